@@ -1,0 +1,66 @@
+# `make` shows this help. Everything runs from a fresh clone: the first target that needs it makes .venv.
+.DEFAULT_GOAL := help
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out
+JOBS ?= 2
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help demo test test-long test-uml check bench firmware flash pi-install library reproduce clean
+
+help:  ## this list
+	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+$(VENV)/installed: pyproject.toml shared/pyproject.toml pi_controller/pyproject.toml host/pyproject.toml simulators/pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 2; }
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
+	@echo "installing the instrument and its tools into $(VENV)"
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -e ./shared -e ./pi_controller -e ./host -e ./simulators --group dev
+	@touch $@
+
+demo: $(VENV)/installed  ## the whole rig, simulated: scan nine materials, end with a report (OUT=out)
+	$(BIN)/polysight demo --out $(OUT)/demo
+
+test: $(VENV)/installed  ## install what is missing, then run every test
+	@./tests/install-tools.sh
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
+
+test-long: $(VENV)/installed  ## tests at full length: 10,000 random rows and 1,000,000 bytes of the stage, 50 kills (an hour)
+	@./tests/install-tools.sh
+	$(BIN)/python -m pytest tests/stage tests/store tests/e2e/test_killed_processes.py -n $(JOBS) --dist loadgroup --long
+
+test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode Linux built from Debian's source (10 minutes, once)
+	@./tests/install-tools.sh kernel
+	$(BIN)/python -m pytest tests/uml --uml -rP
+
+check: $(VENV)/installed  ## lint, format, types, import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+bench: $(VENV)/installed  ## speed as ratios, measured side by side in one run
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --group bench
+	$(BIN)/python -m benchmarks --out $(OUT)/bench
+
+reproduce: $(VENV)/installed  ## the paper's tables and figures from simulation, beside the published values
+	$(BIN)/polysight reproduce --out $(OUT)/reproduce
+
+library: $(VENV)/installed  ## make the simulated reference library of the classifier again
+	$(BIN)/polysight train --simulate examples/library --out host/materials/simulated-library.npz
+
+firmware: $(VENV)/installed  ## build the sketch for an UNO with avr-gcc
+	$(MAKE) -C arduino_stage firmware
+
+flash: firmware  ## flash it: make flash PORT=/dev/ttyACM0
+	$(MAKE) -C arduino_stage flash PORT=$(PORT)
+
+pi-install:  ## install the Pi half on a Pi: make pi-install HOST=pi@polysight
+	@test -n "$(HOST)" || { echo "make pi-install HOST=user@address"; exit 2; }
+	tar -c --exclude=__pycache__ --exclude='*.egg-info' shared pi_controller instrument.toml | ssh $(HOST) 'rm -rf polysight && mkdir polysight && tar -x -C polysight'
+	ssh -t $(HOST) sudo polysight/pi_controller/install.sh
+
+clean:  ## remove what was built
+	rm -rf $(VENV) $(OUT) arduino_stage/build

@@ -1,0 +1,31 @@
+// What motion and protocol ask of the machine they run on: hal_uno.cpp on the board, pc/machine.cpp on a PC.
+#pragma once
+#include <stdint.h>
+
+enum Input : uint8_t { SWITCH_X = 1, SWITCH_Y = 2, EMERGENCY = 4 };
+
+constexpr uint8_t SWITCHES = SWITCH_X | SWITCH_Y;
+
+// State of the switches: bits of Input, set = pressed.
+uint8_t hal_inputs();
+
+// Call Motion::step() after so many ticks, and then after each Motion::interval() until that is 0.
+void hal_start_steps(uint16_t ticks);
+
+// Set the direction pins; they hold still until the next call.
+void hal_directions(bool x_positive, bool y_positive);
+
+void hal_enable(bool on);
+void hal_trigger_width(uint16_t us);
+void hal_write(const char* text, uint8_t length);
+uint16_t hal_steps_per_mm();
+
+// Keeps the step and receive interrupts out while it lives.
+class InterruptLock {
+ public:
+  InterruptLock();
+  ~InterruptLock();
+
+ private:
+  uint8_t saved_;
+};

@@ -1,0 +1,95 @@
+// The step engine: one straight leg at a time, trapezoidal speed, triggers at exact step counts. All integers.
+//
+// A leg of N steps (of the axis with more steps) is counted down step by step. `ramp_` counts the steps it would take
+// to stop from the present speed: speeding up adds one, slowing down takes one away, and slowing down begins when as
+// many steps are left. Speed in the ramp follows dv = a dt; at constant speed the interval between steps is exact:
+// the remainder of TICK_HZ / rate is carried on, so that step k comes floor(k TICK_HZ / rate) ticks after the ramp.
+#pragma once
+#include <stdint.h>
+
+#include "board.h"
+#include "hal.h"
+#include "stage_errors.h"
+
+enum Output : uint8_t { STEP_X = 1, STEP_Y = 2, TRIGGER = 4 };
+
+struct Leg {
+  int32_t dx, dy;   // steps
+  uint16_t rate;    // steps/s of the axis with more steps
+  uint32_t lead;    // steps before the first trigger; the leg moves x alone when points > 0
+  uint32_t pitch;   // steps from trigger to trigger
+  uint16_t points;  // triggers; 0 = none
+  uint8_t until;    // bits of Input that end the leg (homing); 0 = a pressed switch is a fault
+  bool until_open;  // end when the switch opens instead of when it closes
+};
+
+class Motion {
+ public:
+  Motion() { reset(); }
+  void reset();
+  void set_accel(uint32_t steps_s2);
+
+  // Steps from rest to `rate`, and from there to rest.
+  uint32_t ramp_steps(uint16_t rate) const;
+
+  // Plan a leg and start the step timer.
+  void start(const Leg& leg);
+
+  // In the step interrupt: make the step that is due. Returns bits of Output: what to pulse now.
+  uint8_t step(uint8_t inputs);
+
+  // In the step interrupt, after step(): ticks until the next step; 0 = the stage is at rest.
+  uint16_t interval();
+
+  // Slow down to a stop within the leg and wait for resume(). Safe in an interrupt.
+  void hold() { hold_ = true; }
+  void resume();
+  // Give up the rest of the leg. Only at rest, or when position no longer matters.
+  void abandon();
+
+  bool stepping() const { return seen(stepping_); }  // steps are due
+  bool holding() const { return seen(hold_); }
+  bool finished() const { return !seen(stepping_) && left_ == 0; }
+  bool reached() const { return seen(reached_); }  // ended by Leg::until
+  StageError fault() const { return seen(fault_); }  // ended by a switch
+  bool cruising() const { return seen(stepping_) && seen(cruise_); }  // at the leg's exact rate
+  int32_t x_rate() const;                              // steps/s of x now, signed
+
+  int32_t x() const;
+  int32_t y() const;
+  void set_x(int32_t x);
+  void set_y(int32_t y);
+  uint16_t points() const;  // trigger points passed in this row
+  uint16_t pulses() const;  // trigger pulses given in this row
+  void count_pulse() { pulses_++; }
+  void clear_counts();
+
+ private:
+  void resume_leg();
+
+  // The main program's look at what the step interrupt writes: read anew each time. More than a byte: under a lock.
+  template <class T>
+  static T seen(const T& value) {
+    return *static_cast<const volatile T*>(&value);
+  }
+
+  // The step interrupt's own while stepping_, the main program's otherwise. The first ones are the nearest to the
+  // object's address, which the AVR reaches fastest.
+  uint32_t left_;  // steps
+  uint32_t ramp_;  // steps to a stop from the present speed
+  uint32_t speed_q16_, accel_q20_;  // steps/s x 2^16; steps/s per tick x 2^20
+  uint16_t ticks_, rate_, base_, remainder_, carry_;  // at constant speed: base_ + carried remainder_ / rate_
+  uint16_t points_left_;
+  uint32_t ramp_full_, to_trigger_, pitch_;
+  uint32_t major_, minor_, error_;  // Bresenham: steps of the two axes
+  int32_t x_, y_;
+  uint16_t passed_, pulses_, slowest_;
+  int8_t x_direction_, y_direction_;
+  uint8_t until_;
+  bool x_major_, until_open_;
+  bool stepping_, cruise_, reached_;
+  volatile bool hold_;
+  StageError fault_;
+
+  uint32_t accel_;  // steps/s^2
+};

@@ -1,0 +1,78 @@
+// The stage line protocol, firmware half: numbered, checksummed lines in, replies out. docs/spec/stage-line.md.
+#pragma once
+#include <stdint.h>
+
+#include "stage.h"
+
+constexpr uint8_t PROTOCOL_VERSION = 1;
+constexpr uint8_t MAX_LINE_BYTES = 96;  // with checksum and line end
+#define FIRMWARE_VERSION "0.1.0"
+
+// CRC-16/XMODEM, one byte: polynomial 0x1021, start 0.
+uint16_t crc16_update(uint16_t crc, uint8_t byte);
+
+// A reply in the making.
+class Line {
+ public:
+  Line() : length_(0) {}
+  Line& text(const char* s);
+  Line& number(int32_t value);
+  Line& field(const char* name, int32_t value) { return text(" ").text(name).text("=").number(value); }
+  void seal();  // append checksum and line end
+  const char* bytes() const { return bytes_; }
+  uint8_t length() const { return length_; }
+
+ private:
+  void put(char c);
+  char bytes_[MAX_LINE_BYTES];
+  uint8_t length_;
+};
+
+class Protocol {
+ public:
+  explicit Protocol(Stage& stage) : stage_(stage) { reset(); }
+  void reset();
+  void banner();
+
+  // One received byte that is not an immediate one.
+  void receive(uint8_t byte);
+  // Received bytes were lost before they came here: whatever they were, the host hears of it.
+  void lost() { send_error(ERROR_LINE_TOO_LONG); }
+  void poll(uint32_t now_ms);
+
+ private:
+  static constexpr uint8_t MAX_ARGUMENTS = 5;
+  struct Request {
+    uint16_t sequence, crc;
+    const char* verb;
+    uint8_t verb_length, count;
+    int32_t arguments[MAX_ARGUMENTS];
+  };
+  enum Outcome : uint8_t { PENDING, DONE, ALARMED };
+
+  void take_line();
+  bool parse(Request& request) const;
+  StageError execute(const Request& request, bool& motion);
+  void answer(const Request& request);
+  void repeat();
+  void send_ok(uint16_t sequence, bool hello);
+  void send_error(StageError error);                    // the line could not be read
+  void send_error(StageError error, uint16_t sequence);
+  void send_done();
+  void send_alarm(StageError alarm);
+  void send_status();
+
+  Stage& stage_;
+  char line_[MAX_LINE_BYTES];
+  uint8_t length_;
+  bool overlong_;
+
+  // The last answered line, so that its repetition gets the same answer and is not carried out again.
+  bool greeted_, fresh_;  // fresh_: nothing since HELLO, any number may follow
+  uint16_t last_sequence_, last_crc_;
+  StageError last_error_;
+  uint16_t motion_sequence_;  // of the last motion command
+  bool last_is_motion_;
+  Outcome outcome_;
+  StageError outcome_alarm_;
+};

@@ -1,0 +1,78 @@
+// What the stage does: homing, moves and rows as sequences of legs; hold, stop, heartbeat, alarms, soft limits.
+#pragma once
+#include <stdint.h>
+
+#include "motion.h"
+#include "stage_errors.h"
+
+// Second word of SET; shared/stage_line.py has the same list.
+enum Parameter : uint8_t {
+  PARAMETER_ACCEL = 0,
+  PARAMETER_HEARTBEAT = 1,
+  PARAMETER_TRIGGER = 2,
+  PARAMETER_TRAVEL_X = 3,
+  PARAMETER_TRAVEL_Y = 4,
+  PARAMETER_TRAVEL_SPEED = 5,
+  PARAMETER_BACKLASH = 6,
+};
+
+// Bytes that act at once; shared/stage_line.py has the same list.
+enum Immediate : uint8_t {
+  IMMEDIATE_HOLD = 0x81,
+  IMMEDIATE_RESUME = 0x82,
+  IMMEDIATE_STATUS = 0x84,
+  IMMEDIATE_STOP = 0x88,
+};
+
+enum Event : uint8_t { EVENT_NONE, EVENT_DONE, EVENT_ALARM };
+
+class Stage {
+ public:
+  explicit Stage(Motion& motion) : motion_(motion) { reset(); }
+  void reset();
+
+  // Commands. A motion command returns at once; service() tells when it has ended.
+  StageError set(int32_t parameter, int32_t value);
+  StageError enable(int32_t on);
+  StageError home();
+  StageError move(int32_t x, int32_t y, int32_t rate);
+  StageError row(int32_t x0, int32_t pitch, int32_t points, int32_t y, int32_t rate);
+  StageError clear();
+
+  // True when the byte was one of Immediate. Safe in the receive interrupt.
+  bool immediate(uint8_t byte);
+  bool take_status_request();
+  void heard() { heard_ = true; }  // the host is alive
+
+  // Goes on to the next leg, watches heartbeat and switches. Call often.
+  Event service(uint32_t now_ms);
+
+  const char* state() const;
+  bool busy() const { return activity_ != IDLE; }
+  bool homed() const { return homed_; }
+  bool held() const { return held_; }  // the row was interrupted by HOLD
+  bool in_row() const { return row_command_; }  // the last motion command was a row
+  StageError alarm() const { return alarm_; }
+  const Motion& motion() const { return motion_; }
+
+ private:
+  enum Activity : uint8_t { IDLE, MOVE, TRAVEL, ROW, HOMING };
+  StageError ready() const;
+  Event raise(StageError alarm, bool position_lost);
+  Event next_leg();
+  Event next_homing_leg();
+  bool within(int32_t x, int32_t y) const;
+  void begin(Activity activity);
+  void go(int32_t x, int32_t y, uint16_t rate);
+
+  Motion& motion_;
+  volatile bool heard_, status_requested_, resume_requested_, stop_requested_;
+  Activity activity_;
+  StageError alarm_, stopping_;  // stopping_: alarm to raise when the stage has slowed down
+  bool enabled_, homed_, held_, row_command_, started_;
+  uint8_t phase_;  // of homing
+  Leg row_;
+  int32_t row_y_, travel_x_, travel_y_, backlash_;
+  uint16_t travel_rate_, heartbeat_ms_, trigger_us_;
+  uint32_t heard_ms_;
+};

@@ -1,0 +1,1 @@
+"""Speed of the instrument's parts, measured side by side with something plain in the same run."""

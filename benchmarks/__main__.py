@@ -1,0 +1,34 @@
+"""`python -m benchmarks [NAME [options]]`: all benchmarks one after another, or one with its options."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+from benchmarks.measure import one_thread_each
+
+NAMES = ("capture", "sync", "image", "whole", "scaling", "accuracy", "pi")
+
+
+def main(argv: list[str]) -> int:
+    """Run what is asked for; every benchmark prints its own table."""
+    one_thread_each()
+    modules = {name: importlib.import_module(f"benchmarks.{name}") for name in NAMES}
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--out", type=Path, default=None, help="folder for each benchmark's figures as NAME.json")
+    names = parser.add_subparsers(dest="name", metavar="NAME")
+    for name, module in modules.items():
+        words = (module.__doc__ or "").splitlines()[0]
+        module.add_arguments(names.add_parser(name, help=words, description=words))
+    args = parser.parse_args(argv)
+    chosen = {name: parser.parse_args([name]) for name in NAMES} if args.name is None else {args.name: args}
+    for name, options in chosen.items():
+        if args.out is not None and getattr(options, "json", "") is None:
+            options.json = args.out / f"{name}.json"
+    return max(modules[name].run(options) for name, options in chosen.items())
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,154 @@
+"""Simulated data of the published rig: a few recorded rows, whole scans made of them, synchronised cubes."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from host.imaging.grid import Antennas, image_grid, row_offsets_m
+from host.imaging.reduce import scene_gate_m
+from host.store.source import RowData
+from host.sync.chain import SyncedRow
+from shared.config import Board, Instrument, load_instrument
+from shared.raster import RasterPlan, Row, plan_raster
+from shared.units import SPEED_OF_LIGHT_M_S
+from simulators.layouts import OwnLayout
+from simulators.radar import SimulatedRig
+from simulators.scene import Scene, apply_scene, load_scene
+from simulators.simulate import row_offsets_mm
+
+ROOT = Path(__file__).parents[1]
+RIG = ROOT / "instrument.toml"
+SCENE = ROOT / "examples" / "nine-materials.toml"
+DISTINCT = 4  # rows that are simulated; all others repeat them. Even, so that directions fit
+
+
+QUICK = {"columns": 40, "rows": 20}
+
+
+def published(quick: bool = False, **grid: Any) -> tuple[Instrument, Scene]:
+    """The published rig and grid in front of nine plates; changed, or too small for its figures to mean anything."""
+    image = {"columns": 30, "rows": 30} if quick else {}
+    scene = msgspec.structs.replace(load_scene(SCENE), grid={**(QUICK if quick else {}), **grid}, image=image)
+    return apply_scene(load_instrument(RIG), scene), scene
+
+
+@contextmanager
+def temporary(parent: Path | None) -> Iterator[Path]:
+    """A folder for the data, removed afterwards."""
+    folder = Path(tempfile.mkdtemp(prefix="polysight-bench-", dir=parent))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[str, list[NDArray[np.int16]]]:
+    """Rows about the middle of the grid as both receivers record them: int16 [frame, sample, 8] for each board."""
+    radar, plan = SimulatedRig(rig, scene), plan_raster(rig.grid)
+    first = (plan.rows - count) // 4 * 2
+    rows: dict[str, list[NDArray[np.int16]]] = {b.name: [] for b in rig.receivers}
+    for row in itertools.islice(plan, first, first + count):
+        x, y = row_offsets_mm(radar, row)
+        for name, found in rows.items():
+            found.append(radar.chirps(name, x, y, row.index * len(x)))
+    return rows
+
+
+def write_scan(folder: Path, rig: Instrument, rows: dict[str, list[NDArray[np.int16]]], count: int) -> None:
+    """A scan folder of `count` rows, the given ones again and again."""
+    plan = plan_raster(rig.grid)
+    layout = OwnLayout(folder, rig, plan, "benchmark", "2000-01-01T00:00:00+00:00")
+    layout.start()
+    for row in itertools.islice(plan, count):
+        payloads = {name: found[row.index % len(found)] for name, found in rows.items()}
+        layout.write_row(row, payloads, {name: [] for name in payloads})
+    layout.end()
+
+
+@dataclass(frozen=True)
+class RepeatedRows:
+    """A scan of any size whose rows all come from a few short files: only its size is real.
+
+    `files` names each board's rows, whole published ones; a longer row repeats its positions.
+    """
+
+    instrument: Instrument
+    files: dict[str, list[Path]]
+    simulated: bool = True
+    scan_id: str = "benchmark"
+
+    @property
+    def plan(self) -> RasterPlan:
+        """Where every position is."""
+        return plan_raster(self.instrument.grid)
+
+    def rows(self) -> Iterator[int]:
+        """All rows."""
+        return iter(range(self.plan.rows))
+
+    def read_row(self, board_name: str, row: int) -> RowData:
+        """A row's bytes."""
+        files = self.files[board_name]
+        frames = self.plan.columns * self.instrument.burst.pulses
+        wanted = frames * self.instrument.frame_bytes
+        payload = np.fromfile(files[row % len(files)], dtype=np.uint8, count=wanted)
+        return RowData(np.resize(payload, wanted) if payload.size != wanted else payload, [], frames)
+
+
+def point_row(
+    rig: Instrument,
+    antennas: Antennas,
+    row: Row,
+    points_m: NDArray[np.float64],
+    frequencies_hz: NDArray[np.float64],
+    chosen: NDArray[np.bool_] | None = None,
+) -> NDArray[np.complex128]:
+    """Echoes of equal points [n, 3] at (chosen) positions of a row, in the order met, [rx, position, frequency].
+
+    Phase +2 pi f d / c with d the excess path, as after perfect synchronisation.
+    """
+    offsets = row_offsets_m(rig, row)
+    shift = np.pad(offsets if chosen is None else offsets[chosen], ((0, 0), (0, 1)))
+    away = points_m[None] - shift[:, None]
+    path = antennas.excess_m(away[..., 0], away[..., 1], away[..., 2])
+    return np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * path[..., None] * frequencies_hz).sum(axis=2)
+
+
+def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
+    """Synchronised cube of nine points over the image, complex64 [rx, row, column, sample], columns ascending.
+
+    The points' echoes are made at a few frequencies and interpolated, which is good to 1e-6.
+    """
+    grid, chirp, plan = image_grid(rig), rig.chirp, plan_raster(rig.grid)
+    antennas = Antennas.of(rig, board)
+    quarters = [np.linspace(axis[0], axis[-1], 5)[1:-1] for axis in (grid.x_m, grid.y_m)]
+    points = np.array([(x, y, float(np.mean(grid.z_m))) for x in quarters[0] for y in quarters[1]])
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    nodes = np.linspace(sweep[0], sweep[-1], 24)
+    low, high = scene_gate_m((antennas,), plan, grid)
+    turns = 2j * np.pi / SPEED_OF_LIGHT_M_S * np.linspace(low, high, 200)[:, None]
+    expand = np.linalg.lstsq(np.exp(turns * nodes), np.exp(turns * sweep), rcond=1e-9)[0].astype(np.complex64)
+    shape = len(antennas.rx_m), plan.rows, plan.columns, chirp.samples
+    cube = np.lib.format.open_memmap(path, "w+", np.complex64, shape)
+    for row in plan:
+        met = point_row(rig, antennas, row, points, nodes).astype(np.complex64) @ expand
+        cube[:, row.index] = met[:, :: row.direction]
+    cube.flush()
+
+
+def as_synced(samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
+    """What the imagers read of a synchronised row: samples [rx, position, sample], and which positions are valid."""
+    valid = np.ones(samples.shape[1], bool) if valid is None else valid
+    return cast(SyncedRow, SimpleNamespace(samples=samples, valid=valid))

@@ -1,0 +1,230 @@
+"""Imaging of a synchronised cube, against the published method, FastSAR and a plain time-domain sum of the same."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import peers
+from benchmarks.data import as_synced, published, temporary, write_point_cube
+from benchmarks.measure import Seconds, one_core
+from benchmarks.published.image import SETTINGS, form_image
+from benchmarks.table import Line, add_arguments, show, write
+from host.imaging import ImageBuilder, kernels
+from host.imaging.aperture import Aperture, row_starts_m
+from host.imaging.grid import Antennas, image_grid, row_offsets_m
+from host.imaging.imager import choose_imager
+from host.imaging.incremental import IncrementalImager
+from host.imaging.reduce import reduction, scene_gate_m
+from shared.config import Board, Instrument
+from shared.raster import plan_raster
+
+__all__ = ["add_arguments", "run"]
+REPEATS = 5
+ROUNDS = 3  # of what takes seconds
+PEERS = (
+    peers.Peer("the best time-domain sum", "numba", peers.time_domain_image, every=10, limits=(50.0, 150.0)),
+    peers.Peer("FastSAR", "fastsar", peers.fastsar_image, every=40),
+)
+
+Image = NDArray[np.complexfloating]
+
+
+class Bench:
+    """One board's cube on disk, and the ways to its image."""
+
+    def __init__(self, rig: Instrument, board: Board, path: Path) -> None:
+        self.rig, self.board, self.path = rig, board, path
+
+    def ours(self, live: bool = False) -> Image:
+        """From disk to pixels: all rows, then the image; or an image that every row updates."""
+        samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
+        for row, met in self._rows():
+            samples.add_row(row, as_synced(met[:, :: 1 - 2 * (row % 2)]))
+        return (samples.current() if live else samples.image())[0]
+
+    def _rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
+        """Rows [rx, column, sample], read into one buffer: fresh pages for each would cost more than their bytes."""
+        cube = np.load(self.path, mmap_mode="r")
+        rx, rows, columns, samples = cube.shape
+        met = np.empty((rx, columns, samples), np.complex64)
+        with self.path.open("rb", buffering=0) as file:
+            for row in range(rows):
+                for r in range(rx):
+                    file.seek(cube.offset + (r * rows + row) * met[r].nbytes)
+                    file.readinto(met[r].data)
+                yield row, met
+
+    def reduced(self, window: str) -> tuple[Aperture, NDArray[np.complex64]]:
+        """The cube through the range gate alone, complex64 [rx, frequency, row, column], and its aperture."""
+        plan, grid = plan_raster(self.rig.grid), image_grid(self.rig)
+        antennas = Antennas.of(self.rig, self.board)
+        gate = reduction(self.rig.chirp, scene_gate_m((antennas,), plan, grid), window)
+        offsets = np.zeros((plan.rows, plan.columns, 3))
+        for row in plan:
+            offsets[row.index, :, :2] = row_offsets_m(self.rig, row)[:: row.direction]
+        maps, cube = gate.matrix.astype(np.complex64), np.load(self.path, mmap_mode="r")
+        samples = np.stack([np.matmul(maps, cube[:, row].mT) for row in range(plan.rows)], axis=2)
+        return Aperture(antennas, offsets, gate.frequencies_hz, grid), samples
+
+    def ours_cold(self) -> Image:
+        """The same without any kernel kept from before."""
+        kernels.forget()
+        return self.ours()
+
+    def theirs(self, points: int = SETTINGS[0], tuned: bool = False) -> Image:
+        """The published method, from disk."""
+        cube = np.load(self.path, mmap_mode="r")
+        return form_image(cube, self.rig, self.board, image_grid(self.rig), points, tuned)
+
+
+def in_turn(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Seconds]:
+    """Every job once a round."""
+    took = {name: Seconds() for name in jobs}
+    for _ in range(rounds):
+        for name, job in jobs.items():
+            with took[name].timed():
+                job()
+    return took
+
+
+def worst(image: Image, true: Image) -> float:
+    """Largest difference, of the peak."""
+    return float(np.abs(image - true).max() / np.abs(true).max())
+
+
+def rms(image: Image, true: Image) -> float:
+    """Relative rms difference after the best common factor."""
+    factor = np.vdot(image, true) / np.vdot(image, image)
+    return float(np.linalg.norm(factor * image - true) / np.linalg.norm(true))
+
+
+def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
+    """From the cube on disk."""
+    bench.ours()
+    jobs = {
+        "cold": bench.ours_cold,
+        "warm": bench.ours,
+        "published": bench.theirs,
+        "published, tuned": lambda: bench.theirs(tuned=True),
+    }
+    took = in_turn(jobs, min(rounds, ROUNDS))
+    aperture, samples = bench.reduced("boxcar")
+    exact = choose_imager(aperture)[0].image(samples)
+    settings: dict[int, dict[str, float]] = {}
+    for points in SETTINGS:
+        once = Seconds()
+        with once.timed():
+            image = bench.theirs(points)
+        settings[points] = {"cpu_s": once.cpu[0], "rms_error": rms(image, exact)}
+    theirs, tuned = took["published"].median, took["published, tuned"].median
+    finer = (f"{n} points {s['cpu_s']:.1f} s, {100 * s['rms_error']:.2g} %" for n, s in settings.items())
+    lines = []
+    for name, at_least, aim in (("warm", 30, 50), ("cold", 15, 22)):
+        ours = took[name].median
+        lines.append(
+            Line(
+                f"image from the cube on disk, {name} kernels",
+                f"{ours:.3f} s",
+                f"{theirs:.2f} s",
+                theirs / ours,
+                at_least,
+                aim,
+                note=f"against the published method in single precision, padded ({tuned:.2f} s): {tuned / ours:.1f}x"
+                if name == "cold"
+                else f"{tuned / ours:.1f}x; published method's settings, seconds and rms error: {'; '.join(finer)}",
+            )
+        )
+    return lines, {"settings": settings, "cpu_s": {name: t.cpu for name, t in took.items()}}
+
+
+def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
+    """From reduced samples."""
+    aperture, samples = bench.reduced("hann")
+    took: dict[str, list[float]] = {"ours": []}
+    images: dict[str, Image] = {}
+    beside = [peer for peer in PEERS if peers.installed(peer.package)]
+    for _ in range(min(rounds, ROUNDS)):
+        took["ours"] += in_turn({"": lambda: choose_imager(aperture)[0].image(samples)}, rounds)[""].cpu
+        for peer in beside:
+            found = peer.form(aperture, samples, peer.every)
+            took.setdefault(peer.name, []).append(found.seconds)
+            images[peer.name] = found.image
+    ours, lines = statistics.median(took["ours"]), []
+    for peer in beside:
+        theirs = statistics.median(took[peer.name])
+        part = np.zeros_like(samples)
+        part[:, :, :: peer.every] = samples[:, :, :: peer.every]
+        error = rms(images[peer.name], choose_imager(aperture)[0].image(part))
+        note = f"one row in {peer.every} timed, scaled; its image and ours of these rows differ by {error:.1e} rms"
+        name = f"image from the reduced cube, beside {peer.name}"
+        lines.append(Line(name, f"{ours:.3f} s", f"{theirs:.1f} s", theirs / ours, *peer.limits, note=note))
+    for peer in set(PEERS) - set(beside):
+        print(f"{peer.name}: {peer.package} {peers.MISSING}")
+    return lines, {"cpu_s": took}
+
+
+def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
+    """Row by row, with the footprint that both image along."""
+    aperture, samples = bench.reduced("hann")
+    weights = np.ones(samples.shape[2:], np.float32)
+    mirror = np.ones(samples.shape[:2], np.complex64)
+    starts = row_starts_m(aperture.offsets_m)
+    kept: dict[str, Image] = {}
+
+    def by_row() -> None:
+        imager = IncrementalImager(aperture, mirror)
+        for row, start in enumerate(starts):
+            imager.add_row(row, samples[:, :, row] * weights[row], weights[row], float(start))
+        imager.constant_of_sum()
+        kept["rows"] = imager.image_of_sum(np.ones(len(samples)))
+
+    def at_once() -> None:
+        imager, _ = choose_imager(aperture)
+        imager.constant(mirror, weights)
+        kept["batch"] = imager.image(samples * weights)
+
+    jobs = {
+        "rows": by_row,
+        "batch": at_once,
+        "rows from disk": lambda: kept.update(live=bench.ours(live=True)),
+        "batch from disk": lambda: kept.update(whole=bench.ours()),
+    }
+    for job in jobs.values():
+        job()
+    took = in_turn(jobs, rounds)
+    lines = []
+    for where, rows, batch in (
+        ("the cube on disk", "rows from disk", "batch from disk"),
+        ("reduced samples", "rows", "batch"),
+    ):
+        ours, theirs = took[rows].median, took[batch].median
+        name, note = f"all row updates in batch images, both from {where}", f"{1e3 * ours / len(starts):.2f} ms a row"
+        lines.append(Line(name, f"{ours:.3f} s", f"{theirs:.3f} s", ours / theirs, 5, 3, False, note))
+    difference = max(worst(kept["rows"], kept["batch"]), worst(kept["live"], kept["whole"]))
+    lines.append(Line("row by row against batch, of the peak", f"{difference:.1e}", "", difference, 2e-6, 5e-7, False))
+    return lines, {name: t.cpu for name, t in took.items()}
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print."""
+    rig, _ = published(args.quick)
+    lines: list[Line] = []
+    more: dict[str, Any] = {}
+    with temporary(args.folder) as folder, one_core():
+        path = folder / "cube.npy"
+        write_point_cube(path, rig, rig.receivers[0])
+        bench = Bench(rig, rig.receivers[0], path)
+        for part in (against_published, against_time_domain, against_batch):
+            found, figures = part(bench, 1 if args.quick else REPEATS)
+            lines += found
+            more[part.__name__] = figures
+    show(f"imaging of one board, {rig.grid.rows} x {rig.grid.columns} positions, one core", lines, args.quick)
+    write(args.json, "image", lines, **more)
+    return 0

@@ -1,0 +1,179 @@
+"""The Pi half at 10 positions/s on a stand-in GPIO chip: CPU, memory, edge to first pulse, period, width."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tomli_w
+import zmq
+
+from benchmarks.data import temporary
+from benchmarks.measure import machine
+from benchmarks.table import add_arguments as add_common
+from benchmarks.table import write
+from host.scan.pi_client import PiClient
+from shared.config import Instrument, load_instrument, to_builtins
+from shared.messages import BeginRun, Capture, RowFinished
+from shared.raster import plan_raster
+from shared.wires import WireClient, WireEdge
+from simulators import gpio
+
+RIG = Path(__file__).parents[1] / "instrument.toml"
+TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+CPU_AT_MOST, MEMORY_AT_MOST_MB = 0.15, 60.0
+LIMIT_S = 60.0
+ROW_POINTS = 35  # short rows: a machine that is busy with other things ends some of them with a fault
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this benchmark."""
+    add_common(parser)
+    parser.add_argument("--points", type=int, default=350, metavar="N", help="positions to measure (%(default)s)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print; 0 when processor and memory are within their limits."""
+    points = 20 if args.quick else args.points
+    with temporary(args.folder) as folder, ExitStack() as stack:
+        figures = _measure(_rig(folder, min(points, ROW_POINTS)), points, folder, stack)
+    print(f"\nthe Pi half, simulated: {points} positions, 10 a second, 16 pulses each; this machine, not a Pi")
+    here = machine()
+    print(f"{here['cpu']}, {here['cores']} cores, load {here['load_average'][0]}")
+    for name, value in figures.items():
+        print(f"  {name:48s} {value}")
+    write(args.json, "pi", [], figures=figures)
+    within = figures["CPU, share of a core"] < CPU_AT_MOST and figures["memory at most, MB"] < MEMORY_AT_MOST_MB
+    return 0 if within or args.quick else 1
+
+
+def _rig(folder: Path, points: int) -> Instrument:
+    rig, replace = load_instrument(RIG), msgspec.structs.replace
+    stage = replace(rig.stage, port=str(folder / "tty"), centre_x_mm=points + 5.0, centre_y_mm=2.0)
+    pi = replace(
+        rig.pi, gpio_chip=str(folder / "chip"), one_shot=True, journal_dir=str(folder / "journal"),
+        command_address="tcp://127.0.0.1:*", event_address="tcp://127.0.0.1:*",
+    )  # fmt: skip
+    return replace(rig, grid=replace(rig.grid, columns=points, rows=1), stage=stage, pi=pi)
+
+
+def _start(stack: ExitStack, module: str, *args: object, **environment: str) -> tuple[subprocess.Popen[str], str]:
+    """A process that says `ready`, ended with the stack; and what else it said in that line."""
+    command = [sys.executable, "-m", module, *map(str, args)]
+    process = stack.enter_context(
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, **environment})
+    )
+    stack.callback(process.terminate)
+    if process.stdout is None:
+        raise RuntimeError("no output")
+    return process, process.stdout.readline().removeprefix("ready").strip()
+
+
+def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> dict[str, Any]:
+    config, hub = folder / "rig.toml", folder / "wires"
+    config.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
+    _start(stack, "simulators.wires", "--socket", hub)
+    _start(stack, "simulators.stage", "--config", config, "--wires", hub, "--link", rig.stage.port)
+    environment = gpio.environment(Path(rig.pi.gpio_chip), hub)
+    process, command_address = _start(stack, "pi_controller", "run", "--config", config, **environment)
+    event_address = process.stdout.readline().split()[1] if process.stdout else ""
+    wires = WireClient(hub, listen=rig.pi.sync_out)
+    stack.callback(wires.close)
+    where = msgspec.structs.replace(rig.pi, command_address=command_address, event_address=event_address)
+    context: zmq.Context[Any] = zmq.Context()
+    stack.callback(context.destroy, linger=0)
+    client = stack.enter_context(PiClient(context, msgspec.structs.replace(rig, pi=where)))
+    seen = _Rows(client, rig, wires, process.pid)
+    while len(seen.bursts) < points:
+        seen.take_row()
+    status = Path(f"/proc/{process.pid}/status").read_text().split()
+    captures = [c for c, _ in seen.bursts]
+    late_us = sorted((c.first_pulse_ns - c.edge_ns) / 1e3 for c in captures)
+    rises = [[e.t_ns for e in burst[::2]] for _, burst in seen.bursts]
+    error_us = sorted(abs((b - a) / 1e3 - rig.burst.period_us) for burst in rises for a, b in pairwise(burst))
+    high_us = sorted((b.t_ns - a.t_ns) / 1e3 for _, e in seen.bursts for a, b in zip(e[::2], e[1::2], strict=True))
+    width_us = sorted(c.width_max_ns / 1e3 for c in captures)
+    return {
+        "rows, and how many a busy machine ended early": [seen.rows, len(seen.faults)],
+        "faults of those": sorted(set(seen.faults)),
+        "CPU, share of a core": round(seen.cpu_s / seen.wall_s, 3),
+        "memory at most, MB": round(int(status[status.index("VmHWM:") + 1]) / 1e3, 1),
+        "edge to first pulse, us: p50, p99.9, worst": _quantiles(late_us),
+        "period off by, us: p50, p99.9, worst": _quantiles(error_us),
+        "pulse width, us: p50, p99.9, worst": _quantiles(high_us),
+        "bound told of a burst's widest, us: p50, p99.9": _quantiles(width_us)[:2],
+    }
+
+
+class _Rows:
+    """Rows, one after another, and what was seen of them on the wires."""
+
+    def __init__(self, client: PiClient, rig: Instrument, wires: WireClient, pid: int) -> None:
+        self._client, self._wires, self._pid = client, wires, pid
+        self.rows, self.cpu_s, self.wall_s = 0, 0.0, 0.0
+        self.faults: list[int] = []
+        self.bursts: list[tuple[Capture, list[WireEdge]]] = []  # whole ones, with their edges on SYNC_IN
+        client.follow("benchmark", 0, lambda _: None)
+        client.begin_run(
+            BeginRun(
+                scan_id="benchmark", plan=plan_raster(rig.grid), pulses=rig.burst.pulses,
+                period_us=rig.burst.period_us, width_us=rig.burst.width_us, speed_mm_s=rig.stage.speed_mm_s,
+                heartbeat_ms=rig.pi.host_heartbeat_ms,
+            )
+        )  # fmt: skip
+
+    def take_row(self) -> None:
+        """One row, to its end; the processor's time counts from its first capture on."""
+        self.rows += 1
+        while (state := self._client.status().state) != "ready":
+            if state in ("idle", "fault"):
+                self._client.home()
+            time.sleep(0.05)
+        self._client.run_row("benchmark", 0, self.rows)
+        edges: list[WireEdge] = []
+        captures: list[Capture] = []
+        cpu = began = 0.0
+        finished, deadline = None, time.monotonic() + LIMIT_S
+        while finished is None:
+            if time.monotonic() > deadline:
+                raise SystemExit("a row does not end")
+            message = self._wires.receive(0.05)
+            edges += [message] if isinstance(message, WireEdge) else []
+            for event in self._client.events():
+                if isinstance(event, Capture):
+                    if not captures:
+                        cpu, began = _cpu_s(self._pid), time.monotonic()
+                    captures.append(event)
+                finished = event if isinstance(event, RowFinished) else finished
+        if captures:
+            self.cpu_s += _cpu_s(self._pid) - cpu
+            self.wall_s += time.monotonic() - began
+        while isinstance(message := self._wires.receive(0.5), WireEdge):
+            edges.append(message)
+        if finished.fault:
+            self.faults.append(finished.fault)
+        if len(edges) != 2 * finished.pulses:
+            raise SystemExit(f"{len(edges)} edges on the wires, {finished.pulses} pulses told")
+        start = 0
+        for c in captures:
+            if not (finished.fault and c is captures[-1]):
+                self.bursts.append((c, edges[start : start + 2 * c.pulses]))
+            start += 2 * c.pulses
+
+
+def _cpu_s(pid: int) -> float:
+    user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    return (int(user) + int(system)) * TICK_S
+
+
+def _quantiles(values: list[float]) -> list[float]:
+    at = [0.5, 0.999, 1.0]
+    return [round(values[min(len(values) - 1, int(q * len(values)))], 2) for q in at]

@@ -1,0 +1,140 @@
+"""Image error against scan time for scans that leave positions out, simulated: `python -m benchmarks.sparse_scans`.
+
+Every example scene is simulated once with all positions, without noise or disturbances: what is seen is what leaving
+out does. Then rows or columns are masked, and the image is made by matched filter and by reconstruction
+(host/imaging/sparse.py). The error is that of the whole image against the matched filter of all positions, both
+channels' mean; a reconstruction is compared through what it predicts there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from host.imaging.imager import choose_imager
+from host.imaging.samples import BoardSamples
+from host.imaging.sparse import reconstruct
+from host.pipeline import Pipeline
+from host.store.scanfolder import ScanFolder
+from shared.config import Instrument, load_instrument
+from simulators.scene import load_scene
+from simulators.simulate import simulate
+
+ROOT = Path(__file__).parents[1]
+SCENES = ("point-targets", "nine-materials")
+
+
+def patterns(rows: int, columns: int) -> Iterator[tuple[str, np.ndarray, float]]:
+    """(name, positions kept [row, column], share of the whole scan's time)."""
+    rng = np.random.default_rng(1)
+
+    def of_rows(chosen: np.ndarray) -> np.ndarray:
+        kept = np.zeros((rows, columns), bool)
+        kept[chosen] = True
+        return kept
+
+    yield "all positions", np.ones((rows, columns), bool), 1.0
+    yield "every second row", of_rows(np.arange(0, rows, 2)), 0.5
+    yield "every third row", of_rows(np.arange(0, rows, 3)), 1 / 3
+    yield "random half of the rows", of_rows(rng.permutation(rows)[: rows // 2]), 0.5
+    kept = np.zeros((rows, columns), bool)
+    kept[:, ::2] = True
+    yield "every second column, at twice the speed", kept, 0.5
+    yield "random half of the positions", rng.uniform(size=kept.shape) < 0.5, 1.0
+    yield "random quarter of the positions", rng.uniform(size=kept.shape) < 0.25, 1.0
+
+
+def scan_minutes(rig: Instrument) -> float:
+    """Time of the whole scan: rows at constant speed, with run-up, run-out and the step to the next row."""
+    stage, grid = rig.stage, rig.grid
+    length = (grid.columns - 1) * grid.step_x_mm
+    ramp = stage.speed_mm_s / stage.accel_mm_s2
+    row = length / stage.speed_mm_s + 2 * ramp + grid.step_y_mm / stage.travel_speed_mm_s
+    return grid.rows * row / 60
+
+
+def predicted(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """What a reconstructed image's matched filter over all positions would be."""
+    imager, _ = choose_imager(board.aperture)
+    samples = imager.samples(image)
+    gated = (board.model.astype(np.complex64) @ samples.reshape(*samples.shape[:2], -1)).reshape(samples.shape)
+    return imager.image((gated * weights).astype(np.complex64)) / (weights.sum() * len(samples))
+
+
+def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, float]]:
+    """(pattern, minutes, error of the matched filter, error of the reconstruction) of one scan."""
+    pipeline = Pipeline(ScanFolder.load(folder))
+    for row in pipeline.source.rows():
+        pipeline.add_row(row)
+    boards = list(pipeline.images.boards.values())
+    valid = [b.valid.copy() for b in boards]
+    whole = [b.image()[0] for b in boards]
+    weights = [b.weights for b in boards]
+    minutes, out = scan_minutes(pipeline.source.instrument), []
+    rows, columns = valid[0].shape
+    for name, kept, share in patterns(rows, columns):
+        errors = []
+        for board, good, full, weight in zip(boards, valid, whole, weights, strict=True):
+            board.valid[:] = good
+            board.keep(kept)
+            matched = board.image()[0]
+            found = predicted(board, reconstruct(board, iterations, strength=0.01).image, weight)
+            errors.append([np.linalg.norm(image - full) / np.linalg.norm(full) for image in (matched, found)])
+        plain, rebuilt = np.mean(errors, axis=0)
+        out.append((name, share * minutes, float(plain), float(rebuilt)))
+    return out
+
+
+def figure(results: dict[str, list[tuple[str, float, float, float]]], path: Path) -> None:
+    """Errors against scan time, one panel a scene."""
+    fig = Figure(figsize=(11.0, 4.2), dpi=120, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    for ax, (scene, rows) in zip(fig.subplots(1, len(results), squeeze=False)[0], results.items(), strict=True):
+        for i, (name, minutes, plain, rebuilt) in enumerate(rows):
+            colour = f"C{i}"
+            ax.plot(minutes, 100 * rebuilt, "s", color=colour, markerfacecolor="white", label=name)
+            if plain > 0:
+                ax.plot([minutes] * 2, [100 * plain, 100 * rebuilt], "-", color=colour, linewidth=1)
+                ax.plot(minutes, 100 * plain, "o", color=colour)
+        ax.set_yscale("log")
+        ax.set_xlim(left=0)
+        ax.set_xlabel("scan time (minutes)")
+        ax.set_ylabel("image error (%)")
+        ax.set_title(f"SIMULATED: {scene}\nfilled: matched filter, open: reconstruction", fontsize=9, loc="left")
+    fig.axes[-1].legend(fontsize=7, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(path, metadata={"Software": None})
+
+
+def main() -> int:
+    """Simulate, measure, print a Markdown table, draw the figure."""
+    parser = argparse.ArgumentParser(description="image error of sparse scans")
+    parser.add_argument("--figure", type=Path, default=ROOT / "docs" / "images" / "sparse.png")
+    parser.add_argument("--iterations", type=int, default=40)
+    parser.add_argument("--scenes", nargs="*", default=SCENES)
+    parser.add_argument("--keep", type=Path, default=None, help="folder where simulated scans stay")
+    args = parser.parse_args()
+    rig, results = load_instrument(ROOT / "instrument.toml"), {}
+    with tempfile.TemporaryDirectory() as temporary:
+        for scene in args.scenes:
+            folder = (args.keep or Path(temporary)) / f"ideal-{scene}"
+            if not folder.exists():
+                what = load_scene(ROOT / "examples" / f"{scene}.toml").with_disturbances(ideal=True)
+                simulate(rig, what, folder)
+            results[scene] = measure(folder, args.iterations)
+            print(f"\n{scene} (simulated)\n\n| positions | minutes | matched filter | reconstruction |")
+            print("| --- | --- | --- | --- |")
+            for name, minutes, plain, rebuilt in results[scene]:
+                print(f"| {name} | {minutes:.1f} | {100 * plain:.1f} % | {100 * rebuilt:.1f} % |", flush=True)
+    figure(results, args.figure)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,129 @@
+"""Synchronisation of recorded rows, against the published method on the same file and core."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from benchmarks.data import RepeatedRows, published, recorded_rows, temporary
+from benchmarks.measure import Seconds, one_core
+from benchmarks.published.synchronise import Synchroniser
+from benchmarks.table import Line, add_arguments, show, write
+from host.imaging import ImageBuilder
+from host.pipeline import Pipeline
+from host.sync import direct_path
+from shared.config import Instrument
+
+__all__ = ["add_arguments", "run"]
+REPEATS = 5
+POSITIONS = 70  # of a row's 350, evenly spaced: the published method is timed on these
+STAGES = ("decode and align", "direct path")
+LIMITS = {"decode and align": (25.0, 100.0), "direct path": (25.0, 45.0)}
+
+
+@contextmanager
+def direct_path_timed(into: Seconds) -> Iterator[None]:
+    """Times every call of the chain's direct-path stage."""
+    original = direct_path.reference
+
+    def timed(*args: Any, **kwargs: Any) -> Any:
+        with into.timed():
+            return original(*args, **kwargs)
+
+    direct_path.reference = timed
+    try:
+        yield
+    finally:
+        direct_path.reference = original
+
+
+class _NoImage:
+    """Takes synchronised rows and does nothing with them."""
+
+    def add_row(self, *_: object) -> None:
+        """Drop it."""
+
+
+class Ours:
+    """The instrument's pipeline on a row of both boards, but for the image."""
+
+    def __init__(self, rig: Instrument, files: dict[str, Path]) -> None:
+        self._pipeline = Pipeline(RepeatedRows(rig, {name: [path] for name, path in files.items()}))
+        self._pipeline.images = cast(ImageBuilder, _NoImage())
+
+    def row(self) -> tuple[float, float]:
+        """One row from its files: CPU seconds of reading, decoding and aligning, and of the direct path."""
+        whole, inner = Seconds(), Seconds()
+        with whole.timed(), direct_path_timed(inner):
+            self._pipeline.add_row(0)
+        return whole.cpu[0] - sum(inner.cpu), sum(inner.cpu)
+
+
+class Theirs:
+    """The published method on some positions of the same files, its time scaled to the row."""
+
+    def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool, positions: int = POSITIONS) -> None:
+        self._boards = [(Synchroniser(rig, rig.by_name(name), tuned), path) for name, path in files.items()]
+        self._rig = rig
+        self._chosen = np.linspace(0, rig.grid.columns - 1, min(positions, rig.grid.columns)).astype(int)
+
+    def row(self) -> tuple[float, float]:
+        """The chosen positions of each board one after another: CPU seconds as of :class:`Ours`."""
+        pulses = self._rig.burst.pulses
+        size = pulses * self._rig.frame_bytes
+        first, second = Seconds(), Seconds()
+        for method, path in self._boards:
+            aligned = []
+            with first.timed():
+                recording = np.memmap(path, dtype=np.uint8, mode="r")
+                for i in self._chosen:
+                    burst = method.decode(recording[i * size : (i + 1) * size], pulses)
+                    aligned.append(method.align(method.compensate(burst)))
+            with second.timed():
+                for mean in aligned:
+                    method.reference(mean)
+        scale = self._rig.grid.columns / len(self._chosen)
+        return sum(first.cpu) * scale, sum(second.cpu) * scale
+
+
+def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, np.ndarray]:
+    """Seconds a position of one board [round, stage] of each method, in turn, after a round that is not counted."""
+    jobs = {
+        "ours": Ours(rig, files),
+        "published": Theirs(rig, files, tuned=False),
+        "published, tuned": Theirs(rig, files, tuned=True),
+    }
+    rounds: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
+    for turn in range(repeats + 1):
+        for name, job in jobs.items():
+            times = job.row()
+            if turn:
+                rounds[name].append(times)
+    return {name: np.array(times) / (rig.grid.columns * len(files)) for name, times in rounds.items()}
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print."""
+    rig, scene = published(args.quick)
+    with temporary(args.folder) as folder, one_core():
+        files = {}
+        for name, rows in recorded_rows(rig, scene, 1).items():
+            files[name] = folder / f"{name}.bin"
+            rows[0].tofile(files[name])
+        times = measure(rig, files, 1 if args.quick else REPEATS)
+    medians = {method: np.median(t, axis=0) for method, t in times.items()}
+    lines = []
+    for k, stage in enumerate(STAGES):
+        ours, plain, tuned = (float(medians[m][k]) for m in ("ours", "published", "published, tuned"))
+        note = f"against the published method in single precision ({1e6 * tuned:.0f} us): {tuned / ours:.1f}x"
+        lines.append(
+            Line(stage, f"{1e6 * ours:.0f} us", f"{1e6 * plain:.0f} us", plain / ours, *LIMITS[stage], note=note)
+        )
+    show("synchronisation, a position of one board, one core, published method beside it", lines, args.quick)
+    write(args.json, "sync", lines, seconds_a_position={m: t.tolist() for m, t in times.items()})
+    return 0

@@ -1,0 +1,182 @@
+"""One rate of packets, tried for a time: into the project's receivers, or into plain loops that only count."""
+
+from __future__ import annotations
+
+import os
+import time
+import zlib
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from benchmarks.cards import Cards
+from benchmarks.child import Child, ask, cpu_s
+from benchmarks.signal_block import PACKETS
+from host.capture.dca1000 import MAX_PAYLOAD_BYTES
+from host.capture.receiver import ReceiverProcess
+from host.capture.scheduling import receiver_cores
+
+ROW_BLOCKS = 48  # of one board: 286 MB, twelve published rows
+KEEPS_PACE = 0.98
+MBIT_A_PACKET = MAX_PAYLOAD_BYTES * 8 / 1e6
+
+
+@dataclass
+class Trial:
+    """One rate, tried for a time. Rates and counts are of both cards together."""
+
+    wanted: float
+    rate: float
+    seconds: float
+    packets: int
+    lost: int
+    kernel_drops: int
+    exact: bool
+    cpu: list[float]  # share of a core, each receiver
+    queue: float  # worst fill of a receive buffer
+    turn_s: float  # worst time to make a row durable and begin the next
+    rows_beside: float  # rows processed a second meanwhile
+    load: float
+
+    @property
+    def good(self) -> bool:
+        """Nothing lost and every byte right."""
+        return self.lost == 0 and self.exact
+
+    @property
+    def paced(self) -> bool:
+        """Whether the senders kept the pace that was asked for."""
+        return self.rate >= KEEPS_PACE * self.wanted
+
+    def line(self) -> str:
+        """One row of the table."""
+        cpu = "+".join(f"{100 * c:.0f}" for c in self.cpu)
+        verdict = (
+            "LOSS" if self.lost else "WRONG BYTES" if not self.exact else "good" if self.paced else "good (senders)"
+        )
+        return (
+            f"{self.wanted:9.0f} {self.rate:9.0f} {self.rate * MBIT_A_PACKET:7.0f} {self.seconds:6.1f}"
+            f" {self.packets:10d} {self.lost:8d} {self.kernel_drops:8d} {cpu:>9} {100 * self.queue:6.1f}"
+            f" {self.turn_s:6.2f} {self.rows_beside:6.2f} {self.load:5.1f}  {verdict}"
+        )
+
+
+HEAD = (
+    "   asked       got  Mbit/s   sec.    packets     lost  dropped  CPU % ea  que. %  turn s rows/s  load\n"
+    "     1/s       1/s payload               sent            kernel  receiver   worst  worst  beside"
+)
+
+
+class Receivers:
+    """The project's receivers, writing row files."""
+
+    def __init__(self, cards: Cards, stack: ExitStack) -> None:
+        self._cards = cards
+        cores = receiver_cores(len(cards.boards))
+        self._receivers = [
+            stack.enter_context(ReceiverProcess(b, cards.buffer_bytes, c))
+            for b, c in zip(cards.boards, cores, strict=True)
+        ]
+        self.text = "; ".join(f"{r.board.name} {r.scheduling}, buffer {r.granted_bytes}" for r in self._receivers)
+        self._row = 0
+        self._crc: dict[int, list[int]] = {}
+
+    def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
+        """Rows, one after another, until the time is sent; making them durable in between is not in the time."""
+        cards = self._cards
+        in_all = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
+        rows = -(-in_all // ROW_BLOCKS)
+        blocks = round(in_all / rows)
+        packets = blocks * PACKETS
+        before, cpu = ask(beside), [cpu_s(r.pid) for r in self._receivers]
+        trial = Trial(rate, 0, 0, 0, 0, 0, True, [], 0, 0, 0, 0)
+        began = time.perf_counter()
+        ended = 0.0
+        for _ in range(rows):
+            size = packets * MAX_PAYLOAD_BYTES
+            for r in self._receivers:
+                path = cards.folder / r.board.name / f"{self._row:04d}.part"
+                r.begin_row(self._row, 1, size, cards.rig.frame_bytes, path)
+            if ended:
+                trial.turn_s = max(trial.turn_s, time.perf_counter() - ended)
+            cards.start_sending(packets, rate)
+            self._watch(trial, packets / (rate / len(cards.boards)))
+            trial.seconds += cards.sent()
+            self._drain()
+            ended = time.perf_counter()
+            captures = [r.end_row() for r in self._receivers]
+            for k, capture in enumerate(captures):
+                trial.packets += packets
+                trial.lost += packets - capture.packets
+                trial.kernel_drops += capture.kernel_drops
+                trial.exact &= capture.missing_bytes > 0 or capture.crc32 == self._expected(k, blocks)
+            for r in self._receivers:
+                path = cards.folder / r.board.name / f"{self._row:04d}.part"
+                path.unlink() if self._row else path.rename(cards.folder / f"{r.board.name}.bin")
+            self._row += 1
+        wall = time.perf_counter() - began
+        after = ask(beside)
+        trial.rate = trial.packets / trial.seconds
+        # All CPU, the ends of rows included, over the time of sending: it belongs to these packets.
+        trial.cpu = [(cpu_s(r.pid) - c) / trial.seconds for r, c in zip(self._receivers, cpu, strict=True)]
+        trial.rows_beside = (after["rows"] - before["rows"]) / wall
+        trial.load = os.getloadavg()[0]
+        return trial
+
+    def _watch(self, trial: Trial, seconds: float) -> None:
+        limit = time.perf_counter() + seconds
+        while (left := limit - time.perf_counter()) > 0:
+            time.sleep(min(0.05, left))
+            trial.queue = max(trial.queue, max(self._cards.queues()) / (2 * self._cards.buffer_bytes))
+
+    def _drain(self) -> None:
+        """Until the receivers have taken what waits; what is lost never comes."""
+        limit = time.perf_counter() + 5.0
+        while any(self._cards.queues()) and time.perf_counter() < limit:
+            time.sleep(0.01)
+
+    def _expected(self, board: int, blocks: int) -> int:
+        """CRC-32 of so many blocks."""
+        known = self._crc.setdefault(board, [0])
+        while len(known) <= blocks:
+            known.append(zlib.crc32(self._cards.blocks[board], known[-1]))
+        return known[blocks]
+
+
+class PlainLoops:
+    """A plain `recv_into` loop a card, which only counts."""
+
+    def __init__(self, cards: Cards, stack: ExitStack) -> None:
+        self._cards = cards
+        self._loops = []
+        for b in cards.boards:
+            loop = Child("benchmarks.plain_loop", b.host_address, b.data_port, cards.buffer_bytes)
+            stack.callback(loop.close)
+            self._loops.append(loop)
+        for loop in self._loops:
+            loop.hear()
+
+    def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
+        """The same packets, counted."""
+        packets = max(1, round(rate / len(self._loops) * seconds / PACKETS)) * PACKETS
+        before, began = ask(beside), time.perf_counter()
+        for loop in self._loops:
+            loop.say(packets)
+        self._cards.start_sending(packets, rate)
+        took = self._cards.sent()
+        answers = [loop.hear() for loop in self._loops]
+        wall = time.perf_counter() - began
+        total = packets * len(self._loops)
+        return Trial(
+            rate,
+            total / took,
+            took,
+            total,
+            total - sum(a["received"] for a in answers),
+            sum(a["drops"] for a in answers),
+            True,
+            [a["cpu_s"] / took for a in answers],
+            0.0,
+            0.0,
+            (ask(beside)["rows"] - before["rows"]) / wall,
+            os.getloadavg()[0],
+        )

@@ -1,0 +1,118 @@
+"""A full scan of two boards from raw files to images: time, memory, and the wait after its last row."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import statistics
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import sync
+from benchmarks.chain import Chain
+from benchmarks.data import published, recorded_rows, temporary, write_scan
+from benchmarks.measure import Seconds, one_core
+from benchmarks.published.image import form_image
+from benchmarks.table import Line, show, write
+from benchmarks.table import add_arguments as add_common
+from host.imaging import image_grid
+from shared.config import Instrument
+
+REPEATS = 3
+SPARE_BYTES = 3 << 30
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of this benchmark."""
+    add_common(parser)
+    parser.add_argument("--rows", type=int, default=200, help="of the scan (default 200, the published scan)")
+    parser.add_argument("--repeats", type=int, default=REPEATS, help=f"rounds (default {REPEATS})")
+
+
+def rows_that_fit(rig: Instrument, rows: int, folder: Path) -> int:
+    """As many of the rows as the disk has room for."""
+    row_bytes = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers)
+    return max(2, min(rows, (shutil.disk_usage(folder).free - SPARE_BYTES) // row_bytes))
+
+
+class Published:
+    """What the published method needs for the whole scan, from a part: every position and every board cost the same."""
+
+    def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool) -> None:
+        self._rig, self._tuned, self._grid = rig, tuned, image_grid(rig)
+        self._row = sync.Theirs(rig, files, tuned, 35)
+        shape = len(rig.antennas.rx_mm), rig.grid.rows, rig.grid.columns, rig.chirp.samples
+        self._cube = np.broadcast_to(np.ones(shape[1:], np.complex64), shape)
+
+    def run(self) -> float:
+        """CPU seconds of the whole scan."""
+        positions = sum(self._row.row()) * self._rig.grid.rows
+        image = Seconds()
+        with image.timed():
+            form_image(self._cube, self._rig, self._rig.receivers[0], self._grid, tuned=self._tuned)
+        return positions + image.cpu[0] * len(self._rig.receivers)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print."""
+    rig, scene = published(args.quick)
+    with temporary(args.folder) as folder, one_core():
+        count = rows_that_fit(rig, 4 if args.quick else args.rows, folder)
+        rows = recorded_rows(rig, scene)
+        scan = folder / "scan"
+        write_scan(scan, rig, rows, count)
+        files = {name: scan / "raw" / name / "0000.bin" for name in rows}
+        del rows
+        plain, tuned = (Published(rig, files, t) for t in (False, True))
+        batch, live = (Chain(folder, how, {"scan": str(scan)}) for how in ("batch", "live"))
+        ours, theirs, theirs_tuned = [], [], []
+        for _ in range(1 if args.quick else args.repeats):
+            ours.append(batch.run())
+            theirs.append(plain.run())
+            theirs_tuned.append(tuned.run())
+        beside_scan = live.run()
+        memory = max(batch.end(), live.end())
+    scale = rig.grid.rows / count
+    seconds = statistics.median((r["cpu_s"] - r["once_cpu_s"]) * scale + r["once_cpu_s"] for r in ours)
+    last = statistics.median(beside_scan["last_row_wall_s"])
+    last_cpu = statistics.median(beside_scan["last_row_cpu_s"])
+    published_s, tuned_s = statistics.median(theirs), statistics.median(theirs_tuned)
+    size = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers) * count
+    part = f"{count} of {rig.grid.rows} rows ({size / 1e9:.1f} GB)" if scale > 1 else f"all {size / 1e9:.1f} GB"
+    lines = [
+        Line(
+            "raw to image, two boards, 9.2 GB",
+            f"{seconds:.1f} s",
+            f"{published_s:.0f} s",
+            published_s / seconds,
+            60,
+            120,
+            note=f"ours from {part}; published method from 70 positions and one board's image, scaled;"
+            f" in single precision {tuned_s:.0f} s: {tuned_s / seconds:.0f}x",
+        ),
+        Line(
+            "last committed row to final image, s",
+            f"{last:.2f} s",
+            "",
+            last,
+            1.0,
+            0.1,
+            higher_is_better=False,
+            note=f"median of {len(beside_scan['last_row_wall_s'])}, wall seconds ({last_cpu:.2f} s of CPU): reading,"
+            " synchronising and imaging the last row of both boards, then both images",
+        ),
+        Line(
+            "anonymous memory of a full scan, GB",
+            f"{memory / 1e9:.2f} GB",
+            "",
+            memory / 1e9,
+            1.0,
+            0.4,
+            higher_is_better=False,
+            note=f"highest RssAnon of the processing process, at once and row by row; {part}",
+        ),
+    ]
+    show("a whole scan, one core, simulated rows repeated", lines, args.quick)
+    write(args.json, "whole", lines, ours=ours, live=beside_scan, published_s=theirs, published_tuned_s=theirs_tuned)
+    return 0

@@ -1,0 +1,1 @@
+"""The host half: capture -> store -> sync -> imaging -> polarimetry -> materials -> report."""

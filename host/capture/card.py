@@ -1,0 +1,197 @@
+"""Control of one DCA1000 over UDP.
+
+The socket is never connected: replies leave the card from source port 1024 whatever port the command went to. A
+command is sent again only where twice does no harm. When nothing comes back, the error says which hop is silent.
+"""
+
+from __future__ import annotations
+
+import errno
+import select
+import time
+from pathlib import Path
+from types import TracebackType
+
+from host.capture import dca1000
+from host.capture.dca1000 import Code, Reply, Status, Version
+from host.capture.hops import no_route, silent_card
+from host.capture.udp import bind_udp
+from shared.config import Board, Card
+from shared.errors import DeviceError, ProtocolError
+
+ATTEMPTS = 3
+EEPROM_REPORT_S = 0.5
+
+
+class CardClient:
+    """One capture card, addressed as its board says.
+
+    Parameters
+    ----------
+    board
+        Name, addresses and ports.
+    timeout_s
+        Limit of a command, all attempts together.
+    kernel_root
+        Where `proc` and `sys` are, for the diagnosis of a silent card.
+
+    Raises
+    ------
+    DeviceError
+        when the command port is in use or the host address is not this machine's.
+    """
+
+    def __init__(self, board: Board, timeout_s: float, kernel_root: Path = Path("/")) -> None:
+        self.board = board
+        self._timeout_s = timeout_s
+        self._kernel_root = kernel_root
+        self._address = (board.card_address, board.command_port)
+        self._socket = bind_udp(board.host_address, board.command_port, f"{board.name} commands")
+        self._status = Status(0)
+        self.strangers = 0  # datagrams that were neither replies nor status of this card
+
+    def fileno(self) -> int:
+        """Descriptor that becomes readable when the card reports a status by itself."""
+        return self._socket.fileno()
+
+    def alive(self) -> None:
+        """Ask whether the card is there. Raises DeviceError naming the silent hop."""
+        self._command(Code.ALIVE)
+
+    def version(self) -> Version:
+        """The card's FPGA version. Raises DeviceError."""
+        return dca1000.decode_version(self._exchange(Code.VERSION, b"", ATTEMPTS).status)
+
+    def configure(self, card: Card, lanes: int = 4) -> None:
+        """Raw capture of `lanes` LVDS lanes to ethernet, 16 bit, and the pace of its packets. Raises DeviceError."""
+        self._command(Code.CONFIGURE_FPGA, dca1000.configure_fpga_data(lanes))
+        self._command(Code.CONFIGURE_PACKET, dca1000.configure_packet_data(card.packet_bytes, card.packet_delay_us))
+
+    def reset_fpga(self) -> None:
+        """Reset the FPGA; its configuration is lost. Raises DeviceError."""
+        self._command(Code.RESET_FPGA)
+
+    def reset_radar(self) -> None:
+        """Reset the radar board on the card; it must be armed again. Raises DeviceError."""
+        self._command(Code.RESET_RADAR)
+
+    def write_eeprom(self, body: bytes) -> Status:
+        """Send the 18 bytes of command 0x04, once; returns the status bits the card reported meanwhile.
+
+        Not sent again when no reply comes: it may be writing. Callers use :func:`host.capture.eeprom.program_eeprom`.
+        Raises DeviceError when the card refuses or is silent.
+        """
+        self._status = Status(0)
+        self._check(self._exchange(Code.CONFIGURE_EEPROM, body, 1), Code.CONFIGURE_EEPROM)
+        self._receive(EEPROM_REPORT_S)  # a failure is reported by itself, and may come after the reply
+        return self.take_status()
+
+    def record_start(self) -> None:
+        """Start a record.
+
+        Not simply sent again when no reply comes, because the record may run already: stopped first.
+
+        Raises
+        ------
+        DeviceError
+            when the card refuses or is silent.
+        """
+        self._status = Status(0)
+        for attempt in range(ATTEMPTS):
+            reply = self._try(Code.RECORD_START, b"", self._timeout_s / ATTEMPTS)
+            if reply is not None:
+                self._check(reply, Code.RECORD_START)
+                return
+            if attempt < ATTEMPTS - 1:
+                self.record_stop()
+        raise self._silent(Code.RECORD_START, ATTEMPTS)
+
+    def record_stop(self) -> None:
+        """Stop the record. A card that does not record may refuse; that is no error. Raises DeviceError when silent."""
+        self._exchange(Code.RECORD_STOP, b"", ATTEMPTS)
+
+    def take_status(self) -> Status:
+        """Status bits the card reported by itself since the last record start, without waiting."""
+        while self._receive(0.0) is not None:
+            pass
+        return self._status
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def __enter__(self) -> CardClient:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _command(self, code: Code, data: bytes = b"") -> None:
+        self._check(self._exchange(code, data, ATTEMPTS), code)
+
+    def _check(self, reply: Reply, code: Code) -> None:
+        if reply.status != 0:
+            raise DeviceError(
+                f"{self._name()} refused {code.name} with status {reply.status}",
+                "the card is in another state than expected, or its switches select another mode",
+                "power-cycle the card, and check its mode switches (docs/spec/dca1000.md)",
+            )
+
+    def _exchange(self, code: Code, data: bytes, attempts: int) -> Reply:
+        for _ in range(attempts):
+            reply = self._try(code, data, self._timeout_s / attempts)
+            if reply is not None:
+                return reply
+        raise self._silent(code, attempts)
+
+    def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
+        """Send once and wait for the reply to this code."""
+        while self._receive(0.0) is not None:
+            pass  # replies that came too late for an earlier attempt
+        try:
+            self._socket.sendto(dca1000.encode_request(code, data), self._address)
+        except OSError as e:
+            if e.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
+                raise no_route(self.board, f"no way to {self._name()} from {self.board.host_address}") from None
+            what = f"sending to {self._name()} failed: {e.strerror}"
+            raise silent_card(self.board, what, self._kernel_root) from e
+        deadline = time.monotonic() + limit_s
+        while (left := deadline - time.monotonic()) > 0:
+            reply = self._receive(left)
+            if reply is not None and reply.code == code:
+                return reply
+        return None
+
+    def _receive(self, limit_s: float) -> Reply | None:
+        """The next reply, or None after `limit_s`. Status messages are noted on the way, strangers are counted."""
+        deadline = time.monotonic() + limit_s
+        while True:
+            left = max(0.0, deadline - time.monotonic())
+            if not select.select([self._socket], [], [], left)[0]:
+                return None
+            try:
+                raw, (address, _) = self._socket.recvfrom(2048)
+            except (BlockingIOError, ConnectionError):
+                continue
+            if address != self.board.card_address:
+                self.strangers += 1
+                continue
+            try:
+                reply = dca1000.decode_reply(raw)
+            except ProtocolError:
+                self.strangers += 1
+                continue
+            if reply.code != Code.STATUS:
+                return reply
+            self._status |= Status(reply.status & 0x0FFF)
+
+    def _name(self) -> str:
+        return f"capture card of {self.board.name} at {self.board.card_address}:{self.board.command_port}"
+
+    def _silent(self, code: Code, attempts: int) -> DeviceError:
+        """The error for a card that does not answer, with the hop that is silent as far as it can be told."""
+        tried = f"{attempts} attempts" if attempts > 1 else "asked once"
+        what = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
+        return silent_card(self.board, what, self._kernel_root)

@@ -1,0 +1,153 @@
+"""The DCA1000's bytes: requests, replies, asynchronous status and data packet headers. No sockets here.
+
+Specification: docs/spec/dca1000.md. Everything is little-endian.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+from shared.errors import ProtocolError
+
+REQUEST_MAGIC = 0xA55A
+FOOTER = 0xEEAA
+MAX_REQUEST_DATA = 504
+CARD_SOURCE_PORT = 1024  # replies and data leave the card from here, whatever port it listens on
+PACKET_HEADER_BYTES = 10
+MAX_PAYLOAD_BYTES = 1456
+MAX_PACKET_BYTES = PACKET_HEADER_BYTES + MAX_PAYLOAD_BYTES
+BYTE_COUNT_BITS = 48
+SEQUENCE_BITS = 32
+DELAY_TICKS_PER_US = 125  # the card counts 8 ns ticks
+_HEAD = struct.Struct("<HHH")
+_REPLY = struct.Struct("<HHHH")
+_PACKET = struct.Struct("<IIH")
+_FOOTER = struct.Struct("<H")
+
+
+class Code(IntEnum):
+    """Command codes."""
+
+    RESET_FPGA = 0x01
+    RESET_RADAR = 0x02
+    CONFIGURE_FPGA = 0x03
+    CONFIGURE_EEPROM = 0x04
+    RECORD_START = 0x05
+    RECORD_STOP = 0x06
+    ALIVE = 0x09
+    STATUS = 0x0A
+    CONFIGURE_PACKET = 0x0B
+    VERSION = 0x0E
+
+
+class Status(IntFlag):
+    """Bits of the asynchronous status (code 0x0A)."""
+
+    NO_LVDS_DATA = 1 << 0
+    NO_HEADER = 1 << 1
+    EEPROM_FAILURE = 1 << 2
+    SD_CARD_DETECTED = 1 << 3
+    SD_CARD_REMOVED = 1 << 4
+    SD_CARD_FULL = 1 << 5
+    MODE_CONFIGURATION_FAILED = 1 << 6
+    DDR_FULL = 1 << 7
+    RECORD_COMPLETED = 1 << 8
+    LVDS_BUFFER_FULL = 1 << 9
+    PLAYBACK_COMPLETED = 1 << 10
+    PLAYBACK_OUT_OF_SEQUENCE = 1 << 11
+
+
+LOST_BEFORE_PACKETS = Status.DDR_FULL | Status.LVDS_BUFFER_FULL
+"""On these bits the card dropped data before it numbered the packets: bytes are gone without a gap in the counters."""
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Eight bytes from the card: the answer to a command, or (code STATUS) an asynchronous status."""
+
+    code: int
+    status: int
+
+
+@dataclass(frozen=True)
+class Version:
+    """FPGA version of a card."""
+
+    major: int
+    minor: int
+    playback: bool
+
+    def __str__(self) -> str:
+        return f"{self.major}.{self.minor}{' (playback)' if self.playback else ''}"
+
+
+def encode_request(code: int, data: bytes = b"") -> bytes:
+    """A request as sent to the card. Raises ProtocolError when `data` is longer than the card takes."""
+    if len(data) > MAX_REQUEST_DATA:
+        raise ProtocolError(f"request data of {len(data)} bytes is longer than {MAX_REQUEST_DATA}")
+    return _HEAD.pack(REQUEST_MAGIC, code, len(data)) + data + _FOOTER.pack(FOOTER)
+
+
+def decode_request(raw: bytes) -> tuple[int, bytes]:
+    """(code, data) of a request. Raises ProtocolError when the bytes are not a request."""
+    if len(raw) < _HEAD.size + _FOOTER.size:
+        raise ProtocolError(f"request of {len(raw)} bytes is shorter than its frame")
+    magic, code, size = _HEAD.unpack_from(raw)
+    data = raw[_HEAD.size : -_FOOTER.size]
+    if magic != REQUEST_MAGIC or _FOOTER.unpack(raw[-_FOOTER.size :])[0] != FOOTER or size != len(data):
+        raise ProtocolError(f"not a DCA1000 request: {raw[:16].hex(' ')}")
+    return code, data
+
+
+def encode_reply(code: int, status: int) -> bytes:
+    """A reply as the card sends it."""
+    return _REPLY.pack(REQUEST_MAGIC, code, status, FOOTER)
+
+
+def decode_reply(raw: bytes) -> Reply:
+    """A reply or asynchronous status. Raises ProtocolError when the bytes are not one."""
+    if len(raw) != _REPLY.size:
+        raise ProtocolError(f"reply of {len(raw)} bytes, expected {_REPLY.size}: {raw[:16].hex(' ')}")
+    magic, code, status, footer = _REPLY.unpack(raw)
+    if magic != REQUEST_MAGIC or footer != FOOTER:
+        raise ProtocolError(f"not a DCA1000 reply: {raw.hex(' ')}")
+    return Reply(code, status)
+
+
+def configure_fpga_data(lanes: int = 4, timer: int = 30) -> bytes:
+    """Body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), capture, ethernet, 16 bit, timer."""
+    if lanes not in (2, 4):
+        raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}")
+    return bytes([1, 1 if lanes == 4 else 2, 1, 2, 3, timer])
+
+
+def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:
+    """Body of 0x0B: packet size, delay between packets in 8 ns ticks, zero. 1470 and 25 us is `be 05 35 0c 00 00`."""
+    ticks = round(delay_us * DELAY_TICKS_PER_US)
+    if not 0 <= ticks <= 0xFFFF:
+        raise ProtocolError(f"packet delay of {delay_us} us is {ticks} ticks of 8 ns, outside 0..65535")
+    return struct.pack("<HHH", packet_bytes, ticks, 0)
+
+
+def decode_version(status: int) -> Version:
+    """FPGA version from the status word of the reply to 0x0E: bits 0-6 major, 7-13 minor, 14 playback."""
+    return Version(status & 0x7F, (status >> 7) & 0x7F, bool(status >> 14 & 1))
+
+
+def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
+    """A data packet; both counters wrap."""
+    count = byte_count & ((1 << BYTE_COUNT_BITS) - 1)
+    return _PACKET.pack(sequence & 0xFFFFFFFF, count & 0xFFFFFFFF, count >> 32) + payload
+
+
+def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
+    """(sequence, byte count); the byte count is the number of payload bytes before this packet.
+
+    Raises ProtocolError when there is no payload.
+    """
+    if len(packet) <= PACKET_HEADER_BYTES:
+        raise ProtocolError(f"data packet of {len(packet)} bytes holds no payload")
+    sequence, low, high = _PACKET.unpack_from(packet)
+    return sequence, low | high << 32

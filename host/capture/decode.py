@@ -1,0 +1,135 @@
+"""From the card's bytes to complex IF samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import DataError
+
+Mask = NDArray[np.bool_] | Sequence[tuple[int, int]] | None
+
+
+def row_words(
+    payload: bytes | memoryview | NDArray[np.uint8],
+    mask: Mask,
+    frames: int,
+    samples: int,
+    rx: int = 4,
+    swap_iq: bool = False,
+) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
+    """A 4-lane recording in its own order, without a copy: what `host.sync` takes.
+
+    Parameters, `valid` and errors as of :func:`decode_row`; the words are int16 [frame, sample, 2, rx], I before Q.
+    Those of frames that are not valid mean nothing.
+    """
+    words = _words(payload, frames * samples * rx * 2).reshape(frames, samples, 2, rx)
+    return words[:, :, ::-1] if swap_iq else words, valid_frames(mask, frames, samples * rx * 4)
+
+
+def raw_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
+    """The words behind complex frames [rx, frame, sample] in ADC counts: int16 [frame, sample, 2, rx]."""
+    rx, count, samples = frames.shape
+    out = np.empty((count, samples, 2, rx), np.int16)
+    for part, values in enumerate((frames.real, frames.imag)):
+        np.rint(values.transpose(1, 2, 0), out=out[:, :, part], casting="unsafe")
+    return out
+
+
+def decode_row(
+    payload: bytes | memoryview | NDArray[np.uint8],
+    mask: Mask,
+    frames: int,
+    samples: int,
+    rx: int = 4,
+    swap_iq: bool = False,
+) -> tuple[NDArray[np.complex64], NDArray[np.bool_]]:
+    """Decode a 4-lane recording (AWR2243, xWR12xx/14xx): per sample I of every RX, then Q of every RX.
+
+    Parameters
+    ----------
+    payload
+        Bytes as sent, int16 little-endian, at least frames x samples x rx x 4 of them; more are ignored.
+    mask
+        What is missing: bool per byte (True = missing), or byte ranges (start, stop), or None.
+    frames, samples, rx
+        Frames of one chirp, ADC samples of a chirp, RX antennas.
+    swap_iq
+        True when the recording has Q first.
+
+    Returns
+    -------
+    samples
+        complex64 [rx, frame, sample], ADC counts. Frames with any missing byte are zero.
+    valid
+        bool [frame], False where a byte of the frame is missing.
+
+    Raises
+    ------
+    DataError
+        when the payload is shorter than frames x samples x rx say.
+    """
+    words, valid = row_words(payload, mask, frames, samples, rx, swap_iq)
+    out = np.empty((rx, frames, samples), dtype=np.complex64)
+    out.real = words[:, :, 0].transpose(2, 0, 1)
+    out.imag = words[:, :, 1].transpose(2, 0, 1)
+    out[:, ~valid] = 0
+    return out, valid
+
+
+def decode_two_lane(
+    payload: bytes | memoryview | NDArray[np.uint8], chirps: int, samples: int, rx: int = 4, swap_iq: bool = False
+) -> NDArray[np.complex64]:
+    """Decode a 2-lane recording (xWR16xx/18xx/68xx): a whole chirp of RX0, then RX1..., as I0 I1 Q0 Q1 I2 I3 Q2 Q3.
+
+    `samples` must be even. Returns complex64 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
+    """
+    if samples % 2:
+        raise DataError(f"a 2-lane chirp has an even number of samples, not {samples}", "wrong number of samples given")
+    words = _words(payload, chirps * samples * rx * 2).reshape(chirps, rx, samples // 2, 2, 2)
+    first, second = (1, 0) if swap_iq else (0, 1)
+    out = np.empty((rx, chirps, samples), dtype=np.complex64)
+    out.real = words[:, :, :, first, :].reshape(chirps, rx, samples).transpose(1, 0, 2)
+    out.imag = words[:, :, :, second, :].reshape(chirps, rx, samples).transpose(1, 0, 2)
+    return out
+
+
+def decode_real(
+    payload: bytes | memoryview | NDArray[np.uint8], lanes: int, chirps: int, samples: int, rx: int = 4
+) -> NDArray[np.float32]:
+    """Decode a recording of real samples: with 4 lanes every RX a sample, with 2 a whole chirp of RX0, then RX1...
+
+    Returns float32 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
+    """
+    words = _words(payload, chirps * samples * rx)
+    if lanes == 4:
+        return words.reshape(chirps, samples, rx).transpose(2, 0, 1).astype(np.float32)
+    return words.reshape(chirps, rx, samples).transpose(1, 0, 2).astype(np.float32)
+
+
+def valid_frames(mask: Mask, frames: int, frame_bytes: int) -> NDArray[np.bool_]:
+    """Bool [frame]: whether every byte of the frame is there. `mask` as in :func:`decode_row`."""
+    valid = np.ones(frames, dtype=np.bool_)
+    if mask is None:
+        return valid
+    if isinstance(mask, np.ndarray):
+        if mask.size < frames * frame_bytes:
+            raise DataError(f"mask of {mask.size} bytes is shorter than {frames} frames of {frame_bytes} bytes")
+        return np.logical_not(np.any(mask[: frames * frame_bytes].reshape(frames, frame_bytes), axis=1))
+    for start, stop in mask:
+        if stop > start:
+            valid[start // frame_bytes : (stop - 1) // frame_bytes + 1] = False
+    return valid
+
+
+def _words(payload: bytes | memoryview | NDArray[np.uint8], count: int) -> NDArray[np.int16]:
+    raw = np.frombuffer(payload, dtype=np.uint8)
+    if raw.size < count * 2:
+        raise DataError(
+            f"recording of {raw.size} bytes is shorter than the {count * 2} bytes its shape needs",
+            "truncated file, or wrong numbers of frames, samples or RX",
+            "check the chirp and burst of the rig file the recording was made with",
+        )
+    return raw[: count * 2].view("<i2")

@@ -1,0 +1,204 @@
+"""What is in a recording of a DCA1000: shape, range profile, clipping, missing antennas, order of I and Q.
+
+What is not known is guessed from the statistics, and called a guess. `inspect_pcap.py` reads packet captures,
+`inspect_text.py` says it for people, `plot.py` draws it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.capture.dca1000 import Status
+from host.capture.packets_in_file import packets_in_file, place_packets
+from host.capture.placed import Placed
+from host.capture.shape import (
+    DRAW,
+    SAMPLES_TRIED,
+    Shape,
+    best_shape,
+    candidates,
+    decode,
+    is_mirrored,
+    is_offset_binary,
+    spectra,
+    spectral_disorder,
+)
+from shared.config import Instrument
+from shared.errors import DataError
+
+_FULL_SCALE = 32767
+_MUCH_DC = 0.05 * _FULL_SCALE
+_CLEARLY = 4 * DRAW  # so much less disorder in another layout contradicts the one that was given
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a recording beforehand; what is None is guessed."""
+
+    lanes: int | None = None
+    is_complex: bool | None = None
+    samples: int | None = None
+    rx: int = 4
+    q_first: bool | None = None
+
+    @staticmethod
+    def of_shape(shape: Shape, q_first: bool | None = False) -> Known:
+        """Everything, for a recording of this layout."""
+        return Known(shape.lanes, shape.is_complex, shape.samples, shape.rx, q_first)
+
+    @staticmethod
+    def of_instrument(rig: Instrument) -> Known:
+        """What a rig file makes the card send; I first, as mmWave Studio configures it."""
+        return Known.of_shape(Shape.of_instrument(rig))
+
+
+@dataclass
+class Report:
+    """What a recording holds.
+
+    `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
+    float64 [samples], or half as many of real samples. `rx_profile_db` is the same of every antenna over the same
+    median. `rx_rms` and `rx_dc` are one value an antenna, ADC counts. `guessed` names what was not given.
+    """
+
+    path: Path
+    bytes: int
+    lanes: int
+    is_complex: bool
+    rx: int
+    chirps: int
+    samples: int
+    q_first: bool
+    peak_bin: int
+    peak_db: float
+    clipped: int
+    rx_dc: list[float]
+    rx_rms: list[float]
+    left_over_bytes: int
+    profile_db: NDArray[np.float64]
+    rx_profile_db: NDArray[np.float64]
+    guessed: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    card: CardReport | None = None
+    simulated: bool = False
+
+
+@dataclass
+class CardReport:
+    """What a packet capture says about the card: replies (code, status), FPGA version, status, the record."""
+
+    address: str
+    replies: list[tuple[str, int]]
+    version: str
+    status: Status
+    record: Placed | None
+    tail_bytes: int
+    tail_after_s: float
+
+
+def inspect_bin(path: Path, known: Known = Known()) -> Report:
+    """Inspect a payload file; says so when it does not hold what is known of it.
+
+    Raises DataError when it is absent, or shorter than one chirp.
+    """
+    try:
+        payload = np.fromfile(path, dtype=np.uint8)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read: {e.strerror}", "the path is wrong", "give a recording") from None
+    packets = packets_in_file(payload)
+    if not packets:
+        return inspect_payload(path, payload, known)
+    report = inspect_payload(path, place_packets(packets)[0], known)
+    report.remarks.append("whole packets, not payload: read by their counters, which a program must cut off first")
+    return report
+
+
+def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Report:
+    """Inspect payload bytes, uint8 [n]; `path` is for the report. Raises DataError as :func:`inspect_bin`."""
+    lanes, is_complex, samples, rx, q_first = known.lanes, known.is_complex, known.samples, known.rx, known.q_first
+    given: dict[str, object] = {"lanes": lanes, "complex or real": is_complex, "samples": samples}
+    shapes = candidates(lanes, is_complex, samples, rx, payload.size)
+    if not shapes:
+        raise DataError(
+            f"{path}: {payload.size} bytes are not even one chirp of {samples or min(SAMPLES_TRIED)} samples x {rx} RX",
+            "empty or truncated file",
+            "record again; `polysight inspect` needs at least one chirp",
+        )
+    words = payload[: payload.size // 2 * 2].view("<i2")
+    remarks = []
+    if is_offset_binary(words):
+        remarks.append("offset binary, not two's complement: read with its sign bit turned round")
+        words = words ^ np.int16(-0x8000)
+    values = words.view(np.uint8)
+    shape = best_shape(values, shapes)
+    remarks += _contradiction(values, shape)
+    mirrored = shape.is_complex and is_mirrored(spectra(decode(values, shape)).mean(axis=(0, 1)))
+    if shape.is_complex and q_first is None:
+        given["I/Q order"], q_first = None, mirrored
+    q_first = bool(q_first)
+    cube = decode(values, shape, q_first)
+    power = spectra(cube).mean(axis=1)
+    profile, each = _over_median(power)
+    # Without the bins that a constant offset fills through the window, on both sides of zero.
+    peak = 2 + int(np.argmax(profile[2:-1] if shape.is_complex else profile[2:]))
+    report = Report(
+        path=path,
+        bytes=int(payload.size),
+        lanes=shape.lanes,
+        is_complex=shape.is_complex,
+        rx=rx,
+        chirps=payload.size // shape.chirp_bytes,
+        samples=shape.samples,
+        q_first=q_first,
+        peak_bin=peak,
+        peak_db=float(profile[peak]),
+        clipped=int(((words >= _FULL_SCALE) | (words <= -_FULL_SCALE - 1)).sum()),
+        rx_dc=[float(v) for v in np.abs(cube.mean(axis=(1, 2)))],
+        rx_rms=[float(v) for v in np.sqrt(np.mean(np.abs(cube) ** 2, axis=(1, 2)))],
+        left_over_bytes=int(payload.size % shape.chirp_bytes),
+        profile_db=profile,
+        rx_profile_db=each,
+        guessed=[name for name, value in given.items() if value is None],
+    )
+    if mirrored != q_first and shape.is_complex:
+        report.remarks.append("most power is at negative frequencies: I and Q seem to be in the other order")
+    report.remarks += remarks + _remarks(report)
+    return report
+
+
+def _contradiction(values: NDArray[np.uint8], shape: Shape) -> list[str]:
+    """What is said when another layout of the same bytes fits far better than the one taken."""
+    others = [s for s in candidates(None, None, None, shape.rx, values.size) if s != shape]
+    better = best_shape(values, [shape, *others])
+    gain = spectral_disorder(values, shape) - spectral_disorder(values, better)
+    return [f"the data look like {better}, not {shape}: wrong lanes, or another chirp"] if gain > _CLEARLY else []
+
+
+def _over_median(power: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean over antennas, and every antenna, in dB over the median of the mean. `power` is [rx, bin]."""
+    mean = power.mean(axis=0)
+    floor = max(float(np.median(mean)), 1e-12)
+    return 10 * np.log10(np.maximum(mean, 1e-12) / floor), 10 * np.log10(np.maximum(power, 1e-12) / floor)
+
+
+def _remarks(r: Report) -> list[str]:
+    found = []
+    if r.bytes and max(r.rx_rms) == 0:
+        found.append("every sample is zero: nothing was recorded")
+    elif silent := [k for k, v in enumerate(r.rx_rms) if v < 0.01 * max(r.rx_rms)]:
+        found.append(f"RX {', '.join(map(str, silent))} hold no signal: antennas off, or another lane layout")
+    if r.clipped:
+        found.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
+    if r.left_over_bytes:
+        found.append(f"{r.left_over_bytes} bytes after the last whole chirp: truncated, or another shape")
+    if r.rx_dc and max(r.rx_dc) > _MUCH_DC:
+        found.append(
+            f"constant offset of {max(r.rx_dc):.0f} counts: not what this radar's high-pass filter lets through"
+        )
+    if r.peak_db < 10 and max(r.rx_rms) > 0:
+        found.append("no clear peak in the range profile: noise, or another shape than guessed")
+    return found

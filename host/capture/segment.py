@@ -1,0 +1,127 @@
+"""The file one row of one board is received into, and its index of arrivals and gaps.
+
+`<row>.idx` is one JSON line (counts, gaps) followed by int64 little-endian pairs (arrival on the monotonic clock in ns,
+bytes of the row up to which data had come by then), one pair a batch of packets.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import DataError, DeviceError
+
+PAIR = np.dtype("<i8")
+_FULL = ("the disk is full or fails", "free space, then `polysight resume` takes the row again")
+_DAMAGED = ("the file is damaged or truncated", "`polysight validate` of its scan folder names every damaged file")
+
+
+class Segment:
+    """A file of known size, its space on the disk reserved; its bytes are gathered in memory until :meth:`finish`.
+
+    In memory, because a mapped file can make the receiver wait for the disk whenever the kernel writes the file back,
+    while the receive buffer holds a quarter of a second. A row that was not finished is re-taken anyway.
+
+    Parameters
+    ----------
+    path
+        The file; its folder is made.
+    size
+        Bytes.
+    memory
+        uint8 [at least size] to gather in, from an earlier segment; new memory when it is None or too small.
+
+    Attributes
+    ----------
+    data
+        uint8 [size], zero at first.
+    memory
+        For the next segment.
+
+    Raises
+    ------
+    DeviceError
+        when the disk has no room or cannot be written.
+    """
+
+    def __init__(self, path: Path, size: int, memory: NDArray[np.uint8] | None = None) -> None:
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with ExitStack() as stack:
+                self._file = stack.enter_context(path.open("w+b", buffering=0))
+                stack.callback(path.unlink, missing_ok=True)
+                if size:
+                    # Reserve the space now: a full disk must be an error here, not after the row.
+                    os.posix_fallocate(self._file.fileno(), 0, size)
+                if memory is None or memory.size < size:
+                    memory = np.empty(size, dtype=np.uint8)
+                stack.pop_all()
+        except OSError as e:
+            raise DeviceError(
+                f"{path}: cannot reserve {size} bytes: {e.strerror}",
+                "the disk is full or read-only",
+                "free space, or choose another folder; `polysight resume` goes on from the last committed row",
+            ) from None
+        except MemoryError:
+            raise DeviceError(f"{path}: no memory for a row of {size} bytes", "the row is larger than memory") from None
+        self.memory = memory
+        self.data = memory[:size]
+        self.data.fill(0)  # what does not come must be zero; and the pages are there before the first packet
+
+    def finish(self) -> int:
+        """Write the bytes, make them durable, close; returns their CRC-32. Raises DeviceError when the disk fails."""
+        left = self.data.data
+        crc = zlib.crc32(left)
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            os.fsync(self._file.fileno())
+        except OSError as e:
+            raise DeviceError(f"{self.path}: cannot be made durable: {e.strerror}", *_FULL) from None
+        finally:
+            self.close()
+        return crc
+
+    def close(self) -> None:
+        """Close the file. Twice is once."""
+        self._file.close()
+
+    def discard(self) -> None:
+        """Close and remove the file."""
+        self.close()
+        self.path.unlink(missing_ok=True)
+
+
+def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) -> int:
+    """Write a row's index durably; returns its CRC-32. `arrivals` is int64 [n, 2]. Raises DeviceError."""
+    head = json.dumps({**facts, "arrivals": len(arrivals)}, sort_keys=True, separators=(",", ":"))
+    raw = head.encode("ascii") + b"\n" + arrivals.astype(PAIR).tobytes()
+    try:
+        with path.open("wb") as f:
+            f.write(raw)
+            f.flush()
+            os.fsync(f.fileno())
+    except OSError as e:
+        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *_FULL) from None
+    return zlib.crc32(raw)
+
+
+def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
+    """The facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError when absent or damaged."""
+    try:
+        head, _, tail = path.read_bytes().partition(b"\n")
+        facts = json.loads(head)
+        pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
+    except (OSError, ValueError) as e:
+        raise DataError(f"{path}: not a readable row index: {e}", *_DAMAGED) from None
+    if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
+        raise DataError(f"{path}: the row index does not hold what it says", *_DAMAGED)
+    return facts, pairs

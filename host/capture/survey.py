@@ -1,0 +1,183 @@
+"""Every hop between a capture card and the host's memory, tried in order: which is sound, which is silent."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from host.capture.card import CardClient
+from host.capture.hops import Hop, route_interface, silent_hop, silent_radar
+from host.capture.receiver import ReceiverProcess
+from host.capture.receiver_words import RowCapture
+from host.capture.scheduling import PRIORITY_REMEDY, receiver_cores
+from host.capture.udp import check_receive_buffer
+from shared.config import Board, Instrument
+from shared.errors import DeviceError
+
+Verdict = Literal["ok", "warning", "error", "not checked"]
+HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
+"""From near to far: the host's address and ports, the interface, its cable, the card; then what receives its data."""
+LISTEN = "`polysight card --listen 10`, and `polysight-pi pulse` meanwhile"
+_SILENT_AT = {Hop.ROUTE: "route", Hop.LINK: "link"}
+_TURN_S = 0.05
+
+
+@dataclass(frozen=True)
+class HopFinding:
+    """One hop: how it is, what was found, the likely cause and what to do when it is not ok."""
+
+    hop: str
+    verdict: Verdict
+    found: str = ""
+    why: str = ""
+    remedy: str = ""
+
+
+@dataclass
+class CardSurvey:
+    """What was found out about one board's card. `version` is "" when it did not say."""
+
+    board: Board
+    version: str = ""
+    hops: list[HopFinding] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """Whether no hop is wrong."""
+        return all(hop.verdict != "error" for hop in self.hops)
+
+    @property
+    def silent(self) -> str:
+        """The first hop that is wrong; "" when none is."""
+        return next((hop.hop for hop in self.hops if hop.verdict == "error"), "")
+
+
+def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurvey]:
+    """Try every card of the rig file, all at once, in the order of the rig file.
+
+    Parameters
+    ----------
+    instrument
+        The rig file. Cards of boards that are not recorded are asked too, but nothing is received from them.
+    listen_s
+        Record from every recorded board for so long, to see whether its radar streams; 0 for not at all.
+    """
+    cores = dict(zip(instrument.recorded, receiver_cores(len(instrument.recorded)), strict=True))
+    with ThreadPoolExecutor(len(instrument.boards)) as pool:
+        surveys = [pool.submit(_survey, b, instrument, cores.get(b), listen_s) for b in instrument.boards]
+        return [survey.result() for survey in surveys]
+
+
+def _survey(board: Board, instrument: Instrument, core: int | None, listen_s: float) -> CardSurvey:
+    survey = CardSurvey(board)
+    found = survey.hops
+    try:
+        with CardClient(board, instrument.limits.command_timeout_s) as card:
+            found.append(HopFinding("host", "ok", f"{board.host_address}:{board.command_port} is free to listen at"))
+            found += _reach(survey, card)
+            if survey.ok and board.record:
+                found += _receive(card, instrument, core, listen_s)
+    except DeviceError as e:
+        found.append(_wrong("host", e))
+    tried = {hop.hop for hop in found}
+    found += [HopFinding(hop, "not checked") for hop in HOPS if hop not in tried]
+    return survey
+
+
+def _wrong(hop: str, e: DeviceError) -> HopFinding:
+    return HopFinding(hop, "error", e.what, e.why, e.remedy)
+
+
+def _reach(survey: CardSurvey, card: CardClient) -> Iterator[HopFinding]:
+    """Route, link and card. Where the card answers, the hops before it are sound."""
+    address = card.board.card_address
+    error = None
+    try:
+        card.alive()
+        survey.version = str(card.version())
+    except DeviceError as e:
+        error = e
+    silent = "" if error is None else _SILENT_AT.get(silent_hop(address), "card")
+    way = "loopback" if address.startswith("127.") else route_interface(address) or "not told by this system"
+    for hop, sound in (("route", way), ("link", way), ("card", f"answers, FPGA {survey.version}")):
+        if error is not None and hop == silent:
+            yield _wrong(hop, error)
+            return
+        yield HopFinding(hop, "ok", sound)
+
+
+def _receive(card: CardClient, instrument: Instrument, core: int | None, listen_s: float) -> Iterator[HopFinding]:
+    """The receiving process as a scan starts it, its buffer, and what it gets from the radar."""
+    board, wanted = card.board, instrument.card.receive_buffer_bytes
+    try:
+        receiver = ReceiverProcess(board, wanted, core)
+    except DeviceError as e:
+        yield _wrong("receiver", e)
+        return
+    with receiver:
+        if receiver.warnings:
+            refused = "; ".join(warning.removeprefix(f"{board.name}: ") for warning in receiver.warnings)
+            yield HopFinding("receiver", "warning", receiver.scheduling, refused, PRIORITY_REMEDY)
+        else:
+            yield HopFinding("receiver", "ok", receiver.scheduling)
+        burst_bytes = instrument.burst.pulses * instrument.frame_bytes
+        try:
+            warning = check_receive_buffer(board.name, receiver.granted_bytes, wanted, burst_bytes)
+        except DeviceError as e:
+            yield _wrong("buffer", e)
+            return
+        if warning:
+            yield HopFinding("buffer", "warning", warning.removeprefix(f"{board.name}: "))
+        else:
+            yield HopFinding("buffer", "ok", f"{receiver.granted_bytes} bytes granted, {wanted} asked for")
+        if listen_s > 0:
+            yield _listen(card, receiver, instrument, listen_s)
+        else:
+            yield HopFinding("radar", "not checked", "it sends data only when it is triggered", remedy=LISTEN)
+
+
+def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument, listen_s: float) -> HopFinding:
+    """Record for a time, or until a row's bytes are there, into a file that is removed again."""
+    try:
+        with tempfile.TemporaryDirectory(prefix="polysight-card-") as folder:
+            card.record_stop()
+            card.configure(instrument.card)
+            receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, Path(folder) / "listened.bin")
+            card.record_start()
+            deadline = time.monotonic() + listen_s
+            while time.monotonic() < deadline and not receiver.poll().complete:
+                card.take_status()
+                time.sleep(_TURN_S)
+            card.record_stop()
+            got = receiver.end_row(card.take_status())
+    except DeviceError as e:
+        return _wrong("radar", e)
+    return _wrong("radar", silent_radar(card.board, got)) if got.packets == 0 else _streams(got)
+
+
+def _streams(got: RowCapture) -> HopFinding:
+    """A radar that sends. Where its record began is not known, so only gaps between packets are certain losses."""
+    text = f"{got.packets} packets, {got.bytes} bytes came"
+    if got.lost_before_packets:
+        return HopFinding(
+            "radar",
+            "warning",
+            text,
+            f"the card reports {got.lost_before_packets.name}: it dropped data itself",
+            "a shorter card.packet_delay_us in instrument.toml lets the card send faster",
+        )
+    if got.gap_bytes or got.strangers:
+        return HopFinding(
+            "radar",
+            "warning",
+            text,
+            f"{got.gap_bytes} bytes are lost in {got.gaps} gaps, {got.kernel_drops} packets dropped by this machine,"
+            f" {got.strangers} came from elsewhere",
+            "check cable and switch, the receive buffer above, and that no two cards have the same ports",
+        )
+    return HopFinding("radar", "ok", text)

@@ -1,0 +1,220 @@
+"""UDP sockets for the capture card: binding with a clear error, a large buffer that is read back, receiving in batches.
+
+`recvmmsg` fetches many packets with one system call into one block of memory, so that the cost of a packet is its copy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import socket
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.capture.dca1000 import MAX_PAYLOAD_BYTES
+from shared.errors import DeviceError
+
+SO_RCVBUFFORCE = 33  # Linux; may exceed net.core.rmem_max, needs CAP_NET_ADMIN
+SO_MEMINFO = 55  # Linux: nine 32-bit words about the socket's memory
+KERNEL_BYTES_A_PACKET = 2304  # what the kernel charges a receive buffer for a full packet (measured)
+_MEMINFO_DROPS = 8
+_RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
+_STRIDE = 1536  # room for the largest packet and for seeing that one is too long
+_MSG_DONTWAIT = socket.MSG_DONTWAIT if hasattr(socket, "MSG_DONTWAIT") else 0x40
+
+
+class _IoVec(ctypes.Structure):
+    _fields_ = (("base", ctypes.c_size_t), ("length", ctypes.c_size_t))
+
+
+class _Header(ctypes.Structure):
+    """`struct msghdr`; addresses as integers, so that numpy can view an array of them."""
+
+    _fields_ = (
+        ("name", ctypes.c_size_t),
+        ("name_length", ctypes.c_uint32),
+        ("vector", ctypes.c_size_t),
+        ("vector_length", ctypes.c_size_t),
+        ("control", ctypes.c_size_t),
+        ("control_length", ctypes.c_size_t),
+        ("flags", ctypes.c_int),
+    )
+
+
+class _Message(ctypes.Structure):
+    """`struct mmsghdr`."""
+
+    _fields_ = (("header", _Header), ("received", ctypes.c_uint32))
+
+
+def bind_udp(address: str, port: int, what: str) -> socket.socket:
+    """A bound, non-blocking, unconnected UDP socket.
+
+    Raises
+    ------
+    DeviceError
+        when the port is taken or the address is not this machine's; `what` says whose socket it is.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    try:
+        sock.bind((address, port))
+    except OSError as e:
+        sock.close()
+        if e.errno == errno.EADDRINUSE:
+            raise DeviceError(
+                f"{what}: {address}:{port} (UDP) is in use",
+                "another program receives from this card, perhaps an earlier one that still runs",
+                f"`ss -ulnp 'sport = :{port}'` shows it; stop it",
+            ) from None
+        if e.errno == errno.EADDRNOTAVAIL:
+            raise DeviceError(
+                f"{what}: {address} is not an address of this machine",
+                "the network interface to the cards is down or has another address",
+                f"`ip address add {address}/24 dev <interface>`, or correct host_address in instrument.toml",
+            ) from None
+        raise DeviceError(f"{what}: cannot bind {address}:{port} (UDP): {e.strerror}", "", "check host_address") from e
+    return sock
+
+
+def enlarge_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
+    """Ask for a receive buffer and return what the kernel grants, in the kernel's accounting halved back to payload."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted_bytes)
+    if granted_bytes(sock) < wanted_bytes and sys.platform == "linux":
+        with contextlib.suppress(PermissionError):
+            sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, wanted_bytes)
+    return granted_bytes(sock)
+
+
+def granted_bytes(sock: socket.socket) -> int:
+    """The receive buffer in force. Linux reports twice the request, because it counts its own overhead in it."""
+    size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    return size // 2 if sys.platform == "linux" else size
+
+
+def kernel_drops(sock: socket.socket) -> int:
+    """Packets the kernel dropped at this socket since it was opened; 0 where the system does not tell."""
+    try:
+        return struct.unpack("9I", sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36))[_MEMINFO_DROPS]
+    except (OSError, struct.error):
+        return 0
+
+
+class BatchReceiver:
+    """Receives up to `batch` packets at a time into one preallocated block.
+
+    Attributes
+    ----------
+    packets
+        uint8 [batch, 1536]: the packets of the last :meth:`receive`, header included.
+    lengths
+        uint32 [batch]: bytes of each.
+    """
+
+    def __init__(self, sock: socket.socket, source_address: str, batch: int = 256) -> None:
+        self._socket = sock
+        self._source = int.from_bytes(socket.inet_aton(source_address), sys.byteorder)
+        self.packets: NDArray[np.uint8] = np.zeros((batch, _STRIDE), dtype=np.uint8)
+        self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)
+        self.strangers = 0  # packets that did not come from the card's address
+        self._names = np.zeros((batch, 16), dtype=np.uint8)  # struct sockaddr_in of each packet
+        self._sources = self._names[:, 4:8].view(np.uint32)[:, 0]
+        self._vectors = (_IoVec * batch)()
+        self._messages = (_Message * batch)()
+        for i in range(batch):
+            self._vectors[i] = _IoVec(self.packets.ctypes.data + i * _STRIDE, _STRIDE)
+            header = self._messages[i].header
+            header.name, header.name_length = self._names.ctypes.data + 16 * i, 16
+            header.vector, header.vector_length = ctypes.addressof(self._vectors[i]), 1
+        view: Any = np.frombuffer(memoryview(self._messages), dtype=np.dtype(_Message))
+        self._received = view["received"]
+        self._name_lengths = view["header"]["name_length"]
+        self._recvmmsg = getattr(ctypes.CDLL(None, use_errno=True), "recvmmsg", None)
+
+    def receive(self) -> int:
+        """Fetch what is waiting, without waiting; returns the number of packets from the card.
+
+        Strangers' packets are counted and removed.
+        """
+        n = self._fetch()
+        if n == 0:
+            return 0
+        known = self._sources[:n] == self._source
+        if not known.all():
+            self.strangers += int((~known).sum())
+            keep = np.flatnonzero(known)
+            self.packets[: keep.size] = self.packets[keep]
+            self.lengths[: keep.size] = self.lengths[keep]
+            n = int(keep.size)
+        return n
+
+    def _fetch(self) -> int:
+        if self._recvmmsg is None:
+            return self._fetch_one()
+        n = self._recvmmsg(self._socket.fileno(), self._messages, len(self._messages), _MSG_DONTWAIT, None)
+        if n < 0:
+            number = ctypes.get_errno()
+            if number in (errno.EAGAIN, errno.EINTR):
+                return 0
+            raise DeviceError(f"receiving from the capture card failed: {os.strerror(number)}")
+        self.lengths[:n] = self._received[:n]
+        self._name_lengths[:n] = 16
+        return n
+
+    def _fetch_one(self) -> int:
+        """The portable way: one packet a call."""
+        try:
+            size, sender = self._socket.recvfrom_into(memoryview(self.packets[0]))
+        except BlockingIOError:
+            return 0
+        self.lengths[0] = size
+        self._sources[0] = int.from_bytes(socket.inet_aton(sender[0]), sys.byteorder)
+        return 1
+
+
+def usable_packets(buffer_bytes: int) -> int:
+    """How many full packets a receive buffer holds: the kernel charges about 2304 bytes of memory for each."""
+    return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET
+
+
+def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int, rmem_max: Path = _RMEM_MAX) -> str:
+    """A warning when the kernel granted less than was asked for; "" when it did not.
+
+    Parameters
+    ----------
+    name
+        Board, for the message.
+    granted, wanted
+        Bytes of the receive buffer, read back and asked for.
+    burst_bytes
+        Data of one burst. A buffer that does not hold two cannot bridge a pause of the receiver.
+    rmem_max
+        Where the kernel says its limit.
+
+    Raises
+    ------
+    DeviceError
+        when the buffer holds less than two bursts; the remedy is the command that lifts the limit.
+    """
+    enough = max(wanted, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
+    remedy = f"`sysctl -w net.core.rmem_max={enough}`, and the same in /etc/sysctl.d/ to keep it"
+    try:
+        limit = f"net.core.rmem_max is {int(rmem_max.read_text(encoding='ascii'))}"
+    except (OSError, ValueError):
+        limit = "net.core.rmem_max limits it"
+    if usable_packets(granted) * MAX_PAYLOAD_BYTES < 2 * burst_bytes:
+        raise DeviceError(
+            f"{name}: the kernel grants a receive buffer of {granted} bytes, less than two bursts of {burst_bytes}",
+            limit if granted < wanted else "card.receive_buffer_bytes asks for no more",
+            remedy if granted < wanted else f"card.receive_buffer_bytes = {enough} in instrument.toml; {remedy}",
+        )
+    if granted < wanted:
+        return f"{name}: receive buffer of {granted} bytes granted, {wanted} asked for ({limit}); {remedy}"
+    return ""

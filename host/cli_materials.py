@@ -1,0 +1,117 @@
+"""The options of the commands on materials: permittivity, concentration, classify."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from host.materials.layers import Layer
+
+
+class Add(Protocol):
+    """How a command is added to `polysight`."""
+
+    def __call__(
+        self, name: str, run: Callable[[argparse.Namespace], int], text: str, example: str
+    ) -> argparse.ArgumentParser:
+        """A parser for the command's own options."""
+        ...
+
+
+def _permittivity(args: argparse.Namespace) -> int:
+    from host.material_commands import permittivity
+
+    return permittivity(args.products, args.config, args.layer, args.segment, args.json)
+
+
+def _concentration(args: argparse.Namespace) -> int:
+    from host.material_commands import concentration
+
+    return concentration(args.data, dict(args.value), args.confidence, args.json)
+
+
+def _classify(args: argparse.Namespace) -> int:
+    from host.material_commands import classify
+
+    return classify(args.library, args.json)
+
+
+def _layer(text: str) -> Layer:
+    from host.material_commands import parse_layer
+
+    try:
+        return parse_layer(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is neither NAME,REAL,LOSS,MM (known; without MM a half space) nor NAME,?,MM (the unknown one)"
+        ) from None
+
+
+def _value(text: str) -> tuple[str, float]:
+    name, _, number = text.rpartition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PERCENT, e.g. water=0") from None
+
+
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0.5 <= value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not a share from 0.5 to below 1")
+    return value
+
+
+def add_material_commands(add: Add, rig: Path) -> None:
+    """`polysight permittivity`, `polysight concentration` and `polysight classify`."""
+    sub = add(
+        "permittivity",
+        _permittivity,
+        "permittivity of the patches of a processed scan, also of a thin sheet or of a liquid behind a wall",
+        "polysight permittivity out/one --segment 3 --layer glass,5.5,0.05,3 --layer liquid,?",
+    )
+    sub.add_argument("products", type=Path, metavar="PRODUCTS", help="folder that polysight process wrote")
+    sub.add_argument("--segment", type=int, metavar="N", help="this patch only (default: all)")
+    sub.add_argument(
+        "--layer",
+        type=_layer,
+        action="append",
+        default=[],
+        metavar="LAYER",
+        help="layers in the order the wave meets them: NAME,REAL,LOSS,MM for a known one, NAME,?,MM for the unknown"
+        " one; without MM the last one has no back (default: one interface)",
+    )
+    sub.add_argument("--config", type=Path, default=rig, metavar="FILE", help="rig file of the scan")
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+    sub = add(
+        "concentration",
+        _concentration,
+        "concentration of a solution from its polarisation angle, each concentration judged by the others",
+        "polysight concentration sugar.npz --value water=0",
+    )
+    sub.add_argument("data", type=Path, metavar="LIBRARY", help="library (.npz), or folder of published material files")
+    sub.add_argument(
+        "--value",
+        type=_value,
+        action="append",
+        default=[],
+        metavar="NAME=PERCENT",
+        help="concentration of a material whose name does not tell it as '(3.8%%)' does",
+    )
+    sub.add_argument("--confidence", type=_share, default=0.9, help="of the intervals (default: 0.9)")
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+    sub = add(
+        "classify",
+        _classify,
+        "judge the classifiers on a library, with whole scans left out and by pixel",
+        "polysight classify library.npz",
+    )
+    sub.add_argument(
+        "library", type=Path, metavar="LIBRARY", help="library (.npz), or folder of published material files"
+    )
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")

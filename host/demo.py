@@ -1,0 +1,142 @@
+"""`polysight demo`: the simulated rig and the host as separate processes, and the report at the end.
+
+The simulators are started as programs, never imported: nothing at run time depends on them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import selectors
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from shared.config import load_instrument
+from shared.errors import ConfigError, DeviceError
+
+_MARK = ".polysight-demo"
+_START_LIMIT_S = 60.0
+_STOP_LIMIT_S = 10.0
+TIME_SCALE = 40.0
+"""Simulated seconds a second: the demo's rows of 18 s pass in about half a second each."""
+
+
+def run_simulator(arguments: Sequence[str]) -> int:
+    """Run `python -m simulators ...` and return its exit status. Raises ConfigError when it is not installed."""
+    _require_simulators()
+    return subprocess.run([sys.executable, "-m", "simulators", *arguments], check=False).returncode
+
+
+def _require_simulators() -> None:
+    if importlib.util.find_spec("simulators") is None:
+        raise ConfigError(
+            "the simulators are not installed",
+            "only the host half was installed",
+            "pip install ./simulators from the repository, or use make",
+        )
+
+
+def _fresh_folder(out: Path) -> None:
+    """Make an empty folder; an earlier demo's is replaced, anything else is left alone."""
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out} is a file", "a demo needs a folder", "give another --out")
+    if out.exists() and any(out.iterdir()):
+        if not (out / _MARK).exists():
+            raise ConfigError(f"{out} is not empty", "it holds something else than a demo", "give another --out")
+        shutil.rmtree(out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / _MARK).touch()
+
+
+@contextmanager
+def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) -> Iterator[Path]:
+    """The simulated rig with its Pi process, running; yields the rig file that reaches it.
+
+    It runs in a session of its own, so that Ctrl-C ends the scan first and the rig after it.
+
+    Raises
+    ------
+    DeviceError
+        when it does not start; its logs are in `folder`/logs.
+    """
+    _require_simulators()
+    command = [sys.executable, "-m", "simulators.rig", "--config", str(config), "--scene", str(scene)]
+    command += ["--dir", str(folder), "--time-scale", str(time_scale), "--with-pi", "--native"]
+    rig = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        yield _wait_ready(rig, folder)
+    finally:
+        rig.send_signal(signal.SIGTERM)
+        try:
+            rig.communicate(timeout=_STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            rig.kill()
+            rig.communicate()
+
+
+def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
+    """The rig file named by the rig's `ready` line."""
+    if rig.stdout is None or rig.stderr is None:
+        raise DeviceError("the simulated rig has no output to read")
+    deadline = time.monotonic() + _START_LIMIT_S
+    with selectors.DefaultSelector() as selector:
+        selector.register(rig.stdout, selectors.EVENT_READ)
+        while (left := deadline - time.monotonic()) > 0:
+            if not selector.select(left):
+                continue
+            line = rig.stdout.readline()
+            if line.startswith("ready "):
+                return Path(line.removeprefix("ready ").strip())
+            if not line:
+                message = rig.stderr.read().strip().removeprefix("error: ")  # says what, why and what to do
+                raise DeviceError(message or f"the simulated rig ended with status {rig.wait()}, without a word")
+    raise DeviceError(
+        f"the simulated rig was not ready within {_START_LIMIT_S:.0f} s",
+        "an overloaded machine",
+        f"see {folder / 'logs'}",
+    )
+
+
+def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> int:
+    """Scan a scene with the simulated rig; returns the scan's exit status.
+
+    Raises
+    ------
+    PolysightError
+        when a file is wrong, the folder is taken, or a part of the rig does not start.
+    KeyboardInterrupt
+        after the scan and the rig have been ended.
+    """
+    began = time.monotonic()
+    load_instrument(config)
+    _fresh_folder(out)
+    sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
+    with simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
+        scan = [sys.executable, "-m", "host.cli", "scan", "--config", str(rig_file), "--out", str(out / "scan")]
+        scan += ["--truth", str(rig_file.parent / "truth.json")]
+        status = _run_to_its_end(scan)
+    if status == 0:
+        sys.stdout.write(f"simulated demo: {time.monotonic() - began:.0f} s in all\n")
+    else:
+        sys.stderr.write(f"the logs of the simulated rig are in {out / 'rig' / 'logs'}\n")
+    return abs(status)
+
+
+def _run_to_its_end(command: Sequence[str]) -> int:
+    """Run a program and return its status. Ctrl-C ends it first: at once, cleanly, and with one signal only."""
+    child = subprocess.Popen(command, start_new_session=True)
+    try:
+        return child.wait()
+    finally:
+        if child.poll() is None:
+            child.terminate()
+            try:
+                child.wait(_STOP_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()

@@ -1,0 +1,161 @@
+"""Autofocus: the plane's distance and tilt, by the sharpness of the image.
+
+The scene is imaged on a stack of planes parallel to the stage. Any plane, tilted or not, is a cut through that volume,
+so one stack serves the whole search.
+
+Sharpness is that of the intensities, `sum I^2 / (sum I)^2` (Fienup and Miller, J. Opt. Soc. Am. A 20, 2003), with
+intensities counted per resolution cell, not per pixel: cells grow with the plane's distance, and without that the
+nearest plane would look sharpest. Points and edges show the focus; the inside of a plate does not. An aperture of
+length L sees a wrong depth as a phase that grows with L^2: what a wide scan finds to a tenth of a millimetre, a narrow
+one cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from host.imaging.images import ImageBuilder
+from host.imaging.resolution import limit_m
+
+Progress = Callable[[int, int], None]
+_MAX_TILT_DEG = 3.0
+
+
+@dataclass(frozen=True)
+class Focus:
+    """What a focus sweep found.
+
+    Attributes
+    ----------
+    depths_mm
+        float64 [n]: planes of the sweep, relative to the rig file's.
+    sharpness
+        float64 [n]: of the parallel plane at each depth; 1 for the sharpest.
+    depth_mm
+        How much farther than the rig file says the object's plane is, at the image's centre.
+    tilt_deg
+        Its rise in z along x and along y, as angles.
+    gain
+        Sharpness on the found plane over that on the rig file's.
+    """
+
+    depths_mm: NDArray[np.float64]
+    sharpness: NDArray[np.float64]
+    depth_mm: float
+    tilt_deg: tuple[float, float]
+    gain: float
+
+    @property
+    def certain(self) -> bool:
+        """Whether the sharpness falls to both sides of what was found, by more than 2 % at the sweep's ends."""
+        inside = abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
+        return inside and float(max(self.sharpness[0], self.sharpness[-1])) < 0.98
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        return {
+            "depth_mm": round(self.depth_mm, 3),
+            "tilt_deg": [round(t, 3) for t in self.tilt_deg],
+            "gain": round(self.gain, 6),
+            "certain": self.certain,
+            "depths_mm": self.depths_mm.tolist(),
+            "sharpness": self.sharpness.tolist(),
+        }
+
+
+def focus_sweep(
+    builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17, progress: Progress | None = None
+) -> Focus:
+    """Find the plane on which both channels together are sharpest.
+
+    Parameters
+    ----------
+    builder
+        With all rows, and built with `depth_m` at least as large as here.
+    depth_m
+        How far to look to either side of the rig file's plane.
+    planes
+        Planes of the sweep.
+    progress
+        Called with planes done and planes in all.
+    """
+    grid = builder.grid
+    depths = np.linspace(-depth_m, depth_m, planes)
+    stack = np.zeros((planes, *grid.shape))
+    for i, depth in enumerate(depths):
+        for board in builder.boards.values():
+            image = board.image(replace(grid, z_m=float(np.mean(grid.z_m)) + depth))[0]
+            stack[i] += np.abs(image) ** 2
+        if progress is not None:
+            progress(i + 1, planes)
+    cells = _cells(builder, depths)
+    x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
+
+    def sharpness(plane: NDArray[np.float64]) -> float:
+        """On a plane: its depth in mm at the centre, and its rise along x and y in mm over 100 mm."""
+        depth, along_x, along_y = plane * [1e-3, 1e-2, 1e-2]
+        z = np.clip(depth + along_x * x[None, :] + along_y * y[:, None], depths[0], depths[-1])
+        weight = 1 / _at(cells, depths, z)
+        intensity = _at(stack, depths, z)
+        return float((weight * intensity**2).sum() / max(float((weight * intensity).sum()) ** 2, 1e-300))
+
+    flat = np.array([sharpness(np.array([1e3 * depth, 0.0, 0.0])) for depth in depths])
+    start = np.array([1e3 * depths[int(np.argmax(flat))], 0.0, 0.0])
+    rise = 1e2 * float(np.tan(np.radians(_MAX_TILT_DEG)))
+    found = scipy.optimize.minimize(
+        lambda plane: -sharpness(plane) / flat.max(),
+        start,
+        method="Nelder-Mead",
+        bounds=[(-1e3 * depth_m, 1e3 * depth_m), (-rise, rise), (-rise, rise)],
+        options={"initial_simplex": start + np.vstack([np.zeros(3), np.eye(3)]), "xatol": 0.005, "fatol": 1e-9},
+    )
+    depth, along_x, along_y = found.x
+    gain = -found.fun * flat.max() / sharpness(np.zeros(3))
+    tilt = np.degrees(np.arctan(np.array([along_x, along_y]) / 1e2))
+    return Focus(1e3 * depths, flat / flat.max(), float(depth), (float(tilt[0]), float(tilt[1])), float(gain))
+
+
+def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Area of a resolution cell around every pixel of every plane, relative, [plane, ny, nx].
+
+    From nine places a plane: it varies slowly.
+    """
+    aperture, grid = next(iter(builder.boards.values())).aperture, builder.grid
+    z = float(np.mean(grid.z_m)) + depths
+    axes = (z[[0, -1]], grid.y_m[[0, grid.y_m.size // 2, -1]], grid.x_m[[0, grid.x_m.size // 2, -1]])
+    area = np.array(
+        [
+            [
+                [
+                    limit_m(aperture, np.array([px, py, pz]), 0) * limit_m(aperture, np.array([px, py, pz]), 1)
+                    for px in axes[2]
+                ]
+                for py in axes[1]
+            ]
+            for pz in axes[0]
+        ]
+    )
+    between = RegularGridInterpolator(axes, area, method="linear")
+    return between(tuple(np.meshgrid(z, grid.y_m, grid.x_m, indexing="ij")))
+
+
+def _at(stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Intensity on a surface through the stack, by cubic convolution between its planes (Keys 1981)."""
+    place = (z - depths[0]) / (depths[1] - depths[0])
+    base = np.clip(np.floor(place).astype(np.intp), 1, len(depths) - 3)
+    t = place - base
+    weights = (
+        ((-0.5 * t + 1.0) * t - 0.5) * t,
+        (1.5 * t - 2.5) * t * t + 1.0,
+        ((-1.5 * t + 2.0) * t + 0.5) * t,
+        (0.5 * t - 0.5) * t * t,
+    )
+    rows, columns = np.indices(z.shape)
+    return sum((w * stack[base + i - 1, rows, columns] for i, w in enumerate(weights)), np.zeros(z.shape))

@@ -1,0 +1,88 @@
+"""Where pixels, antennas and stage positions are: the geometry that every imager shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.imaging.model import excess_path_m
+from shared.config import Board, Instrument
+from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from shared.raster import Row, mean_burst_travel_mm
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """Pixels of an image: `x_m` [nx] and `y_m` [ny] ascending and evenly spaced by `pixel_m`.
+
+    They lie on the plane at `z_m`, or on any surface where `z_m` is float64 [ny, nx].
+    """
+
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    z_m: float | NDArray[np.float64]
+    pixel_m: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return self.y_m.size, self.x_m.size
+
+    @property
+    def voxels_m(self) -> NDArray[np.float64]:
+        """Every pixel's place, float64 [ny * nx, 3], row by row."""
+        y, x = np.meshgrid(self.y_m, self.x_m, indexing="ij")
+        return np.stack([x.ravel(), y.ravel(), np.broadcast_to(self.z_m, x.shape).ravel()], axis=1)
+
+
+def image_grid(rig: Instrument) -> ImageGrid:
+    """The configured grid, centred on the specular midpoint of TX and H, on the object plane."""
+    x, y, z = specular_midpoint_m(rig, rig.receivers[0])
+    pixel = rig.image.pixel_mm / 1e3
+
+    def axis(n: int, centre: float) -> NDArray[np.float64]:
+        return centre + (np.arange(n, dtype=np.float64) - (n - 1) / 2) * pixel
+
+    return ImageGrid(axis(rig.image.columns, x), axis(rig.image.rows, y), z, pixel)
+
+
+@dataclass(frozen=True)
+class Antennas:
+    """TX [3] and RX [rx, 3] of one board at stage offset zero, metres."""
+
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rig: Instrument, board: Board) -> Antennas:
+        """Antennas that make a board's image."""
+        return cls(np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board)))
+
+    @property
+    def direct_m(self) -> NDArray[np.float64]:
+        """Direct path to each RX, [rx]."""
+        return np.sqrt(((self.rx_m - self.tx_m) ** 2).sum(axis=1))
+
+    def excess_m(
+        self, dx: NDArray[np.float64], dy: NDArray[np.float64], z: float | NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Excess path `|v - tx| + |v - rx| - |tx - rx|` for `v - u = (dx, dy, z)`, [rx, ...]; u is the stage offset."""
+        pairs = zip(self.rx_m, self.direct_m, strict=True)
+        return np.stack([excess_path_m(np, dx, dy, z, self.tx_m, rx, direct) for rx, direct in pairs])
+
+    def mirror_m(self, z: float) -> NDArray[np.float64]:
+        """Path from TX over a mirror at the plane `z` to each RX, [rx]: the distance from the TX's mirror image."""
+        image = self.tx_m * [1, 1, -1] + [0, 0, 2 * z]
+        return np.sqrt(((self.rx_m - image) ** 2).sum(axis=1))
+
+
+def row_offsets_m(rig: Instrument, row: Row) -> NDArray[np.float64]:
+    """True mean stage offset (x, y) of each point's burst, metres [position, 2], in the order the points are met.
+
+    The stage does not stop: a burst is centred half its duration after the trigger point, so even and odd rows differ.
+    """
+    travel = row.direction * mean_burst_travel_mm(rig.burst, rig.stage)
+    x = np.array([row.x_mm(i) + travel for i in range(row.points)])
+    return np.stack([x, np.full(row.points, row.y_mm)], axis=1) / 1e3

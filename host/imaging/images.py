@@ -1,0 +1,147 @@
+"""From synchronised rows to the two channel images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.signal
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from host.imaging.grid import Antennas, image_grid
+from host.imaging.reduce import Window, reduction, scene_gate_m
+from host.imaging.samples import BoardSamples, Image
+from host.sync.chain import SyncedRow
+from shared.config import Instrument
+from shared.errors import DataError
+from shared.raster import plan_raster
+
+_VISIBLE = 0.15  # of the strongest footprint: weaker pixels would be mostly amplified noise
+_NEIGHBOURS = 15  # pixels
+TAPERS: dict[str, Window] = {"none": "boxcar", "kaiser": ("kaiser", 4.0), "taylor": ("taylor", 4, 30)}
+"""Windows over the aperture by their name in the rig file, as scipy names them."""
+
+
+@dataclass(frozen=True)
+class ChannelImages:
+    """The two channels on one grid.
+
+    Attributes
+    ----------
+    h, v
+        complex64 [ny, nx]: reflectivity, image divided by the footprint of a uniform mirror; 0 where not valid. Still
+        to be referenced to metal: each holds its channel's constant gain.
+    h_raw, v_raw
+        complex64 [ny, nx]: before that division.
+    h_footprint, v_footprint
+        complex64 [ny, nx].
+    x_m, y_m
+        float64 [nx], [ny]: axes in the rig frame.
+    valid
+        bool [ny, nx]: both footprints are strong enough.
+    rx_calibration
+        Board name to complex128 [rx]: gain and phase of each RX, from the direct path, that was divided out.
+    notices
+        What the user should know of how they were made.
+    """
+
+    h: NDArray[np.complex64]
+    v: NDArray[np.complex64]
+    h_raw: NDArray[np.complex64]
+    v_raw: NDArray[np.complex64]
+    h_footprint: NDArray[np.complex64]
+    v_footprint: NDArray[np.complex64]
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    rx_calibration: dict[str, NDArray[np.complex128]]
+    notices: tuple[str, ...] = ()
+
+
+class ImageBuilder:
+    """Collects rows in any order, and forms the images of those it has.
+
+    A row taken again replaces the earlier take. Only reduced samples are kept: 10 frequencies instead of 192.
+
+    Parameters
+    ----------
+    rig
+        The scan's rig file.
+    window
+        Fast-time window, see :func:`host.imaging.reduce.reduction`.
+    taper
+        Window over the aperture in x and y, by scipy's name; "boxcar" for none; None takes the rig file's. A sharp
+        aperture's sidelobes make the inside of a plate depend on all that surrounds it, and H and V differently
+        (docs/decisions/0002-imaging.md).
+    live
+        Let every row update sums, 2 ms a row and board of the published grid, so that :meth:`current` costs next to
+        nothing after each; and make the kernels of the final image beforehand.
+    depth_m
+        Keep echoes of a scene that may lie this much nearer or farther than the rig file says, for autofocus.
+    """
+
+    def __init__(
+        self,
+        rig: Instrument,
+        window: Window = "hann",
+        taper: Window | None = None,
+        live: bool = False,
+        depth_m: float = 0.0,
+    ) -> None:
+        self.grid = image_grid(rig)
+        plan = plan_raster(rig.grid)
+        antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
+        gate = scene_gate_m(antennas, plan, self.grid, depth_m)
+        taper = TAPERS[rig.image.apodisation] if taper is None else taper
+        weights = np.outer(_window(taper, plan.rows), _window(taper, plan.columns)).astype(np.float32)
+        gated = reduction(rig.chirp, gate, window)
+        self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
+
+    def add_row(
+        self, board_name: str, row_index: int, row: SyncedRow, offsets_m: NDArray[np.float64] | None = None
+    ) -> None:
+        """Take in one synchronised row of one board, see :meth:`host.imaging.samples.BoardSamples.add_row`.
+
+        Raises
+        ------
+        DataError
+            when the row is not one of this plan's.
+        """
+        if board_name not in self.boards:
+            raise DataError(
+                f"row {row_index} of board {board_name!r} is not in this scan",
+                "data and rig file do not belong together",
+                "use the rig file of this scan",
+            )
+        self.boards[board_name].add_row(row_index, row, offsets_m)
+
+    def rx_calibration(self, board_name: str) -> NDArray[np.complex128]:
+        """Complex gain of each RX of a board, [rx]."""
+        return self.boards[board_name].rx_calibration()
+
+    def finish(self) -> ChannelImages:
+        """Both images from the rows added so far, all at once; more rows may follow."""
+        return self._channels({name: board.image() for name, board in self.boards.items()})
+
+    def current(self) -> ChannelImages:
+        """The same within 1e-6 of the peak, for looking on: at once where the builder is `live`."""
+        return self._channels({name: board.current() for name, board in self.boards.items()})
+
+    def _channels(self, made: dict[str, tuple[Image, Image, str | None]]) -> ChannelImages:
+        h, v = made.values()
+        visible = np.ones(self.grid.shape, bool)
+        for _, weight, _ in (h, v):
+            strong = np.abs(weight) >= _VISIBLE * np.abs(weight).max()
+            # The footprint's rim ripples with the row spacing: the majority of the neighbourhood decides, not stripes.
+            visible &= ndimage.median_filter(strong, size=_NEIGHBOURS, mode="nearest") & (weight != 0)
+        flat = [np.divide(raw, w, out=np.zeros_like(raw), where=visible) for raw, w, _ in (h, v)]
+        calibration = {name: board.rx_calibration() for name, board in self.boards.items()}
+        notices = tuple(f"{name}: {notice}" for name, (_, _, notice) in made.items() if notice)
+        axes = (self.grid.x_m, self.grid.y_m)
+        return ChannelImages(flat[0], flat[1], h[0], v[0], h[1], v[1], *axes, visible, calibration, notices)
+
+
+def _window(name: Window, n: int) -> NDArray[np.float64]:
+    """A symmetric window of n points without the zeros at its ends."""
+    return np.asarray(scipy.signal.get_window(name, n + 2, fftbins=False), np.float64)[1:-1]

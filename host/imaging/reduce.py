@@ -1,0 +1,113 @@
+"""Range gate: from 192 fast-time samples to the few frequency samples that the scene can fill.
+
+Every pixel wants the matched filter `S(d) = sum_t w_t x_t exp(-j 2 pi f_t d / c)` for its excess path d, and all d
+lie in a gate `[d_1, d_2]` of few range cells. Functions `exp(-j 2 pi f d / c)` of d on that gate, for f within the
+swept band B, span a space of about `B (d_2 - d_1) / c + 1` dimensions (Landau and Pollak 1962), so each is a
+combination of those at a few evenly spaced f_m: `exp(-j 2 pi f_t d / c) w_t = sum_m M_mt exp(-j 2 pi f_m d / c)`, M
+by least squares over the gate. Then `S(d) = sum_m (M x)_m exp(-j 2 pi f_m d / c)` with `M x` computed once per
+position: the imagers see M x at f_m and nothing else. Six more samples than the time-bandwidth product make the
+error 1e-6 of the peak (docs/decisions/0002-imaging.md has the derivation).
+
+The direct path is a constant in x. It lies outside the gate but close to it, so it is subtracted, not only windowed
+away: its amplitude is the generalised least-squares estimate with the gate as coloured noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+from numpy.typing import NDArray
+
+from host.imaging.grid import Antennas, ImageGrid
+from shared.config import Chirp
+from shared.raster import RasterPlan
+from shared.units import SPEED_OF_LIGHT_M_S
+
+Window = str | tuple[Any, ...]  # as scipy.signal.get_window takes it
+_NOISE = 1e-3  # noise power of one sample beside the gate's, for the direct path's estimate
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """The linear maps of a scan's range gate.
+
+    Attributes
+    ----------
+    frequencies_hz
+        float64 [m].
+    matrix
+        complex128 [m, sample]: window, direct-path removal and projection in one. Samples outside the linear part
+        have weight 0.
+    direct
+        complex128 [sample]: `direct @ x` is the amplitude of the direct path.
+    model
+        complex128 [m, m]: an echo of path d and amplitude 1 comes out as `model @ exp(+j 2 pi frequencies_hz d / c)`.
+    gate_m
+        Excess paths that are kept.
+    """
+
+    frequencies_hz: NDArray[np.float64]
+    matrix: NDArray[np.complex128]
+    direct: NDArray[np.complex128]
+    model: NDArray[np.complex128]
+    gate_m: tuple[float, float]
+
+
+def scene_gate_m(
+    antennas: tuple[Antennas, ...], plan: RasterPlan, grid: ImageGrid, depth_m: float = 0.0
+) -> tuple[float, float]:
+    """Smallest and largest excess path between any pixel, `depth_m` nearer or farther, and any stage position."""
+    half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3  # 2 mm more: the travel within a burst
+    half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
+    dx, dy = np.meshgrid(
+        np.linspace(grid.x_m[0] - half_x, grid.x_m[-1] + half_x, 41),
+        np.linspace(grid.y_m[0] - half_y, grid.y_m[-1] + half_y, 41),
+    )
+    planes = (float(np.min(grid.z_m)) - depth_m, float(np.max(grid.z_m)) + depth_m)
+    excess = np.stack([a.excess_m(dx, dy, z) for a in antennas for z in planes])
+    return float(excess.min()), float(excess.max())
+
+
+def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann", extra: int = 6) -> Reduction:
+    """Build the maps of a gate.
+
+    Parameters
+    ----------
+    chirp
+        The chirp the samples were taken with.
+    gate_m
+        Smallest and largest excess path wanted, metres.
+    window
+        Fast-time window over the linear samples, by scipy's name; "boxcar" for none.
+    extra
+        Frequency samples beyond the time-bandwidth product.
+    """
+    a, b = chirp.linear_samples
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(a, b)
+    weight = np.asarray(scipy.signal.get_window(window, b - a + 2, fftbins=False))[1:-1]
+    weight = weight / weight.sum()
+    band = sweep[-1] - sweep[0]
+    product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
+    frequencies = np.linspace(sweep[0], sweep[-1], int(np.ceil(product)) + extra)
+    d = np.linspace(*gate_m, max(64, 8 * frequencies.size)) / SPEED_OF_LIGHT_M_S
+    wanted = np.exp(-2j * np.pi * np.outer(d, sweep)) * weight
+    basis = np.exp(-2j * np.pi * np.outer(d, frequencies))
+    m = np.linalg.lstsq(basis, wanted, rcond=1e-6)[0]
+
+    echoes = np.exp(2j * np.pi * np.outer(sweep, d)) / np.sqrt(d.size)
+    covariance = echoes @ echoes.conj().T + _NOISE * np.eye(b - a)
+    direct = scipy.linalg.solve(covariance, np.ones(b - a), assume_a="pos").conj()
+    direct /= direct.sum()
+
+    matrix = np.zeros((frequencies.size, chirp.samples), complex)
+    matrix[:, a:b] = m - np.outer(m.sum(axis=1), direct)
+    whole = np.zeros(chirp.samples, complex)
+    whole[a:b] = direct
+    # Echoes at the samples' frequencies are likewise combinations of echoes at the few.
+    few = np.exp(2j * np.pi * np.outer(d, frequencies))
+    from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
+    return Reduction(frequencies, matrix, whole, (matrix[:, a:b] @ from_few).astype(np.complex128), gate_m)

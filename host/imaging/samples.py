@@ -1,0 +1,183 @@
+"""One board's reduced samples, as rows come in, and its image."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.imaging.aperture import Aperture, irregular, row_starts_m
+from host.imaging.footprint import mirror_reduced
+from host.imaging.grid import Antennas, ImageGrid, row_offsets_m
+from host.imaging.imager import choose_imager
+from host.imaging.incremental import SLACK_M, IncrementalImager
+from host.imaging.reduce import Reduction
+from host.sync.chain import SyncedRow
+from shared.config import Board, Instrument
+from shared.errors import DataError
+from shared.raster import plan_raster
+
+Image = NDArray[np.complex64]
+_log = logging.getLogger(__name__)
+
+
+class BoardSamples:
+    """Samples of one board, [rx, frequency, row, column], columns from the smallest x; missing ones are 0 and masked.
+
+    Parameters
+    ----------
+    rig, board
+        The scan's rig file, and one of its receiving boards.
+    grid
+        Pixels.
+    reduction
+        Range gate.
+    taper
+        float32 [row, column]: weight of every position.
+    live
+        Keep sums over the rows, for :meth:`current`.
+    """
+
+    def __init__(
+        self,
+        rig: Instrument,
+        board: Board,
+        grid: ImageGrid,
+        reduction: Reduction,
+        taper: NDArray[np.float32],
+        live: bool = False,
+    ) -> None:
+        self.board, self.taper = board, taper
+        self._plan, self._grid = plan_raster(rig.grid), grid
+        self._reduction, self._linear = reduction, slice(*rig.chirp.linear_samples)
+        maps = np.vstack([reduction.matrix, reduction.direct])
+        self._maps = np.ascontiguousarray(maps[:, self._linear], np.complex64)
+        self._antennas = Antennas.of(rig, board)
+        self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
+        rows = [row_offsets_m(rig, row)[:: row.direction] for row in self._plan]
+        self._offsets = np.pad(np.stack(rows), ((0, 0), (0, 0), (0, 1)))
+        self._planned = row_starts_m(self._offsets)
+        rx, shape = len(self._antennas.rx_m), taper.shape
+        self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
+        self._direct = np.zeros((rx, *shape), np.complex64)
+        self.valid = np.zeros(shape, bool)
+        regular = irregular(self.aperture) is None
+        self._live = None
+        if live and regular:
+            self._live = IncrementalImager(self.aperture, self.mirror)
+            choose_imager(self.aperture)  # its kernels are made now, not after the last row
+
+    @property
+    def aperture(self) -> Aperture:
+        """Where everything is."""
+        return Aperture(self._antennas, self._offsets, self._reduction.frequencies_hz, self._grid)
+
+    @property
+    def model(self) -> NDArray[np.complex128]:
+        """How an echo's samples come out of the range gate, [frequency, frequency], see `reduce.Reduction.model`."""
+        return self._reduction.model
+
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """Taper of each position, 0 without valid data, float32 [row, column]."""
+        return self.taper * self.valid
+
+    @property
+    def count(self) -> np.float32:
+        """What a sum over positions and RX is divided by."""
+        return np.float32((self.weights.sum() or 1.0) * len(self._antennas.rx_m))
+
+    def add_row(self, index: int, row: SyncedRow, offsets_m: NDArray[np.float64] | None = None) -> None:
+        """Take in a row; an earlier take of it is replaced.
+
+        Parameters
+        ----------
+        index
+            Of the row in the plan.
+        row
+            Positions in the order they were met.
+        offsets_m
+            float64 [position, 2 or 3], same order: true mean stage offsets, where they are better known than the plan.
+
+        Raises
+        ------
+        DataError
+            when the row is not one of this plan's.
+        """
+        if not 0 <= index < self._plan.rows:
+            raise _stranger(f"row {index} of board {self.board.name!r} is not in this scan")
+        if row.valid.shape != (self._plan.columns,):
+            raise _stranger(
+                f"row {index} of board {self.board.name} has {row.valid.size} positions, the plan {self._plan.columns}"
+            )
+        self._show(index, -1)
+        forward = slice(None, None, self._plan.row(index).direction)
+        reduced = np.matmul(self._maps, row.samples[..., self._linear].mT)[..., forward]
+        self.valid[index] = row.valid[forward]
+        self._cube[:, :, index] = reduced[:, :-1] * self.valid[index]
+        self._direct[:, index] = reduced[:, -1] * self.valid[index]
+        if offsets_m is not None:
+            self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
+            moved = abs(row_starts_m(self._offsets)[index] - self._planned[index])
+            if moved > SLACK_M or irregular(self.aperture) is not None:
+                self._live = None
+        self._show(index, 1)
+
+    def keep(self, positions: NDArray[np.bool_]) -> None:
+        """Mask every position [row, column] that is not to be kept, as if it had not been scanned."""
+        self.valid &= positions
+        self._live = None
+
+    def _show(self, index: int, sign: int) -> None:
+        """Add a row to the live image, or take it away."""
+        weights = sign * self.weights[index]
+        if self._live is not None and weights.any():
+            start = float(row_starts_m(self._offsets)[index])
+            self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
+
+    def rx_calibration(self) -> NDArray[np.complex128]:
+        """Complex gain of each RX, relative to a direct path of one metre: the mean direct path of all positions, [rx].
+
+        The direct path's length to each RX is known; what remains after it is the receiver's own.
+        """
+        total = (self._direct * self.valid).sum(axis=(1, 2), dtype=np.complex128)
+        gain = total / max(1, int(self.valid.sum())) * self._antennas.direct_m
+        return np.where(gain == 0, 1, gain)
+
+    def calibrated(self) -> NDArray[np.complex64]:
+        """Samples with every RX's gain taken out, not weighted."""
+        return self._cube * (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
+
+    def current(self) -> tuple[Image, Image, str | None]:
+        """As :meth:`image`, from the sums over rows where they are kept: equal to 1e-6 of the peak, and at once."""
+        if self._live is None:
+            return self.image()
+        image = self._live.image_of_sum(1 / self.rx_calibration())
+        return image / self.count, self._live.constant_of_sum() / self.count, None
+
+    def image(self, grid: ImageGrid | None = None) -> tuple[Image, Image, str | None]:
+        """Image and footprint of the rows so far, complex64 [ny, nx], and a notice where it was slow.
+
+        The same rows give the same bits, in whatever order and however often they came.
+
+        Parameters
+        ----------
+        grid
+            Other pixels than the rig file's; they must lie inside the range gate.
+        """
+        grid = self._grid if grid is None else grid
+        aperture = Aperture(self._antennas, self._offsets, self._reduction.frequencies_hz, grid)
+        imager, notice = choose_imager(aperture)
+        if notice:
+            _log.warning("%s: %s", self.board.name, notice)
+        gains = (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
+        samples = self._cube * (gains * self.weights)
+        image: Any = imager.image(samples) / self.count
+        footprint: Any = imager.constant(self.mirror.astype(np.complex64), self.weights) / self.count
+        return image.astype(np.complex64), footprint.astype(np.complex64), notice
+
+
+def _stranger(what: str) -> DataError:
+    return DataError(what, "data and rig file do not belong together", "use the rig file of this scan")

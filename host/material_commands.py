@@ -1,0 +1,172 @@
+"""Commands on materials that were found already: permittivity through layers, concentration, classifiers."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from host.materials import Library
+from host.materials.authors import read_materials
+from host.materials.concentration import fit_concentration
+from host.materials.layers import Bands, Layer, LayerFit, Spectrum, fit_layer
+from shared.config import load_instrument
+from shared.errors import ConfigError, DataError
+
+LAST = "?"
+
+
+def parse_layer(text: str) -> Layer:
+    """`name,eps',eps'',mm` of a known layer, `name,?,mm` of the unknown one; without mm a half space.
+
+    Raises ValueError when it has another form.
+    """
+    parts = [p.strip() for p in text.split(",")]
+    unknown = len(parts) in (2, 3) and parts[1] == LAST
+    numbers = [float(p) for p in parts[2 if unknown else 1 :]]
+    if not unknown and len(numbers) not in (2, 3):
+        raise ValueError(text)
+    thickness = numbers[-1] / 1e3 if len(numbers) == (1 if unknown else 3) else None
+    if thickness is not None and thickness <= 0:
+        raise ValueError(text)
+    return Layer(parts[0], None if unknown else complex(numbers[0], -numbers[1]), thickness)
+
+
+def _segments(products: Path) -> list[dict[str, Any]]:
+    path = products / "materials.json"
+    try:
+        return list(json.loads(path.read_text(encoding="utf-8"))["segments"])
+    except FileNotFoundError:
+        raise DataError(
+            f"{path}: no such file", "the scan was not processed, or no metal was found", "polysight process"
+        ) from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as e:
+        raise DataError(f"{path}: cannot be read: {e}", "written by polysight process", "process the scan again") from e
+
+
+def _fit(segment: Mapping[str, Any], stack: Sequence[Layer], spectrum: Spectrum, angle_deg: float) -> LayerFit | None:
+    ratio, std = segment.get("ratio"), segment.get("inverse_ratio_std")
+    if ratio is None or not std or segment.get("metal_reference"):
+        return None
+    inverse = 1 / complex(ratio["real"], ratio["imag"])
+    return fit_layer(Bands(spectrum, np.array([inverse]), np.array([std])), stack, float(np.radians(angle_deg)))
+
+
+def permittivity(products: Path, config: Path, stack: Sequence[Layer], segment: int | None, as_json: bool) -> int:
+    """Permittivity of patches, as one interface or as the unknown layer of a stack; returns the exit status.
+
+    Raises
+    ------
+    DataError
+        when the folder holds no materials, or not that segment.
+    """
+    rows = [r for r in _segments(products) if segment is None or r["label"] == segment]
+    if not rows:
+        raise DataError(f"{products}: no segment {segment}", "its number is not in materials.json")
+    spectrum = Spectrum.of(load_instrument(config).chirp) if stack else None
+    out: list[dict[str, Any]] = []
+    for row in rows:
+        found = _fit(row, stack, spectrum, row["incidence_deg"]) if spectrum else None
+        out.append({"label": row["label"], "name": row["name"], "single_interface": row["permittivity"]})
+        if found is not None:
+            out[-1]["layer"] = _layer_row(found)
+    if as_json:
+        sys.stdout.write(json.dumps(out, indent=1) + "\n")
+    else:
+        sys.stdout.write("".join(_line(row) for row in out))
+    return 0
+
+
+def _layer_row(fit: LayerFit) -> dict[str, Any]:
+    flat = asdict(replace(fit, rivals=()))
+    flat["permittivity"] = [fit.permittivity.real, -fit.permittivity.imag]
+    flat["rivals"] = [[r.permittivity.real, -r.permittivity.imag] for r in fit.rivals]
+    return flat | {"warnings": fit.warnings()}
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    head = f"{row['label']:>3}  {row['name'] or '':24s}"
+    single = row["single_interface"]
+    if single is None:
+        return f"{head} metal-like: no permittivity\n"
+    text = f"{head} one interface {single['real']:6.2f} - j{-single['imag']:5.2f}"
+    if single.get("real_std") is not None:
+        text += f"  +- {single['real_std']:.2f}"
+    layer = row.get("layer")
+    if layer is not None:
+        real, loss = layer["permittivity"]
+        text += f"   in the stack {real:6.2f} - j{loss:5.2f}  +- {layer['std_real']:.2f}, {layer['std_loss']:.2f}"
+        text += "".join(f"\n     note: {w}" for w in layer["warnings"])
+    return text + "\n"
+
+
+def concentration(data: Path, given: Mapping[str, float], confidence: float, as_json: bool) -> int:
+    """Line from polarisation angle to concentration, judged with each concentration left out; the exit status.
+
+    `data` is a library (.npz) or a folder of the published material files. Raises DataError.
+    """
+    library = read_materials(data) if data.is_dir() else Library.load(data)
+    unknown = sorted(set(given) - set(library.names))
+    if unknown:
+        raise ConfigError(
+            f"{data}: no material {unknown[0]!r}", f"it holds {', '.join(library.names)}", "correct --value"
+        )
+    result = fit_concentration(library, given, confidence)
+    source = "simulated" if library.simulated else "measured"
+    if as_json:
+        content = {
+            "source": source,
+            "line": asdict(result.line),
+            "left_out": [asdict(r) for r in result.left_out],
+            "median_error_percent": result.median_error,
+            "covered": result.covered,
+        }
+        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        return 0
+    line = result.line
+    rows = [
+        f"  {r.name:30s} {r.true_percent:6.2f} %   found {r.percent:6.2f} %   {r.low:6.2f} .. {r.high:6.2f} %\n"
+        for r in result.left_out
+    ]
+    sys.stdout.write(
+        f"{source}: percent = {line.intercept:.2f} + ({np.radians(line.slope):.3f}) * angle in degrees,"
+        f" {line.patches} patches\neach concentration as told by the others:\n{''.join(rows)}"
+        f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals hold the"
+        f" truth in {100 * result.covered:.0f} % of the patches\n"
+    )
+    return 0
+
+
+def classify(data: Path, as_json: bool) -> int:
+    """Share of pixels and patches that each model names right under both splits; returns the exit status.
+
+    `data` is a library (.npz) or a folder of the published material files. Raises DataError.
+    """
+    from host.materials.models import MODELS, Samples, score  # here: scikit-learn loads for a second
+
+    library = read_materials(data) if data.is_dir() else Library.load(data)
+    samples = Samples.of(library)
+    scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
+    source = "simulated" if library.simulated else "measured"
+    if as_json:
+        rows = [{k: v for k, v in asdict(s).items() if k not in ("confusion", "names")} for s in scores]
+        best = max(scores[::2], key=lambda s: s.pixels)
+        content = {"source": source, "names": best.names, "scores": rows}
+        content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
+        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        return 0
+    sys.stdout.write(
+        f"{source}: {len(library.names)} materials, {len(library.scans)} scans, {samples.names.size} pixels\n"
+        f"{'':36s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
+        f"{'model':36s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
+    )
+    for held, mixed in zip(scores[::2], scores[1::2], strict=True):
+        sys.stdout.write(
+            f"{held.model:36s}{held.pixels:11.1%}{held.patches:11.1%}{mixed.pixels:12.1%}{mixed.patches:12.1%}\n"
+        )
+    return 0

@@ -1,0 +1,53 @@
+"""Materials: patches, permittivity, the reference library and the classifier."""
+
+from host.materials.analyse import MaterialsResult, PatchResult, analyse, image_centre_mm, pixel_accuracy
+from host.materials.classify import UNKNOWN, Classifier, Verdict, Weights
+from host.materials.fit import Fit, fit_library, fit_weights
+from host.materials.labels import patches_from_labels, read_labels, write_labels
+from host.materials.library import Entry, Library
+from host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
+from host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
+from host.materials.segment import Patch, Segmentation, SegmentSettings, segment
+from host.materials.table2 import Published, table2
+from host.materials.train import TrainingScan, entries_of, make_library
+from host.materials.truth import TruthPlate, read_truth, truth_labels, truth_plates
+
+__all__ = [
+    "UNKNOWN",
+    "Classifier",
+    "Entry",
+    "Fit",
+    "Library",
+    "MaterialsResult",
+    "MetalReference",
+    "Patch",
+    "PatchResult",
+    "Permittivity",
+    "Published",
+    "SegmentSettings",
+    "Segmentation",
+    "TrainingScan",
+    "TruthPlate",
+    "Verdict",
+    "Weights",
+    "analyse",
+    "entries_of",
+    "estimate_permittivity",
+    "find_metal",
+    "fit_library",
+    "fit_weights",
+    "image_centre_mm",
+    "make_library",
+    "median_ratio",
+    "metal_by_label",
+    "metal_in_box",
+    "patches_from_labels",
+    "pixel_accuracy",
+    "read_labels",
+    "read_truth",
+    "segment",
+    "table2",
+    "truth_labels",
+    "truth_plates",
+    "write_labels",
+]

@@ -1,0 +1,179 @@
+"""The reference library: labelled patches with their pixels and where they come from, as one data file.
+
+The file is an .npz with plain arrays and a JSON text inside; it is read with `allow_pickle=False`, so that a library
+from a stranger cannot run code.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shared.errors import DataError
+
+FORMAT = "polysight-library-1"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One labelled patch.
+
+    Attributes
+    ----------
+    name
+        Material.
+    scan
+        Scan it comes from: the unit by which training and test data are kept apart.
+    h, v
+        float32 [n], |H| and |V| of its pixels relative to metal.
+    p
+        complex64 [n], metal-referenced ratio H / V.
+    incidence_deg
+        Angle of incidence.
+    simulated
+        Whether the scan was simulated.
+    seed, thickness_mm, permittivity
+        Of the simulated placement, the sample, and the truth [eps', eps''], where known.
+    versions
+        Versions of what made it.
+    reference
+        What it was divided by, where it was not the metal of its own scan.
+    """
+
+    name: str
+    scan: str
+    h: npt.NDArray[np.float32]
+    v: npt.NDArray[np.float32]
+    p: npt.NDArray[np.complex64]
+    incidence_deg: float
+    simulated: bool
+    seed: int | None = None
+    thickness_mm: float | None = None
+    permittivity: tuple[float, float] | None = None
+    versions: dict[str, str] = field(default_factory=dict)
+    reference: str | None = None
+
+
+@dataclass(frozen=True)
+class Library:
+    """Entries, and what was fitted on them (weights of the classifier; empty when nothing was)."""
+
+    entries: tuple[Entry, ...]
+    fit: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Materials, sorted."""
+        return tuple(sorted({e.name for e in self.entries}))
+
+    @property
+    def scans(self) -> tuple[str, ...]:
+        """Scans, sorted."""
+        return tuple(sorted({e.scan for e in self.entries}))
+
+    @property
+    def simulated(self) -> bool:
+        """Whether any entry was simulated."""
+        return any(e.simulated for e in self.entries)
+
+    def select(self, scans: Iterable[str]) -> Library:
+        """The entries of these scans, without the fit."""
+        wanted = set(scans)
+        return Library(tuple(e for e in self.entries if e.scan in wanted), {}, self.note)
+
+    def pixels(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.complex128]]:
+        """|H|, |V| and P of all pixels, [n] each, entry after entry."""
+        return (
+            np.concatenate([e.h for e in self.entries]).astype(np.float64),
+            np.concatenate([e.v for e in self.entries]).astype(np.float64),
+            np.concatenate([e.p for e in self.entries]).astype(np.complex128),
+        )
+
+    def of_pixels(self, key: str) -> npt.NDArray:
+        """An attribute of each pixel's entry (`name` or `scan`), [n]."""
+        return np.concatenate([np.full(e.h.size, getattr(e, key)) for e in self.entries])
+
+    def save(self, path: Path) -> None:
+        """Write the library, replacing the file only when it is complete."""
+        entries = [
+            {k: v for k, v in asdict_shallow(e).items() if k not in ("h", "v", "p")} | {"pixels": int(e.h.size)}
+            for e in self.entries
+        ]
+        meta = {"format": FORMAT, "note": self.note, "fit": self.fit, "entries": entries}
+        text = np.frombuffer(json.dumps(meta, sort_keys=True).encode("utf-8"), np.uint8)
+        empty_f, empty_c = np.zeros(0, np.float32), np.zeros(0, np.complex64)
+        part = path.with_name(path.name + ".part")
+        with part.open("wb") as f:
+            np.savez_compressed(
+                f,
+                h=np.concatenate([empty_f, *(e.h for e in self.entries)]),
+                v=np.concatenate([empty_f, *(e.v for e in self.entries)]),
+                p=np.concatenate([empty_c, *(e.p for e in self.entries)]),
+                meta=text,
+            )
+            f.flush()
+            os.fsync(f.fileno())
+        part.replace(path)
+
+    @staticmethod
+    def load(path: Path) -> Library:
+        """Read a library.
+
+        Raises
+        ------
+        DataError
+            when the file is absent, no library, of another format version, damaged, or holds pickled objects.
+        """
+        bad = f"{path}: not a material library"
+        try:
+            with path.open("rb") as f, np.load(f, allow_pickle=False) as z:
+                meta = json.loads(z["meta"].tobytes().decode("utf-8"))
+                h, v, p = z["h"], z["v"], z["p"]
+        except FileNotFoundError:
+            raise DataError(
+                f"{path}: no such library", "none was trained yet, or the path is wrong", "polysight train"
+            ) from None
+        except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
+            raise DataError(bad, f"{type(e).__name__}: {e}", "make it again with polysight train") from None
+        if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+            found = meta.get("format") if isinstance(meta, dict) else None
+            raise DataError(bad, f"its format is {found!r}, this program reads {FORMAT!r}", "train it again")
+        try:
+            return Library(_entries(meta["entries"], h, v, p), dict(meta["fit"]), str(meta["note"]))
+        except (KeyError, TypeError, ValueError) as e:
+            raise DataError(bad, f"its description does not fit its arrays: {e}", "train it again") from None
+
+
+def asdict_shallow(entry: Entry) -> dict[str, Any]:
+    """The fields of an entry without copying its arrays."""
+    return {name: getattr(entry, name) for name in Entry.__dataclass_fields__}
+
+
+def _entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:
+    if not h.shape == v.shape == p.shape or h.ndim != 1 or sum(r["pixels"] for r in rows) != h.size:
+        raise ValueError(f"arrays {h.shape}, {v.shape}, {p.shape}")
+    out, start = [], 0
+    for row in rows:
+        stop = start + row["pixels"]
+        fields = {k: value for k, value in row.items() if k != "pixels"}
+        if fields.get("permittivity") is not None:
+            fields["permittivity"] = tuple(fields["permittivity"])
+        out.append(
+            Entry(
+                h=h[start:stop].astype(np.float32),
+                v=v[start:stop].astype(np.float32),
+                p=p[start:stop].astype(np.complex64),
+                **fields,
+            )
+        )
+        start = stop
+    return tuple(out)

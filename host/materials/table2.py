@@ -1,0 +1,39 @@
+"""The paper's Table 2 as data: 36 materials with their published permittivities."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from importlib import resources
+
+
+@dataclass(frozen=True)
+class Published:
+    """One row of Table 2.
+
+    Attributes
+    ----------
+    number, name
+        As in the paper, thickness in the name included.
+    permittivity
+        eps' - j eps'', the apparent value of a single interface; loss zero where the paper gives none (see note).
+    thickness_mm
+        From the name, None where it gives none.
+    note
+        What to know before using the value.
+    """
+
+    number: int
+    name: str
+    permittivity: complex
+    thickness_mm: float | None
+    note: str | None
+
+
+def table2() -> tuple[Published, ...]:
+    """The 36 rows of the paper's Table 2, in its order."""
+    raw = json.loads(resources.files("host.materials").joinpath("table2.json").read_text(encoding="utf-8"))
+    return tuple(
+        Published(m["number"], m["name"], complex(m["real"], -(m["loss"] or 0.0)), m["thickness_mm"], m["note"])
+        for m in raw["materials"]
+    )

@@ -1,0 +1,97 @@
+"""What really lies on the plane, where that is known: plates of a simulated scene, matched to patches by position."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.materials.segment import Box, Patch, box_mask
+from shared.errors import DataError
+
+
+@dataclass(frozen=True)
+class TruthPlate:
+    """A rectangular plate.
+
+    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal and for stacks of layers.
+    """
+
+    name: str
+    box_mm: Box
+    permittivity: complex | None
+    thickness_mm: float | None = None
+    metal: bool = False
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """Middle of the box."""
+        return (self.box_mm[0] + self.box_mm[2]) / 2, (self.box_mm[1] + self.box_mm[3]) / 2
+
+
+def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
+    """Plates of a truth file's content: `plates`, each with name, centre_mm, size_mm, permittivity or metal.
+
+    Raises
+    ------
+    DataError
+        when it has another form.
+    """
+    try:
+        return tuple(_plate(p) for p in truth["plates"])
+    except (KeyError, TypeError, ValueError, IndexError) as e:
+        raise DataError(
+            f"the truth has another form than expected: {type(e).__name__}: {e}",
+            "expected plates = [{name, centre_mm, size_mm, permittivity or metal}]",
+        ) from None
+
+
+def read_truth(path: Path) -> tuple[TruthPlate, ...]:
+    """Plates of a truth.json. Raises DataError."""
+    try:
+        return truth_plates(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as e:
+        raise DataError(f"{path}: cannot be read as truth: {e}", "written by polysight simulate beside its data") from e
+
+
+def _plate(raw: Mapping[str, Any]) -> TruthPlate:
+    cx, cy = (float(c) for c in raw["centre_mm"])
+    w, h = (float(s) for s in raw["size_mm"])
+    eps = None
+    metal = bool(raw.get("metal", False))
+    if not metal and not raw.get("layers"):
+        re, loss = raw["permittivity"]
+        eps = complex(float(re), -float(loss))
+    thickness = raw.get("thickness_mm")
+    box = (cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2)
+    return TruthPlate(str(raw["name"]), box, eps, None if thickness is None else float(thickness), metal)
+
+
+def match(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[int, TruthPlate]:
+    """Plate of each patch label: the patch's middle lies in the plate, each plate goes to the nearest such patch."""
+    pairs = []
+    for plate in plates:
+        x0, y0, x1, y1 = plate.box_mm
+        for patch in patches:
+            x, y = patch.centre_mm
+            if x0 <= x <= x1 and y0 <= y <= y1:
+                distance = float(np.hypot(x - plate.centre_mm[0], y - plate.centre_mm[1]))
+                pairs.append((distance, patch.label, plate))
+    out: dict[int, TruthPlate] = {}
+    for _, label, plate in sorted(pairs, key=lambda p: p[0]):
+        if label not in out and all(p is not plate for p in out.values()):
+            out[label] = plate
+    return out
+
+
+def truth_labels(plates: Iterable[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.int32]:
+    """Label image int32 [ny, nx] of the plates: 0 where nothing is, then 1, 2 ... in their order."""
+    labels = np.zeros((np.size(y_m), np.size(x_m)), np.int32)
+    for i, plate in enumerate(plates, start=1):
+        labels[box_mask(plate.box_mm, x_m, y_m)] = i
+    return labels

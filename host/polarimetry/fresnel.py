@@ -1,0 +1,188 @@
+"""Reflection of plane waves at flat interfaces: Fresnel's coefficients, their ratio, and layered media.
+
+Time convention `exp(+j omega t)`: a passive medium has permittivity `eps' - j eps''` with `eps'' >= 0` and every wave
+inside it decays. Signs of Eq. 2 of the paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from shared.errors import PolysightError
+from shared.units import SPEED_OF_LIGHT_M_S
+
+Complex = npt.NDArray[np.complex128]
+Real = npt.NDArray[np.float64]
+
+
+def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
+    """Index times cosine in the medium, sqrt(eps - sin^2 theta_i): the root that decays when passive (Im <= 0)."""
+    q: Complex = np.sqrt(eps - sine**2)
+    return np.where((q.real == 0) & (q.imag > 0), -q, q)
+
+
+def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Complex]:
+    """Reflection coefficients of a half space seen from air (Eq. 2 of the paper).
+
+    Parameters
+    ----------
+    eps
+        Relative permittivity `eps' - j eps''`, any shape; infinite means a perfect conductor.
+    theta_rad
+        Incidence angle in radians, broadcast against `eps`.
+
+    Returns
+    -------
+    r_s, r_p
+        complex128, broadcast shape: s (perpendicular to the plane of incidence) and p (parallel to it).
+    """
+    eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
+    metal = ~np.isfinite(eps)
+    eps = np.where(metal, 1.0, eps)
+    c, s = np.cos(theta), np.sin(theta)
+    q = _normal_wavenumber(eps, s)
+    r_s = np.where(metal, -1.0, (c - q) / (c + q))
+    # cos(theta_t) = q / n, so n_i cos(theta_t) -+ n_t cos(theta_i) is (q -+ eps c) / n: no square root of eps needed.
+    r_p = np.where(metal, -1.0, (q - eps * c) / (q + eps * c))
+    return r_s[()], r_p[()]
+
+
+def ratio_from_permittivity(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
+    """Polarisation ratio P = r_s / r_p of a half space (Eq. 2 of the paper).
+
+    Written as (q cos + sin^2) / (q cos - sin^2) with q = sqrt(eps - sin^2), which equals r_s / r_p and has no 0/0 at
+    eps = 1. Infinite permittivity gives 1 (metal), the exact Brewster angle of a lossless medium gives infinity.
+
+    Parameters and shapes as :func:`fresnel`; returns complex128.
+    """
+    eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
+    metal = ~np.isfinite(eps)
+    s = np.sin(theta)
+    a = _normal_wavenumber(np.where(metal, 1.0, eps), s) * np.cos(theta)
+    pole = a == s**2
+    ratio = (a + s**2) / np.where(pole, 1.0, a - s**2)
+    return np.where(metal, 1.0, np.where(pole, complex(np.inf, 0.0), ratio))[()]
+
+
+def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
+    """Permittivity of a half space from its polarisation ratio (Eq. 3 of the paper).
+
+    Eq. 3 is evaluated as sin^2 (1 + tan^2 ((1 + P) / (1 - P))^2), which is the same expression without cancellation.
+    It does not change under P -> 1/P, so either ratio may be given.
+
+    P = 1 is the pole: a perfect conductor, at any angle. It returns `inf + 0j`. Close to it the permittivity grows as
+    4 / |P - 1|^2 and an error of P is magnified accordingly: what is metal-like has no determinable permittivity.
+
+    Parameters
+    ----------
+    p
+        Complex ratio H / V, metal-referenced, any shape; infinite is allowed (V vanishes: the Brewster angle).
+    theta_rad
+        Incidence angle in radians, broadcast against `p`.
+
+    Returns
+    -------
+    eps
+        complex128; not a number where `p` is not.
+    """
+    p, theta = np.broadcast_arrays(np.asarray(p, np.complex128), np.asarray(theta_rad, np.float64))
+    # Work with the ratio of modulus <= 1: the same permittivity, and no overflow near the Brewster angle.
+    big = np.abs(p) > 1
+    with np.errstate(invalid="ignore"):
+        small = np.where(np.isinf(p), 0.0, np.where(big, 1.0 / np.where(big, p, 1.0), p))
+        pole = small == 1
+        u = (1 + small) / np.where(pole, 1.0, 1 - small)
+        eps = np.sin(theta) ** 2 * (1 + np.tan(theta) ** 2 * u**2)
+    return np.where(pole, complex(np.inf, 0.0), eps)[()]
+
+
+def brewster_angle_rad(eps: npt.ArrayLike) -> Real:
+    """Angle at which |r_p| of a half space is smallest, radians (exact for lossless media: tan theta = sqrt(eps)).
+
+    For lossy media this is the pseudo-Brewster angle of least |r_p|, approximated by arctan(sqrt|eps|). The paper
+    calls it the angle of lowest *s* reflectance; it is the p-polarised wave that vanishes there.
+    """
+    return np.arctan(np.sqrt(np.abs(np.asarray(eps, np.complex128))))[()]
+
+
+def _entries(value: Sequence[npt.ArrayLike] | npt.ArrayLike) -> list[Any]:
+    """The entries of a list, tuple or array; a single number is a list of one."""
+    if isinstance(value, list | tuple):
+        return list(value)
+    array = np.asarray(value)
+    return [array] if array.ndim == 0 else list(array)
+
+
+def multilayer(
+    eps: Sequence[npt.ArrayLike] | npt.ArrayLike,
+    thickness_m: Sequence[npt.ArrayLike] | npt.ArrayLike,
+    frequency_hz: npt.ArrayLike,
+    theta_rad: npt.ArrayLike,
+) -> tuple[Complex, Complex]:
+    """Reflection coefficients of a stack of flat layers seen from air.
+
+    The transfer-matrix solution in its recursive form (Rouard; Born & Wolf, section 1.6): from the last interface to
+    the first, r = (r_front + r_behind z) / (1 + r_front r_behind z) with z = exp(-2 j k0 d q). Only decaying
+    exponentials occur, so thick and lossy layers do not overflow as a product of matrices does.
+
+    Parameters
+    ----------
+    eps
+        Relative permittivity of each medium in the order the wave meets them; each entry a number or an array that
+        broadcasts against frequency and angle. A single number is one medium.
+    thickness_m
+        Thickness of each of them in metres. The last medium is a half space when its thickness is infinite or left
+        out; otherwise air follows it. So `multilayer(eps, inf, f, theta)` is :func:`fresnel` and
+        `multilayer(eps, d, f, theta)` is a sheet in air.
+    frequency_hz
+        Frequency, number or array.
+    theta_rad
+        Incidence angle in air, radians, number or array.
+
+    Returns
+    -------
+    r_s, r_p
+        complex128, broadcast shape, phase referred to the front surface, signs of Eq. 2.
+
+    Raises
+    ------
+    PolysightError
+        when the numbers of permittivities and thicknesses do not fit, or a thickness is negative or infinite before
+        the last medium.
+    """
+    media = [np.asarray(e, np.complex128) for e in _entries(eps)]
+    layers = [np.asarray(d, np.float64) for d in _entries(thickness_m)]
+    if not media or len(layers) not in (len(media) - 1, len(media)):
+        raise PolysightError(
+            f"multilayer: {len(media)} permittivities with {len(layers)} thicknesses",
+            "each medium needs a thickness; only that of the last one may be left out (half space)",
+        )
+    if len(layers) == len(media):
+        if np.all(np.isinf(layers[-1])):
+            layers.pop()
+        else:
+            media.append(np.asarray(1.0 + 0j))
+    if any(np.any(~np.isfinite(d)) or np.any(d < 0) for d in layers):
+        raise PolysightError(
+            "multilayer: a thickness is negative or not finite", "only the last medium may be infinitely thick"
+        )
+    theta = np.asarray(theta_rad, np.float64)
+    s = np.sin(theta)
+    k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
+    media.insert(0, np.asarray(1.0 + 0j))
+    q = [np.cos(theta).astype(np.complex128), *(_normal_wavenumber(e, s) for e in media[1:])]
+    y = [qi / ei for qi, ei in zip(q, media, strict=True)]
+    r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
+    r_p: Complex = (y[-1] - y[-2]) / (y[-1] + y[-2])
+    for i in range(len(layers) - 1, -1, -1):
+        z = np.exp(-2j * k0 * layers[i] * q[i + 1])
+        front_s = (q[i] - q[i + 1]) / (q[i] + q[i + 1])
+        front_p = (y[i + 1] - y[i]) / (y[i + 1] + y[i])
+        r_s = (front_s + r_s * z) / (1 + front_s * r_s * z)
+        r_p = (front_p + r_p * z) / (1 + front_p * r_p * z)
+    shape = np.broadcast_shapes(r_s.shape, k0.shape)
+    return np.broadcast_to(r_s, shape)[()], np.broadcast_to(r_p, shape)[()]

@@ -1,0 +1,119 @@
+"""What a processed scan leaves behind: image.npz, quality.json, materials.json, report.html and figures/."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from host.imaging import ChannelImages
+from host.materials import Library, MaterialsResult, TruthPlate, pixel_accuracy
+from host.polarimetry import ratio
+from host.report import write_image, write_json, write_report
+from host.report.assemble import context_of, library_sentence
+from host.store.scanfolder import versions
+from host.store.source import ScanSource
+from shared.config import Instrument
+from shared.geometry import incidence_deg
+
+NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
+
+
+@dataclass(frozen=True)
+class Products:
+    """Where the products are, and what they say in short."""
+
+    folder: Path
+    lines: tuple[str, ...]
+
+    def summary(self) -> str:
+        """Text for the terminal."""
+        return "".join(
+            f"{line}\n"
+            for line in (*self.lines, f"report:   {self.folder / 'report.html'}", f"products: {self.folder}/")
+        )
+
+
+def write_images(out: Path, images: ChannelImages) -> None:
+    """image.npz before any metal reference is known: p is h / v in arbitrary units."""
+    p = ratio(images.h, images.v)
+    write_image(out / "image.npz", images.h, images.v, p, images.x_m, images.y_m, images.valid)
+
+
+def write_quality(out: Path, quality: dict[str, Any]) -> None:
+    """quality.json."""
+    write_json(out / "quality.json", quality)
+
+
+def write_materials(
+    out: Path,
+    source: ScanSource,
+    images: ChannelImages,
+    found: MaterialsResult,
+    library: Library,
+    quality: dict[str, Any],
+    truth: tuple[TruthPlate, ...],
+) -> Products:
+    """The metal-referenced image.npz, quality.json, materials.json, figures and report."""
+    c = found.calibrated
+    write_image(out / "image.npz", c.h, c.v, c.p, images.x_m, images.y_m, images.valid)
+    write_quality(out, quality)
+    rows = found.rows()
+    write_json(
+        out / "materials.json",
+        {
+            "scan_id": source.scan_id,
+            "simulated": source.simulated,
+            "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
+            "library": library_sentence(library),
+            "pixel_accuracy": pixel_accuracy(found),
+            "segments": rows,
+        },
+    )
+    context = context_of(
+        found,
+        images.x_m,
+        images.y_m,
+        title=f"Scan {source.scan_id}",
+        simulated=source.simulated,
+        valid=images.valid,
+        plates=truth,
+        library=library,
+        quality=quality,
+        config=_config_summary(source.instrument),
+        provenance={
+            "scan": source.scan_id,
+            "processed": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
+            **versions(),
+        },
+        notes=[NOT_ON_HARDWARE],
+    )
+    write_report(out, context)
+    return Products(out, _lines(source, found, rows))
+
+
+def _config_summary(rig: Instrument) -> dict[str, Any]:
+    h, _ = rig.receivers
+    c, leak = rig.chirp, rig.polarimetry
+    return {
+        "rig": rig.name,
+        "incidence": f"{incidence_deg(rig, h):.1f} degrees",
+        "chirp": f"{c.first_sample_hz / 1e9:.3f} GHz + {c.swept_hz / 1e9:.3f} GHz in {c.samples} samples",
+        "grid": f"{rig.grid.columns} x {rig.grid.rows} positions, {rig.grid.step_x_mm:g} x {rig.grid.step_y_mm:g} mm",
+        "burst": f"{rig.burst.pulses} pulses, {rig.burst.period_us:g} us apart, stage at {rig.stage.speed_mm_s:g} mm/s",
+        "leakage removed": f"H {complex(*leak.leakage_h):.3g}, V {complex(*leak.leakage_v):.3g} (rig file)",
+    }
+
+
+def _lines(source: ScanSource, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
+    head = (
+        f"{'simulated ' if source.simulated else ''}scan {source.scan_id}: {len(rows)} patches; metal {found.metal.how}"
+    )
+    known = [r for r in rows if r["truth"] is not None]
+    if not known:
+        return (head,)
+    right = sum(r["name"] == r["truth"]["name"] for r in known)
+    accuracy = pixel_accuracy(found)
+    share = "" if accuracy is None else f", {100 * accuracy:.1f} % of their pixels"
+    return head, f"{right} of {len(known)} plates named right{share}"

@@ -1,0 +1,99 @@
+"""How good a scan is: what was received and masked, how well the boards were synchronised, where the time went."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.store.source import RowData
+from host.sync.backlash import echo_of_row, estimate_backlash, object_filter
+from host.sync.chain import SyncedRow
+from shared.config import Board, Instrument
+
+
+@dataclass
+class BoardQuality:
+    """Sums over the rows of one board; a row that is added again replaces its earlier figures."""
+
+    rig: Instrument
+    board: Board
+    rows: dict[int, dict[str, Any]] = field(default_factory=dict)
+    echoes: dict[int, NDArray[np.complex64]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._filter = object_filter(self.rig, self.board)
+
+    def add(self, row: int, recorded: RowData, frames_valid: int, synced: SyncedRow) -> None:
+        """Take in one row."""
+        self.echoes[row] = echo_of_row(synced, self._filter)
+        self.rows[row] = {
+            "frames_expected": recorded.frames_expected,
+            "frames_received": frames_valid,
+            "bytes_missing": recorded.missing_bytes,
+            "crc32": recorded.crc32,
+            "positions": int(synced.valid.size),
+            "positions_masked": int(synced.valid.size - synced.valid.sum()),
+            "direct_hz": synced.direct_hz[synced.valid],
+            "stages": synced.stages,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """Plain numbers for quality.json. Residuals are root mean squares over rows, weighted by valid positions."""
+        rows = list(self.rows.values())
+        total: dict[str, Any] = {
+            key: sum(r[key] for r in rows)
+            for key in ("frames_expected", "frames_received", "bytes_missing", "positions", "positions_masked")
+        }
+        total["frames_masked"] = total["frames_expected"] - total["frames_received"]
+        stages: dict[str, dict[str, float]] = {}
+        for stage in dict.fromkeys(s for r in rows for s in r["stages"]):
+            found = [(r["stages"][stage], r["positions"] - r["positions_masked"]) for r in rows if stage in r["stages"]]
+            weight = sum(n for _, n in found)
+            f, p, a = (float(np.sqrt(sum(s[i] ** 2 * n for s, n in found) / weight)) for i in range(3))
+            stages[stage] = {"frequency_std_hz": f, "phase_std_rad": p, "amplitude_std": a}
+        direct = np.concatenate([r["direct_hz"] for r in rows]) if rows else np.zeros(0)
+        if direct.size:
+            total["direct_path_hz"] = {
+                "median": float(np.median(direct)),
+                "min": float(direct.min()),
+                "max": float(direct.max()),
+            }
+        total["stage_backlash_mm"] = self._backlash()
+        total["raw_crc32"] = {row: r["crc32"] for row, r in self.rows.items() if r["crc32"]}
+        return {**total, "synchronisation": stages}
+
+    def _backlash(self) -> dict[str, float] | None:
+        """How far odd rows lie towards +x of where the plan puts them, from the echoes; None where they do not tell."""
+        found = estimate_backlash(self.echoes, self.rig)
+        return None if found is None else {"shift": round(found.shift_mm, 4), "std": round(found.std_mm, 4)}
+
+
+class Quality:
+    """Collects the figures of a scan while it is processed."""
+
+    def __init__(self, rig: Instrument) -> None:
+        self.boards = {board.name: BoardQuality(rig, board) for board in rig.receivers}
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the wall time of a block to a stage's seconds."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
+
+    def to_dict(self, **more: Any) -> dict[str, Any]:
+        """Content of quality.json."""
+        return {
+            "boards": {name: board.summary() for name, board in self.boards.items()},
+            "seconds_per_stage": {stage: round(s, 4) for stage, s in self.seconds.items()},
+            **more,
+        }

@@ -1,0 +1,292 @@
+"""One radar board's states, from off to frames ended, and what brings it from one to the next.
+
+`ARMED` only when the radar has said that it waits for triggers, `DONE` only when it has said that its frames have
+ended. A fatal event is `FAULT`, which only a reset leaves. Not run on hardware yet.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from enum import Enum
+
+from host.radar import commands as c
+from host.radar import events as e
+from host.radar.firmware import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
+from host.radar.messages import Message
+from host.radar.program import Program
+from host.radar.spi import RESPONSE_S, Clock, Link, WordLink
+from shared.errors import DeviceError
+
+_POWER_UP_S = 5.0
+_CALIBRATION_S = 5.0
+_READY_S = 1.0
+_RESET_HELD_S = 0.1
+_SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")
+
+
+class State(Enum):
+    """Where a board is."""
+
+    OFF = "off"
+    POWERED = "powered: main and RF core are up"
+    RF_READY = "calibrated"
+    CONFIGURED = "chirp and data path are set"
+    ARMED = "waits for pulses"
+    RUNNING = "pulses have begun"
+    DONE = "frames ended"
+    FAULT = "has failed, needs a reset"
+
+
+TRANSITIONS: Mapping[State, frozenset[State]] = {
+    State.OFF: frozenset({State.POWERED, State.FAULT}),
+    State.POWERED: frozenset({State.RF_READY, State.FAULT, State.OFF}),
+    State.RF_READY: frozenset({State.CONFIGURED, State.FAULT, State.OFF}),
+    State.CONFIGURED: frozenset({State.ARMED, State.FAULT, State.OFF}),
+    State.ARMED: frozenset({State.RUNNING, State.DONE, State.CONFIGURED, State.FAULT, State.OFF}),
+    State.RUNNING: frozenset({State.DONE, State.CONFIGURED, State.FAULT, State.OFF}),
+    State.DONE: frozenset({State.ARMED, State.FAULT, State.OFF}),
+    State.FAULT: frozenset({State.OFF}),
+}
+
+
+class RadarBoard:
+    """One board behind a word link.
+
+    Attributes
+    ----------
+    reason
+        Why it is in `FAULT`.
+    facts
+        What it said of itself: versions, temperatures, calibration.
+    """
+
+    def __init__(self, name: str, words: WordLink, clock: Clock, program: Program) -> None:
+        self.name, self._words, self._clock, self._program = name, words, clock, program
+        self._sent: list[bytes] = []
+        self._link = Link(name, words, clock, self._sent.append)
+        self._state, self._frames = State.OFF, 0
+        self.reason = ""
+        self.facts: dict[str, object] = {}
+        self._log: list[str] = []
+
+    @property
+    def state(self) -> State:
+        """Where the board is, as far as it was read."""
+        return self._state
+
+    def configure(self, on_power: Callable[[], None] = lambda: None) -> None:
+        """From wherever it is, by a reset, to `CONFIGURED`.
+
+        `on_power` is called when the main core is up, before anything else (to download firmware).
+
+        Raises
+        ------
+        DeviceError
+            naming the step that failed; the board is then in `FAULT`.
+        """
+        with _Failing(self):
+            self._power_up(on_power)
+            self._read_versions()
+            for command in self._program.basic:
+                self._link.call(command)
+            self._link.call(c.RF_INIT)
+            self._calibrated(self._wait(e.RF_INIT_DONE, _CALIBRATION_S))
+            self._to(State.RF_READY)
+            for command in self._program.waveform:
+                self._link.call(command)
+            self._to(State.CONFIGURED)
+
+    def arm(self, frames: int) -> None:
+        """Count out frames and start them, until the radar has said that it waits for their triggers.
+
+        A board that failed, or was never configured, is configured first; frames still awaited from before are
+        stopped.
+
+        Raises
+        ------
+        DeviceError
+            when it does not get there; the board is then in `FAULT`.
+        """
+        self.poll()
+        if self._state in (State.OFF, State.FAULT):
+            self.configure()
+        with _Failing(self):
+            if self._state in (State.ARMED, State.RUNNING):
+                self._stop()
+            if self._state is State.FAULT:
+                raise DeviceError(
+                    f"{self.name}: {self.reason}", "a fatal event while it was stopped", "resume the scan"
+                )
+            self.read_temperatures()
+            if frames != self._frames:
+                self._frames = 0
+                for command in self._program.frames(frames):
+                    self._link.call(command)
+                self._frames = frames
+            self._link.call(c.FrameControl(c.START))
+            self._wait(e.TRIGGER_READY, _READY_S)
+            if self._state is not State.ARMED:
+                raise DeviceError(f"{self.name}: {self.reason}", "a fatal event while it was armed", "resume the scan")
+
+    def pulses_begin(self) -> None:
+        """The host knows that pulses come from now on; the radar does not say so."""
+        if self._state is State.ARMED:
+            self._to(State.RUNNING)
+
+    def poll(self) -> State:
+        """Read what the board has to say, and return where it is. A link that is gone is a fault."""
+        if self._state not in (State.OFF, State.FAULT):
+            try:
+                for event in self._link.poll():
+                    self._on_event(event)
+            except DeviceError as error:
+                self.fail(error.what)
+        return self._state
+
+    def read_temperatures(self) -> None:
+        """Ask for the temperatures. Raises DeviceError."""
+        answer = self._link.call(c.GET_TEMPERATURES)
+        data = _data_of(self.name, answer, c.GET_TEMPERATURES, 24)
+        stamp, *degrees = struct.unpack_from("<I9h", data)
+        self.facts["temperatures_c"] = dict(zip(_SENSORS, degrees, strict=True))
+        self.facts["device_ms"] = stamp
+
+    def download(self, image: bytes) -> None:
+        """Write firmware to the board's flash; for `configure`'s moment after power-up. Raises DeviceError."""
+        for n, (chunk, remaining) in enumerate(file_chunks(image, TO_FLASH)):
+            self._link.call(chunk, timeout_s=ERASE_TIMEOUT_S if n == 0 else RESPONSE_S, remaining=remaining)
+
+    def report(self) -> dict[str, object]:
+        """What happened since the last report: facts, every byte sent, events, warnings. For the manifest."""
+        told: dict[str, object] = {
+            "state": self._state.name.lower(),
+            **self.facts,
+            "sent": [raw.hex() for raw in self._sent],
+            "events": self._log[:],
+            "warnings": self._link.warnings[:],
+        }
+        if self.reason:
+            told["reason"] = self.reason
+        self._sent.clear()
+        self._log.clear()
+        self._link.warnings.clear()
+        return told
+
+    def close(self) -> None:
+        """Stop frames that are awaited, as far as the board listens, and let go of it."""
+        try:
+            if self.poll() in (State.ARMED, State.RUNNING):
+                self._stop()
+        except DeviceError:
+            pass  # it is let go of either way, and hardware that is gone makes no frames for long
+        finally:
+            self._words.close()
+
+    def fail(self, reason: str) -> None:
+        """Into `FAULT`; the first reason stays."""
+        if self._state is not State.FAULT:
+            self.reason = reason
+            self._to(State.FAULT)
+
+    def _power_up(self, on_power: Callable[[], None]) -> None:
+        if self._state is not State.OFF:
+            self._to(State.OFF)
+        self.reason, self._frames = "", 0
+        self.facts.clear()
+        self._words.reset(held=True)
+        self._clock.sleep(_RESET_HELD_S)
+        self._link.restart()
+        self._words.reset(held=False)
+        up = self._link.wait_for((e.MAIN_POWER_UP, e.MAIN_CPU_FAULT), _POWER_UP_S, self._note)
+        if up.id != e.MAIN_POWER_UP or up.detail:
+            raise DeviceError(f"{self.name}: {up}", "the board does not start soundly", "switch its power off and on")
+        on_power()
+        self._link.call(c.DeviceConfiguration())
+        self._link.call(c.RF_POWER_UP)
+        self._link.wait_for((e.RF_POWER_UP_DONE,), _POWER_UP_S, self._note)
+        self._to(State.POWERED)
+
+    def _read_versions(self) -> None:
+        for key, question in (("rf_firmware", c.GET_RF_VERSION), ("main_firmware", c.GET_MAIN_VERSION)):
+            v = _data_of(self.name, self._link.call(question), question, 16)
+            hardware, release, patch = v[:3], v[3:7], (*v[10:12], v[15] >> 4, v[15] & 15)
+            self.facts[key] = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
+            self.facts["hardware"] = ".".join(map(str, hardware))
+            if not any(patch):
+                raise DeviceError(
+                    f"{self.name}: its {key.replace('_', ' ')} has no patch (version {self.facts[key]})",
+                    "the firmware was never written to this board's flash",
+                    "write TI's image once: docs/how-to/radar-bring-up.md",
+                )
+
+    def _calibrated(self, event: e.Event) -> None:
+        self.facts["calibration"] = dict(event.values)
+        passed = event.values.get("passed")
+        if not isinstance(passed, int) or passed & e.SYNTHESIZER != e.SYNTHESIZER:
+            raise DeviceError(
+                f"{self.name}: calibration failed: {event}", "no reference clock or supply", "power-cycle it"
+            )
+
+    def _stop(self) -> None:
+        """Stop frames that wait for triggers. The stop is forbidden within a frame: one frame period passes first."""
+        self._clock.sleep(self._program.frame_period_us * 1e-6)
+        self.poll()
+        if self._state in (State.ARMED, State.RUNNING):
+            self._link.call(c.FrameControl(c.STOP_WHILE_WAITING))
+            self._link.wait_for((e.FRAME_END,), _READY_S, self._note)
+            self._to(State.CONFIGURED)
+
+    def _wait(self, wanted: int, limit_s: float) -> e.Event:
+        return self._link.wait_for((wanted,), limit_s, self._on_event)
+
+    def _note(self, event: e.Event) -> None:
+        """Keep an event for the report; a fatal one ends what is being done."""
+        self._log.append(str(event))
+        if event.fatal:
+            self.fail(str(event))
+            raise DeviceError(
+                f"{self.name}: {event}", "the radar stopped itself", "it is reset when the row is retaken"
+            )
+
+    def _on_event(self, event: e.Event) -> None:
+        self._log.append(str(event))
+        if event.fatal:
+            self.fail(str(event))
+        elif event.id == e.FRAME_END and self._state in (State.ARMED, State.RUNNING):
+            self._to(State.DONE)
+        elif event.id == e.TRIGGER_READY and self._state in (State.CONFIGURED, State.DONE):
+            self._to(State.ARMED)
+
+    def _to(self, then: State) -> None:
+        if then not in TRANSITIONS[self._state]:
+            raise DeviceError(
+                f"{self.name}: {self._state.value}, cannot become: {then.value}", "out of order", "resume"
+            )
+        self._state = then
+
+
+class _Failing:
+    """An error that leaves this block puts the board into `FAULT` with what it says."""
+
+    def __init__(self, board: RadarBoard) -> None:
+        self._board = board
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if error is not None:
+            self._board.fail(error.what if isinstance(error, DeviceError) else str(error))
+
+
+def _data_of(name: str, answer: Message, question: c.Command, least: int) -> bytes:
+    """The sub-block of an answer that was asked for. Raises DeviceError when it is not there."""
+    for block in answer.blocks:
+        if block.id == question.ID and len(block.data) >= least:
+            return block.data
+    raise DeviceError(
+        f"{name}: the answer to 0x{question.ID:04X} does not hold it",
+        "another device or firmware",
+        "check the firmware",
+    )

@@ -1,0 +1,219 @@
+"""What a radar says by itself, in words: asynchronous events, and the numbers of refused commands.
+
+ICD pages at each table; which ones are fatal: ICD 337. A fatal one ends in a reset and a new configuration.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from host.radar.messages import SubBlock
+
+RF_CPU_FAULT, RF_ESM_FAULT, RF_INIT_DONE = 0x1002, 0x1003, 0x1004
+TRIGGER_READY, FRAME_END, ANALOG_FAULT, TIMING_FAILURE = 0x100B, 0x100F, 0x1010, 0x1011
+CALIBRATION_REPORT = 0x1012
+MAIN_POWER_UP, RF_POWER_UP_DONE = 0x5000, 0x5001
+MAIN_CPU_FAULT, MAIN_ESM_FAULT, BOOT_STATUS, RF_ERROR = 0x5002, 0x5003, 0x5005, 0x5008
+
+CALIBRATIONS = {  # ICD 217, bit: name
+    1: "clock PLL",
+    2: "synthesizer VCO1",
+    3: "synthesizer VCO2",
+    4: "LO distribution",
+    5: "ADC offset",
+    6: "high-pass filter",
+    7: "low-pass filter",
+    8: "peak detector",
+    9: "TX power",
+    10: "RX gain",
+    11: "TX phase",
+    12: "RX I/Q",
+}
+SYNTHESIZER = 0b1110  # without these three nothing can be transmitted
+_CPU_FAULTS = (  # ICD 212, 317
+    "undefined instruction",
+    "instruction fetch abort",
+    "data access abort",
+    "firmware fatal error",
+    "chirp error",
+    "register read-back error",
+    "power save error",
+)
+_RF_CODES = (  # ICD 213
+    "undefined",
+    "the ramp generator was not triggered by a pulse",
+    "burst starts and ends do not match",
+    "chirp starts and ends do not match",
+    "a calibration was not done before the burst",
+    "event queue full: the host does not read",
+    "sequencer copy error",
+    "temperature data invalid",
+    "test source not ready in time",
+)
+_RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1", 4: "ESM group 2", 7: "monitoring"}
+_ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}  # ICD 223
+_RF_GROUP1_FATAL = 1 << 25  # programmable filter, double bit error (ICD 216); its parity error is reserved there
+_MAIN_GROUP1_FATAL = 1 << 22  # FRC lockstep (ICD 320)
+
+REFUSALS = {  # API error codes, ICD 338-349, of the commands sent here
+    1: "wrong message number",
+    2: "no sub-block in the message",
+    3: "wrong sub-block number",
+    4: "wrong sub-block length",
+    5: "wrong sub-block data",
+    6: "error while processing the command",
+    7: "file CRC mismatch",
+    8: "file type mismatch",
+    20: "frames are already started",
+    21: "frames are already stopped",
+    22: "no valid frame configuration",
+    23: "start/stop word out of range",
+    24: "RX mask out of range",
+    25: "TX mask out of range",
+    36: "start frequency outside 76..81 GHz",
+    38: "idle time shorter than the filters' spill time",
+    41: "ADC window does not end inside the ramp",
+    46: "ramp ends outside 76..81 GHz",
+    48: "number of samples out of range",
+    49: "sample rate out of range",
+    52: "RX gain out of range or odd",
+    66: "sweep outside the VCO's range",
+    69: "ADC window does not end inside the ramp",
+    71: "chirp uses a TX that is not powered",
+    75: "frame uses a chirp that is not configured",
+    76: "frame uses a profile that is not configured",
+    79: "frame period out of range",
+    80: "chirps take longer than the frame period",
+    81: "trigger select out of range",
+    83: "frames are running",
+    129: "stop 4 needs hardware triggers",
+    1013: "data rate and clock edges do not go together",
+    1023: "words per chirp outside 64..8192",
+}
+
+
+@dataclass(frozen=True)
+class Event:
+    """One asynchronous event.
+
+    Attributes
+    ----------
+    fatal
+        Whether the device must be reset.
+    values
+        What a manifest keeps of it.
+    """
+
+    id: int
+    name: str
+    detail: str = ""
+    fatal: bool = False
+    values: Mapping[str, object] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return self.name + (f": {self.detail}" if self.detail else "")
+
+
+def describe_refusal(number: int, block: int) -> str:
+    """Error number and sub-block of a refused command, in words."""
+    return f"{REFUSALS.get(number, 'see the interface control document')} (error {number}, sub-block 0x{block:04X})"
+
+
+def decode_event(block: SubBlock) -> Event:
+    """An event from its sub-block; unknown or short ones are told as such, and are not fatal."""
+    known = _EVENTS.get(block.id)
+    if known is None:
+        return Event(block.id, f"event 0x{block.id:04X}", block.data.hex())
+    name, read = known
+    try:
+        detail, fatal, values = read(block.data)
+    except (struct.error, IndexError):
+        return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}")
+    return Event(block.id, name, detail, fatal, values)
+
+
+_Read = tuple[str, bool, Mapping[str, object]]
+
+
+def _plain(data: bytes) -> _Read:
+    del data
+    return "", False, {}
+
+
+def _word(words: Mapping[int, str] | tuple[str, ...], number: int) -> str:
+    try:
+        return words[number]
+    except (KeyError, IndexError):
+        return f"code {number}"
+
+
+def _bits(names: Mapping[int, str], mask: int) -> str:
+    return ", ".join(_word(names, b) for b in range(mask.bit_length()) if mask >> b & 1)
+
+
+def _cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
+    def read(data: bytes) -> _Read:
+        kind, code, line = struct.unpack_from("<BBH", data)
+        if kind == 0xFF:
+            return "no fault", False, {}
+        more = f", {_word(codes, code)}, firmware line {line}" if kind == 3 and codes else ""
+        return _word(_CPU_FAULTS, kind) + more, True, {"type": kind, "code": code, "line": line}
+
+    return read
+
+
+def _esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
+    def read(data: bytes) -> _Read:
+        one, two = struct.unpack_from("<II", data)
+        fatal = bool(two or one & fatal_in_group1)
+        return f"group 1 0x{one:08X}, group 2 0x{two:08X}", fatal, {"group1": one, "group2": two}
+
+    return read
+
+
+def _init_done(data: bytes) -> _Read:
+    status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
+    failed = sum(1 << b for b in CALIBRATIONS if not status >> b & 1)
+    values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
+    return f"{temperature} C" + (f"; not passed: {_bits(CALIBRATIONS, failed)}" if failed else ""), False, values
+
+
+def _analog(data: bytes) -> _Read:
+    kind, _, _, signals = struct.unpack_from("<BBHI", data)
+    return _bits(_ANALOG, signals) or "no signal named", bool(kind), {"signals": signals}
+
+
+def _main_power_up(data: bytes) -> _Read:
+    ticks, boot, tests = struct.unpack_from("<IQQ", data)
+    detail = f"boot errors 0x{boot:X}, self-tests failed 0x{tests:X}" if boot or tests else ""
+    return detail, False, {"power_up_us": ticks * 0.005, "boot_errors": boot, "tests_failed": tests}
+
+
+def _rf_power_up(data: bytes) -> _Read:
+    passed, ticks = struct.unpack_from("<II", data)
+    return "", False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
+
+
+def _rf_error(data: bytes) -> _Read:
+    (flag,) = struct.unpack_from("<I", data)
+    return _word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
+
+
+_EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
+    RF_CPU_FAULT: ("RF core fault", _cpu(_RF_CODES)),
+    RF_ESM_FAULT: ("RF core error signal", _esm(_RF_GROUP1_FATAL)),
+    RF_INIT_DONE: ("RF calibrated", _init_done),
+    TRIGGER_READY: ("ready for triggers", _plain),
+    FRAME_END: ("frames ended", _plain),
+    ANALOG_FAULT: ("analog supply fault", _analog),
+    TIMING_FAILURE: ("calibrations do not fit the frame", _plain),
+    CALIBRATION_REPORT: ("run-time calibration", _plain),
+    MAIN_POWER_UP: ("main core is up", _main_power_up),
+    RF_POWER_UP_DONE: ("RF core is up", _rf_power_up),
+    MAIN_CPU_FAULT: ("main core fault", _cpu(())),
+    MAIN_ESM_FAULT: ("main core error signal", _esm(_MAIN_GROUP1_FATAL)),
+    BOOT_STATUS: ("booted over SPI", _main_power_up),
+    RF_ERROR: ("RF core error", _rf_error),
+}

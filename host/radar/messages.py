@@ -1,0 +1,228 @@
+"""mmWaveLink messages as bytes: sync word, header, sub-blocks, CRC.
+
+Source of every number: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3. The
+bytes are described in docs/spec/mmwavelink.md. Not run on hardware yet.
+"""
+
+from __future__ import annotations
+
+import binascii
+import struct
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+
+from shared.errors import ProtocolError
+
+HOST_SYNC = bytes.fromhex("34122143")
+DEVICE_SYNC = bytes.fromhex("badccdab")
+READY_TO_READ = bytes.fromhex("78566587") + b"\xff" * 12  # "CNYS": what the host writes when the interrupt is high
+SYNC_BYTES = 4
+HEADER_BYTES = 12
+CRC_BYTES = 4
+MESSAGE_LIMIT = 256  # with the sync word
+BODY_LIMIT = 232  # of one sub-block; the chunk size that TI recommends over SPI (ICD 20)
+BLOCKS_PER_MESSAGE_ID = 32
+ERROR_BLOCK = 0x0000
+_HEADER = struct.Struct("<6H")
+_BLOCK = struct.Struct("<2H")
+_PAD = b"\xff"
+_RETRY, _NO_CRC, _CRC32 = 0x0003, 0x0300, 0x0400
+_WHY = "noise on the SPI lines, or a device that has lost its place"
+_DO = "asked for again by itself; check the 60-pin connector and the USB cable if it stays"
+
+
+class Direction(IntEnum):
+    """Who speaks to whom (ICD table 2.2)."""
+
+    HOST_TO_RF = 1
+    RF_TO_HOST = 2
+    HOST_TO_MAIN = 5
+    MAIN_TO_HOST = 6
+
+
+class Kind(IntEnum):
+    """What a message is."""
+
+    COMMAND = 0
+    RESPONSE = 1
+    NACK = 2
+    EVENT = 3
+
+
+@dataclass(frozen=True)
+class SubBlock:
+    """One configuration or report: its number (message id x 32 + n) and its data without the four bytes before it."""
+
+    id: int
+    data: bytes = b""
+
+    @property
+    def message_id(self) -> int:
+        """The message this sub-block travels in."""
+        return self.id // BLOCKS_PER_MESSAGE_ID
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message (one chunk), without what the codec computes."""
+
+    direction: Direction
+    kind: Kind
+    message_id: int
+    blocks: tuple[SubBlock, ...] = ()
+    sequence: int = 0
+    retry: bool = False
+    remaining_chunks: int = 0
+
+    @property
+    def error(self) -> tuple[int, int] | None:
+        """Error number and sub-block of a response that refuses the command (ICD table 5.1); None of any other."""
+        for block in self.blocks:
+            if self.kind is Kind.RESPONSE and block.id == ERROR_BLOCK and len(block.data) >= 4:
+                number, where = _BLOCK.unpack(block.data[:4])
+                return number, where
+        return None
+
+
+@dataclass(frozen=True)
+class Header:
+    """A checked header: what is still to be read, and with which CRC."""
+
+    direction: int
+    kind: Kind
+    message_id: int
+    length: int
+    flags: int
+    remaining_chunks: int
+    block_count: int
+
+    @property
+    def body_bytes(self) -> int:
+        """Bytes that follow the header, CRC included."""
+        return self.length - HEADER_BYTES
+
+    @property
+    def crc_bytes(self) -> int:
+        """0, 2 or 4: the first event after power-up still has 16 bits (ICD 293)."""
+        if self.flags & _NO_CRC == _NO_CRC:
+            return 0
+        bits = self.flags >> 10 & 3
+        if bits > 1:
+            raise ProtocolError(f"a message with CRC length code {bits}; 0 and 1 are understood", _WHY, _DO)
+        return 2 << bits
+
+    @property
+    def sequence(self) -> int:
+        """Sequence number, 0..15."""
+        return self.flags >> 12
+
+
+def command(blocks: tuple[SubBlock, ...], *, sequence: int = 0, retry: bool = False, remaining: int = 0) -> Message:
+    """A command of sub-blocks of one message id; main core or RF core by that id (0x200 and above: main)."""
+    ids = {b.message_id for b in blocks}
+    if len(ids) != 1:
+        raise ValueError(f"sub-blocks of one command share one message id, these have {sorted(ids)}")
+    message_id = ids.pop()
+    direction = Direction.HOST_TO_MAIN if message_id >= 0x200 else Direction.HOST_TO_RF
+    return Message(direction, Kind.COMMAND, message_id, blocks, sequence, retry, remaining)
+
+
+def checksum(words: bytes) -> int:
+    """Ones-complement of the ones-complement sum of little-endian 16-bit words (ICD 12; RFC 1071)."""
+    total = sum(struct.unpack(f"<{len(words) // 2}H", words))
+    while total >> 16:
+        total = (total & 0xFFFF) + (total >> 16)
+    return ~total & 0xFFFF
+
+
+def encode(message: Message) -> bytes:
+    """The bytes of a message, sync word first, with a 32-bit CRC.
+
+    The body is padded with 0xFF to a multiple of four bytes before its CRC (ICD 9: length less CRC is a multiple of 4).
+
+    Raises
+    ------
+    ValueError
+        when a field does not fit its bits, or the message is longer than one chunk may be.
+    """
+    body = b"".join(_BLOCK.pack(b.id, len(b.data) + _BLOCK.size) + b.data for b in message.blocks)
+    body += _PAD * (-len(body) % 4)
+    length = HEADER_BYTES + len(body) + CRC_BYTES
+    if not 0 <= message.sequence < 16 or not 0 <= message.message_id < 1024:
+        raise ValueError(f"sequence {message.sequence} must be 0..15, message id {message.message_id} 0..1023")
+    if SYNC_BYTES + length > MESSAGE_LIMIT:
+        raise ValueError(f"a message of {SYNC_BYTES + length} bytes; one chunk holds at most {MESSAGE_LIMIT}")
+    opcode = message.direction | message.kind << 4 | message.message_id << 6
+    flags = message.sequence << 12 | _CRC32 | (_RETRY if message.retry else 0)
+    head = struct.pack("<5H", opcode, length, flags, message.remaining_chunks, len(message.blocks))
+    head += checksum(head).to_bytes(2, "little")
+    sync = HOST_SYNC if message.direction in (Direction.HOST_TO_RF, Direction.HOST_TO_MAIN) else DEVICE_SYNC
+    return sync + head + body + zlib.crc32(head + body).to_bytes(4, "little")
+
+
+def decode_header(raw: bytes) -> Header:
+    """Check sync word and checksum of the first 16 bytes of a message. Raises ProtocolError."""
+    if len(raw) < SYNC_BYTES + HEADER_BYTES or raw[:SYNC_BYTES] not in (HOST_SYNC, DEVICE_SYNC):
+        raise ProtocolError(f"no sync word in {raw[:16].hex()}", _WHY, _DO)
+    head = raw[SYNC_BYTES : SYNC_BYTES + HEADER_BYTES]
+    opcode, length, flags, remaining, count, told = _HEADER.unpack(head)
+    if checksum(head[:-2]) != told:
+        raise ProtocolError(f"header {head.hex()}: checksum {told:04x} is wrong", _WHY, _DO)
+    header = Header(opcode & 0xF, Kind(opcode >> 4 & 3), opcode >> 6, length, flags, remaining, count)
+    if not HEADER_BYTES + header.crc_bytes <= length <= MESSAGE_LIMIT - SYNC_BYTES:
+        raise ProtocolError(f"header {head.hex()}: a length of {length} bytes is impossible", _WHY, _DO)
+    return header
+
+
+def decode(raw: bytes) -> Message:
+    """A message from its bytes, sync word first.
+
+    Raises
+    ------
+    ProtocolError
+        when sync word, checksum, CRC, length or sub-blocks are wrong.
+    """
+    header = decode_header(raw)
+    inner = raw[SYNC_BYTES:]
+    if len(inner) != header.length:
+        raise ProtocolError(f"{len(inner)} bytes of a message that says {header.length}", _WHY, _DO)
+    end = header.length - header.crc_bytes
+    if crc(inner[:end], header.crc_bytes) != inner[end:]:
+        raise ProtocolError(f"message {inner.hex()}: its CRC is wrong", _WHY, _DO)
+    try:
+        direction = Direction(header.direction)
+    except ValueError:
+        raise ProtocolError(f"message {inner.hex()}: unknown direction {header.direction}", _WHY, _DO) from None
+    return Message(
+        direction,
+        header.kind,
+        header.message_id,
+        _blocks(inner[HEADER_BYTES:end], header.block_count),
+        header.sequence,
+        header.flags & _RETRY == _RETRY,
+        header.remaining_chunks,
+    )
+
+
+def crc(data: bytes, size: int) -> bytes:
+    """CRC of 0, 2 or 4 bytes (ICD table 2.7): 16 bit CCITT from 0xFFFF, 32 bit as of Ethernet; little-endian."""
+    if size == 0:
+        return b""
+    value = zlib.crc32(data) if size == 4 else binascii.crc_hqx(data, 0xFFFF)
+    return value.to_bytes(size, "little")
+
+
+def _blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
+    blocks, at = [], 0
+    for _ in range(count):
+        if at + _BLOCK.size > len(body):
+            raise ProtocolError(f"{count} sub-blocks announced, {len(blocks)} found", _WHY, _DO)
+        number, length = _BLOCK.unpack_from(body, at)
+        if length < _BLOCK.size or at + length > len(body):
+            raise ProtocolError(f"sub-block 0x{number:04X} with a length of {length} bytes", _WHY, _DO)
+        blocks.append(SubBlock(number, body[at + _BLOCK.size : at + length]))
+        at += length
+    if len(body) - at >= 4:
+        raise ProtocolError(f"{len(body) - at} bytes after the last of {count} sub-blocks", _WHY, _DO)
+    return tuple(blocks)

@@ -1,0 +1,122 @@
+"""Radars that this host configures and arms itself, over USB: the backend `native`.
+
+A board that failed is reset and configured anew when the next row, or the same one again, is armed. Not run on
+hardware yet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from host.radar.board import RadarBoard, State
+from host.radar.interface import BoardState, RadarControl, RadarState
+from host.radar.program import program
+from host.radar.spi import Clock, SystemClock, WordLink
+from host.radar.usb import open_usb
+from host.radar.usb_tcp import SCHEME, open_tcp
+from host.radar.validator import constraints, direct_if_hz, require
+from shared.config import Instrument
+
+
+def open_board(serial: str) -> WordLink:
+    """A board's word link by its USB serial number, or by `tcp://address:port`. Raises ConfigError, DeviceError."""
+    return open_tcp(serial) if serial.startswith(SCHEME) else open_usb(serial)
+
+
+_LOOK_S = 0.005
+_TOLD = {
+    State.ARMED: RadarState.ARMED,
+    State.RUNNING: RadarState.ARMED,
+    State.DONE: RadarState.DONE,
+    State.FAULT: RadarState.FAULT,
+}
+
+
+class NativeRadars(RadarControl):
+    """Every board of a rig, each by the serial number of its USB chip.
+
+    Parameters
+    ----------
+    rig
+        With `radar.native` for each board. What it asks of the radars is looked at before anything is written.
+    open_words
+        Opens a board's word link by its serial number.
+    clock
+        Time.
+
+    Raises
+    ------
+    ConfigError
+        when a constraint is broken (:mod:`host.radar.validator`), or the USB library is missing.
+    DeviceError
+        when a board cannot be opened or configured.
+    """
+
+    def __init__(
+        self, rig: Instrument, open_words: Callable[[str], WordLink] = open_board, clock: Clock | None = None
+    ) -> None:
+        self._rig, self._clock = rig, clock or SystemClock()
+        frames = rig.grid.columns * rig.burst.pulses
+        require(rig, frames)
+        self._constraints = [str(c) for c in constraints(rig, frames)]
+        self._boards: dict[str, RadarBoard] = {}
+        with ExitStack() as opened:
+            opened.callback(self.close)
+            for board in rig.boards:
+                made = program(rig, board)
+                words = open_words(rig.radar.native[board.name].usb_serial)
+                self._boards[board.name] = RadarBoard(board.name, words, self._clock, made)
+            for board in self._boards.values():
+                board.configure()
+            opened.pop_all()
+
+    def arm(self, frames: int) -> None:
+        """Start `frames` frames on every board; each has said that it waits for triggers when this returns.
+
+        Raises ConfigError, DeviceError.
+        """
+        require(self._rig, frames)
+        for board in self._boards.values():
+            board.arm(frames)
+
+    def row_begins(self) -> None:
+        """Pulses may come from now on."""
+        for board in self._boards.values():
+            board.pulses_begin()
+
+    def wait_done(self, limit_s: float) -> list[str]:
+        """Boards that do not say within the limit that all their frames ended: they missed pulses, or failed."""
+        deadline = self._clock.now() + limit_s
+        while waiting := [n for n, b in self._boards.items() if b.poll() in (State.ARMED, State.RUNNING)]:
+            if self._clock.now() > deadline:
+                break
+            self._clock.sleep(_LOOK_S)
+        return waiting
+
+    def states(self) -> dict[str, BoardState]:
+        """What each board has said, by name; a link that is gone is a fault. Boards not armed are left out."""
+        found = {}
+        for name, board in self._boards.items():
+            state = board.poll()
+            if state in _TOLD:
+                detail = board.reason if state is State.FAULT else state.value
+                found[name] = BoardState(_TOLD[state], detail)
+        return found
+
+    def report(self) -> dict[str, object]:
+        """For the manifest: what was checked, what each board said of itself, and every byte sent since then."""
+        told: dict[str, object] = {"control": "native", "boards": {n: b.report() for n, b in self._boards.items()}}
+        if self._constraints:
+            told["constraints"] = self._constraints
+            told["direct_if_hz"] = {
+                b.name: round(direct_if_hz(self._rig, b)) for b in self._rig.boards if b.role != "transmit"
+            }
+            self._constraints = []
+        return told
+
+    def close(self) -> None:
+        """Stop what waits, and let go of every board."""
+        for board in self._boards.values():
+            board.close()
+        self._boards = {}

@@ -1,0 +1,96 @@
+"""What a board is told from power-up to its frames, from the rig file.
+
+Order: ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. Not run on hardware yet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from host.radar import commands as c
+from shared.config import Board, Instrument
+
+TRIGGER_MARGIN_US = 200.0
+"""From the end of a frame's period to the next pulse: 150 us at least, 300 us at most recommended (ICD 93)."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """The commands of one board, in order.
+
+    Attributes
+    ----------
+    basic
+        After the RF core is up.
+    waveform
+        After the RF core is calibrated.
+    """
+
+    basic: tuple[c.Command, ...]
+    waveform: tuple[c.Command, ...]
+    samples: int
+    frame_period_us: float
+
+    def frames(self, count: int) -> tuple[c.Command, ...]:
+        """Frames of one chirp each: the RF core's part, then the main core's."""
+        return (c.Frame(count, self.frame_period_us, self.samples), c.FrameApply(self.samples))
+
+
+def frame_period_us(rig: Instrument) -> float:
+    """Frame period that leaves the margin before the next pulse of a burst, microseconds."""
+    return rig.burst.period_us - TRIGGER_MARGIN_US
+
+
+def chirp_us(rig: Instrument) -> float:
+    """Time of one chirp: idle, ramp, and the 10 ns that a ramp takes longer than programmed (ICD 82)."""
+    return rig.radar.idle_us + rig.chirp.ramp_end_us + c.CHIRP_TICK_US
+
+
+def tx_mask(rig: Instrument, board: Board) -> int:
+    """The transmitters a board uses: one on the transmitting board, none on the others."""
+    return 1 << board.tx_antenna if board.name == rig.transmitter.name else 0
+
+
+def program(rig: Instrument, board: Board) -> Program:
+    """The commands for a board of a rig. Raises ValueError when a value fits no field."""
+    chirp, tx = rig.chirp, tx_mask(rig, board)
+    native = rig.radar.native[board.name]
+    rx = (1 << len(rig.antennas.rx_mm)) - 1
+    made = Program(
+        basic=(
+            c.Channels(rx, tx),
+            c.AdcOutput(chirp.if_mode),
+            c.LdoBypass(native.ldo_bypass),
+            c.DataFormat(rx),
+            c.LowPower(),
+            c.ApllBandwidth(),
+            c.RfDevice(),
+        ),
+        waveform=(
+            c.Profile(
+                chirp.start_hz + board.start_offset_hz,
+                chirp.slope_hz_per_s,
+                rig.radar.idle_us,
+                chirp.adc_start_us,
+                chirp.ramp_end_us,
+                chirp.samples,
+                chirp.sample_rate_hz,
+                chirp.hpf1_khz,
+                chirp.hpf2_khz,
+                rig.radar.rx_gain_db,
+                rig.radar.rf_gain_target_db,
+                rig.radar.tx_backoff_db,
+            ),
+            c.Chirp(tx),
+            c.DataPath(),
+            c.DataPathClock(),
+            c.HsiClock(),
+            c.LaneEnable(),
+            c.LvdsLanes(),
+        ),
+        samples=chirp.samples,
+        frame_period_us=frame_period_us(rig),
+    )
+    for command in (*made.basic, *made.waveform):
+        command.block()  # refuses here what fits no field
+    return made

@@ -1,0 +1,257 @@
+"""mmWaveLink over 16-bit words: commands and their answers, events between them, and what to do when one is lost.
+
+Procedure: ICD section 3. A time-out sends the same message again with the retry flag, which the device answers without
+obeying twice; a NACK sends it with a new sequence number. Not run on hardware yet.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from host.radar.commands import RF_POWER_UP, Command
+from host.radar.events import Event, decode_event, describe_refusal
+from host.radar.messages import (
+    HEADER_BYTES,
+    READY_TO_READ,
+    SYNC_BYTES,
+    Kind,
+    Message,
+    command,
+    decode,
+    decode_header,
+    encode,
+)
+from shared.errors import DeviceError, ProtocolError
+
+RESPONSE_S = 1.0
+ATTEMPTS = 3
+SETTLE_S = 30e-6  # from the interrupt to the first word (ICD 20)
+_LOOK_S = 0.5e-3
+_INTERRUPT_LOW_S = 0.1
+_SYNC_SEARCH_BYTES = 252
+_FLUSH_BYTES = 244  # of a message whose header is not to be believed: so many bytes bring the device back in step
+_DO = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume`"
+
+
+class WordLink(Protocol):
+    """What carries 16-bit words to one board, its interrupt line back, and its reset and sense lines."""
+
+    def write(self, words: Sequence[int]) -> None:
+        """Shift words out, each with chip select of its own. Raises DeviceError when the link is gone."""
+        ...
+
+    def read(self, count: int) -> list[int]:
+        """Shift words in. Raises DeviceError when the link is gone."""
+        ...
+
+    def interrupt(self) -> bool:
+        """Whether the board's host interrupt is high. Raises DeviceError when the link is gone."""
+        ...
+
+    def reset(self, held: bool) -> None:
+        """Hold the board in reset, or release it in functional mode (sense-on-power mode 4)."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it. Twice is once."""
+        ...
+
+
+class Clock(Protocol):
+    """Time, as a link needs it."""
+
+    def now(self) -> float:
+        """Seconds."""
+        ...
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        ...
+
+
+class SystemClock:
+    """The machine's monotonic time."""
+
+    def now(self) -> float:
+        """Seconds since some moment."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+
+class Link:
+    """One board's messages.
+
+    Parameters
+    ----------
+    name
+        The board, for errors.
+    words
+        What carries them.
+    on_sent
+        Told every message as it is written.
+    """
+
+    def __init__(self, name: str, words: WordLink, clock: Clock, on_sent: Callable[[bytes], None]) -> None:
+        self._name, self._words, self._clock, self._on_sent = name, words, clock, on_sent
+        self._sequence = 0
+        self._events: deque[Event] = deque()
+        self.warnings: list[str] = []
+
+    def restart(self) -> None:
+        """The device was reset: it counts from zero again, and what it had said is void."""
+        self._sequence = 0
+        self._events.clear()
+
+    def call(self, sent: Command, *, timeout_s: float = RESPONSE_S, remaining: int = 0) -> Message:
+        """Send a command and return the device's answer.
+
+        Raises
+        ------
+        DeviceError
+            when the device does not answer, or refuses the command; RF power-up is never sent twice.
+        """
+        problems: list[str] = []
+        retry = False
+        for _ in range(1 if sent is RF_POWER_UP else ATTEMPTS):
+            raw = encode(command((sent.block(),), sequence=self._sequence, retry=retry, remaining=remaining))
+            self._write(raw)
+            answer, problem = self._answer(sent.block().message_id, timeout_s)
+            if answer is None:
+                problems.append(problem)
+                retry = True
+                continue
+            self._sequence = (self._sequence + 1) % 16
+            if answer.kind is Kind.NACK:
+                problems.append("the device received it damaged")
+                retry = False
+                continue
+            if problems:
+                self._warn(f"{type(sent).__name__} (0x{sent.ID:04X}) sent {len(problems) + 1} times: {problems[-1]}")
+            if answer.error is not None:
+                raise DeviceError(
+                    f"{self._name}: the radar refuses {sent}: {describe_refusal(*answer.error)}",
+                    "the rig file asks for what this device cannot do, or it was in another state than thought",
+                    "correct [chirp], [burst] or [radar]; docs/spec/mmwavelink.md",
+                )
+            return answer
+        raise DeviceError(
+            f"{self._name}: no valid answer to {sent} after {len(problems)} tries:"
+            f" {'; '.join(dict.fromkeys(problems))}",
+            "the board has no power, hangs, or its SPI lines are disturbed",
+            _DO,
+        )
+
+    def poll(self) -> list[Event]:
+        """Events since the last look; reads what waits in the device. Raises DeviceError when the link is gone."""
+        while self._words.interrupt():
+            message, problem = self._receive()
+            if message is None:
+                self._warn(problem)
+                break
+            self._keep(message)
+        events = list(self._events)
+        self._events.clear()
+        return events
+
+    def wait_for(self, ids: Sequence[int], limit_s: float, on_event: Callable[[Event], None]) -> Event:
+        """The first of these events; `on_event` is told each one on the way, this one too.
+
+        Raises
+        ------
+        DeviceError
+            when it does not come.
+        """
+        deadline = self._clock.now() + limit_s
+        while True:
+            events = self.poll()
+            for event in events:
+                on_event(event)
+            for event in events:
+                if event.id in ids:
+                    return event
+            if self._clock.now() > deadline:
+                wanted = ", ".join(f"0x{i:04X}" for i in ids)
+                raise DeviceError(
+                    f"{self._name}: the radar did not report {wanted} within {limit_s:g} s",
+                    "it hangs, was reset, or its interrupt line is not connected",
+                    _DO,
+                )
+            self._clock.sleep(_LOOK_S)
+
+    def _answer(self, message_id: int, timeout_s: float) -> tuple[Message | None, str]:
+        """The response to the message just sent, or None and why; events on the way are kept."""
+        deadline = self._clock.now() + timeout_s
+        problem = f"no answer within {timeout_s:g} s"
+        while self._clock.now() <= deadline:
+            if not self._words.interrupt():
+                self._clock.sleep(_LOOK_S)
+                continue
+            message, found = self._receive()
+            if message is None:
+                problem = found
+            elif message.kind is Kind.EVENT:
+                self._keep(message)
+            elif message.kind is Kind.NACK or (message.message_id, message.sequence) == (message_id, self._sequence):
+                return message, ""
+            else:
+                self._warn(f"an answer to an earlier message came late (sequence {message.sequence})")
+        return None, problem
+
+    def _receive(self) -> tuple[Message | None, str]:
+        """One message, now that the interrupt is high; None and why when it cannot be read."""
+        self._clock.sleep(SETTLE_S)
+        self._write(READY_TO_READ)
+        if not self._wait_low():
+            self._write(READY_TO_READ)
+            if not self._wait_low():
+                return None, "the host interrupt stays high"
+        head = self._read(SYNC_BYTES)
+        searched = 0
+        while head[-SYNC_BYTES:] != b"\xba\xdc\xcd\xab":
+            if searched >= _SYNC_SEARCH_BYTES:
+                return None, f"no sync word in {searched} bytes"
+            head += self._read(2)
+            searched += 2
+        head = head[-SYNC_BYTES:] + self._read(HEADER_BYTES)
+        try:
+            header = decode_header(head)
+        except ProtocolError as e:
+            self._read(_FLUSH_BYTES)
+            return None, e.what
+        body = self._read(header.body_bytes)
+        try:
+            return decode(head + body), ""
+        except ProtocolError as e:
+            return None, e.what
+
+    def _wait_low(self) -> bool:
+        deadline = self._clock.now() + _INTERRUPT_LOW_S
+        while self._words.interrupt():
+            if self._clock.now() > deadline:
+                return False
+            self._clock.sleep(SETTLE_S)
+        return True
+
+    def _keep(self, message: Message) -> None:
+        if message.kind is Kind.EVENT:
+            self._events.extend(decode_event(b) for b in message.blocks)
+        else:
+            self._warn(f"an answer that nobody waits for (sequence {message.sequence})")
+
+    def _write(self, raw: bytes) -> None:
+        self._on_sent(raw)
+        self._words.write(struct.unpack(f"<{len(raw) // 2}H", raw))
+
+    def _read(self, size: int) -> bytes:
+        words = self._words.read((size + 1) // 2)
+        return struct.pack(f"<{len(words)}H", *words)[:size]
+
+    def _warn(self, what: str) -> None:
+        self.warnings.append(f"{self._name}: {what}")

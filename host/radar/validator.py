@@ -1,0 +1,162 @@
+"""Named constraints on what the radars are about to be told, looked at before anything is written.
+
+Each has its formula, limit and value. Sources: ICD at its printed page; rig facts as in docs/spec/mmwavelink.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from host.radar.commands import SLOPE_HZ_PER_S_PER_CODE, START_HZ_PER_CODE, slope_code, start_code
+from host.radar.program import chirp_us, frame_period_us
+from shared.config import Board, Instrument
+from shared.errors import ConfigError
+from shared.geometry import direct_path_m
+from shared.units import SPEED_OF_LIGHT_M_S
+
+BAND_HZ = (76e9, 81e9)
+INTER_FRAME_US = 300.0
+AFTER_FRAME_US = 150.0
+FRAME_PERIOD_US = (300.0, 1.342e6)
+PULSE_US = (0.025, 4.0)
+SAMPLE_MEMORY_BYTES = 16384
+TRIGGER_UNCERTAINTY_S = 5e-9  # of one board against the pulse (ICD 92)
+PASSBAND = 0.9  # of the sample rate
+MAX_SLOPE_CODE = 5510
+MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}  # regular ADC mode, 20 MHz IF (ICD 85)
+
+
+class Constraint(NamedTuple):
+    """One rule: what is compared with what.
+
+    `low <= value <= high` must hold, where a limit is not None; all three are in `unit`.
+    """
+
+    name: str
+    formula: str
+    value: float
+    low: float | None
+    high: float | None
+    unit: str
+    remedy: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether it does."""
+        return (self.low is None or self.value >= self.low) and (self.high is None or self.value <= self.high)
+
+    def __str__(self) -> str:
+        low = "" if self.low is None else f"{self.low:.9g} <= "
+        high = "" if self.high is None else f" <= {self.high:.9g}"
+        return f"{self.name}: {low}{self.formula} = {self.value:.9g}{high} {self.unit}".rstrip()
+
+
+def direct_if_hz(rig: Instrument, board: Board) -> float:
+    """IF of the direct path without any timing error: slope x path / c + difference of start frequencies, hertz.
+
+    With the frequencies that the codes stand for, and the mean over the board's antennas.
+    """
+    paths = direct_path_m(rig, board)
+    slope = slope_code(rig.chirp.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE
+    start, transmitted = (
+        start_code(rig.chirp.start_hz + b.start_offset_hz) * START_HZ_PER_CODE for b in (board, rig.transmitter)
+    )
+    return slope * sum(paths) / len(paths) / SPEED_OF_LIGHT_M_S + start - transmitted
+
+
+def constraints(rig: Instrument, frames: int) -> list[Constraint]:
+    """Every constraint on a rig, for rows of `frames` frames."""
+    return [*_timing(rig, frames), *_chirp(rig), *(c for b in rig.boards for c in _of_board(rig, b))]
+
+
+def require(rig: Instrument, frames: int) -> None:
+    """Refuse a rig that breaks a constraint. Raises ConfigError naming each broken one and what to change."""
+    broken = [c for c in constraints(rig, frames) if not c.holds]
+    if broken:
+        raise ConfigError(
+            "the radars would refuse or misunderstand this: " + "; ".join(str(c) for c in broken),
+            "the rig file asks for what an AWR2243 cannot do safely",
+            "; ".join(dict.fromkeys(c.remedy for c in broken)),
+        )
+
+
+def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
+    period, chirps = frame_period_us(rig), chirp_us(rig)
+    slower = "raise burst.period_us"
+    yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "take fewer points or pulses a row")
+    yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", slower)
+    yield Constraint(
+        "inter-frame time", "frame period - chirps", period - chirps, INTER_FRAME_US, None, "us", slower
+    )  # ICD 91
+    gap = rig.burst.period_us - period
+    yield Constraint("pulse gap", "pulse period - frame period", gap, AFTER_FRAME_US, None, "us", slower)  # ICD 93
+    yield Constraint("pulse width", "SYNC_IN pulse", rig.burst.width_us, *PULSE_US, "us", "set burst.width_us")
+
+
+def _chirp(rig: Instrument) -> Iterator[Constraint]:
+    c = rig.chirp
+    end = c.adc_start_us + c.samples / c.sample_rate_hz * 1e6
+    yield Constraint(
+        "ADC window", "ADC start + samples / rate", end, None, c.ramp_end_us, "us", "raise chirp.ramp_end_us"
+    )
+    memory = c.samples * len(rig.antennas.rx_mm) * 4
+    yield Constraint(
+        "sample memory", "samples x RX x 4", memory, None, SAMPLE_MEMORY_BYTES, "bytes", "lower chirp.samples"
+    )
+    yield Constraint("samples", "words a chirp", 2 * c.samples, 64, 8192, "", "set chirp.samples")  # error 1023
+    limit = MAX_RATE_HZ[c.if_mode]
+    yield Constraint("sample rate", "rate", c.sample_rate_hz, 2e6, limit, "Hz", "set chirp.sample_rate_hz")
+    remainder = abs(c.sample_rate_hz / 1e3 - round(c.sample_rate_hz / 1e3)) * 1e3
+    yield Constraint(
+        "sample rate step", "distance to whole kHz", remainder, None, 1e-3, "Hz", "give whole kHz in sample_rate_hz"
+    )
+    slope = slope_code(c.slope_hz_per_s)
+    yield Constraint("slope", "code of the slope", slope, 1, MAX_SLOPE_CODE, "", "lower chirp.slope_hz_per_s")
+    yield Constraint("ADC start", "ADC start", c.adc_start_us, 0, 40.95, "us", "lower chirp.adc_start_us")
+    yield Constraint("ramp", "ramp end", c.ramp_end_us, None, 5000, "us", "lower chirp.ramp_end_us")
+    yield Constraint("idle", "idle time", rig.radar.idle_us, 0, 5242.87, "us", "lower radar.idle_us")
+    gain = rig.radar.rx_gain_db
+    yield Constraint("RX gain", "RX gain", gain, 24, 52, "dB", "set radar.rx_gain_db to 24..52, even")  # error 52
+    yield Constraint("RX gain step", "RX gain modulo 2", gain % 2, None, 0, "dB", "set an even radar.rx_gain_db")
+    yield Constraint("TX back-off", "back-off", rig.radar.tx_backoff_db, 0, 20, "dB", "lower radar.tx_backoff_db")
+
+
+def _of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
+    c, here = rig.chirp, f" of {board.name}"
+    start = start_code(c.start_hz + board.start_offset_hz) * START_HZ_PER_CODE
+    top = start + slope_code(c.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE * c.ramp_end_us * 1e-6
+    offset = f"change start_offset_hz{here}, or the chirp"
+    yield Constraint(f"start frequency{here}", "start + offset", start, *BAND_HZ, "Hz", offset)
+    yield Constraint(f"sweep{here}", "start + offset + slope x ramp end", top, *BAND_HZ, "Hz", offset)
+    if board.name in rig.radar.native:
+        native = rig.radar.native[board.name]
+        unacknowledged = native.ldo_bypass and native.ldo_bypass_acknowledged != native.usb_serial
+        yield Constraint(
+            f"LDO bypass{here}",
+            "bypass without this board's acknowledgement",
+            int(unacknowledged),
+            None,
+            0,
+            "",
+            f"leave ldo_bypass{here} off: on a board with 1.3 V RF supplies, as TI's usually are, it may destroy the"
+            " device. Only where 1.0 V was measured on them: its USB serial number in ldo_bypass_acknowledged",
+        )
+    if board.role == "transmit":
+        return
+    found, spread = direct_if_hz(rig, board), c.slope_hz_per_s * TRIGGER_UNCERTAINTY_S
+    low, high = (
+        (0.0, PASSBAND * c.sample_rate_hz)
+        if c.if_mode == "complex1x"
+        else (-PASSBAND / 2 * c.sample_rate_hz, PASSBAND / 2 * c.sample_rate_hz)
+    )
+    better = board.start_offset_hz + (low + high) / 2 - found
+    yield Constraint(
+        f"IF budget{here}",
+        "slope x direct path / c + start offsets, 5 ns of trigger either way",
+        found,
+        low + spread,
+        high - spread,
+        "Hz",
+        f"set start_offset_hz{here}; {better:.0f} puts its direct path in the middle",
+    )

@@ -1,0 +1,20 @@
+"""The report and the product files."""
+
+from host.report.assemble import context_of
+from host.report.context import ReportContext
+from host.report.figures import banner_png, figures
+from host.report.products import plain, read_image, write_atomically, write_image, write_json
+from host.report.report import write_report
+
+__all__ = [
+    "ReportContext",
+    "banner_png",
+    "context_of",
+    "figures",
+    "plain",
+    "read_image",
+    "write_atomically",
+    "write_image",
+    "write_json",
+    "write_report",
+]

@@ -1,0 +1,72 @@
+"""A report's context from what the materials stage found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.materials import Library, MaterialsResult, TruthPlate, pixel_accuracy
+from host.report.context import ReportContext
+
+
+def context_of(
+    result: MaterialsResult,
+    x_m: npt.NDArray[np.float64],
+    y_m: npt.NDArray[np.float64],
+    *,
+    title: str,
+    simulated: bool,
+    valid: npt.NDArray[np.bool_] | None = None,
+    plates: Sequence[TruthPlate] = (),
+    library: Library | None = None,
+    quality: dict[str, Any] | None = None,
+    config: dict[str, Any] | None = None,
+    provenance: dict[str, Any] | None = None,
+    notes: Sequence[str] = (),
+) -> ReportContext:
+    """Everything a report shows of a :class:`host.materials.MaterialsResult`; the rest is passed on as it is."""
+    return ReportContext(
+        title=title,
+        simulated=simulated,
+        x_m=x_m,
+        y_m=y_m,
+        h=result.calibrated.h,
+        v=result.calibrated.v,
+        p=result.calibrated.p,
+        valid=valid,
+        materials=result.rows(),
+        segments=result.segmentation.labels,
+        pixel_names={r.patch.label: (r.names, r.patch.interior) for r in result.patches if r.names is not None},
+        truth=[{"name": t.name, "box_mm": t.box_mm, "permittivity": t.permittivity} for t in plates] or None,
+        metal_how=result.metal.how,
+        pixel_accuracy=pixel_accuracy(result),
+        library_note=library_sentence(library) if library else "",
+        quality=quality or {},
+        config=config or {},
+        provenance=provenance or {},
+        notes=list(notes),
+    )
+
+
+def library_sentence(library: Library) -> str:
+    """One or two sentences: what the library holds, and how well it names scans it has not seen."""
+    kind = "simulated " if library.simulated else ""
+    out = (
+        f"weighted KNN on |H|, |V| and complex P; library of {len(library.names)} materials from {len(library.scans)} "
+    )
+    out += f"{kind}scans."
+    fit = library.fit
+    if "patch_accuracy" in fit:
+        out += (
+            f" On scans left out of the library it names {100 * fit['pixel_accuracy']:.1f} % of the pixels and "
+            f"{100 * fit['patch_accuracy']:.1f} % of the patches right"
+        )
+        channel = fit.get("by_channel", {})
+        if {"h", "v", "p"} <= set(channel):
+            alone = ", ".join(f"{k.upper()} {100 * channel[k]:.0f} %" for k in "hvp")
+            out += f" (pixels by one channel alone: {alone})"
+        out += "."
+    return f"{out} {library.note}".strip()

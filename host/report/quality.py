@@ -1,0 +1,159 @@
+"""Numbers of a report: the headline figures and the quality tables, from the content of quality.json."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from host.report.context import ReportContext
+from host.report.imaging import imaging_table
+
+Table = dict[str, Any]
+
+
+def text(value: Any) -> str:
+    """A value as a person reads it: thousands grouped, few digits, yes and no, lists with commas."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return f"{int(value):,}".replace(",", "\u202f") if abs(int(value)) >= 10000 else str(int(value))
+    if isinstance(value, float | np.floating):
+        v = float(value)
+        if v == int(v) and abs(v) < 1e15:
+            return text(int(v))
+        return f"{v:.3g}" if abs(v) < 1000 else f"{v:,.0f}".replace(",", "\u202f")
+    if isinstance(value, dict):
+        return ", ".join(f"{k}: {text(v)}" for k, v in value.items()) or "–"
+    if isinstance(value, list | tuple):
+        return ", ".join(text(v) for v in value) or "none"
+    return str(value)
+
+
+UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
+
+
+def pretty(key: str) -> str:
+    """A key as a heading: `RH if_hz` becomes `RH IF (Hz)`."""
+    words = key.replace("_", " ").split()
+    unit = UNITS.get(words[-1]) if len(words) > 1 else None
+    if unit:
+        words = words[:-1]
+    out = " ".join({"if": "IF", "std": ""}.get(w, w) for w in words).replace("  ", " ").strip()
+    return f"{out} ({unit})" if unit else out
+
+
+def key_numbers(ctx: ReportContext, rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """The headline figures: what a reader wants to know first."""
+    out: list[dict[str, str]] = []
+
+    def add(value: str, what: str) -> None:
+        out.append({"value": value, "text": what})
+
+    if ctx.truth:
+        right = sum(r["right"] for r in rows)
+        add(f"{right} of {len(ctx.truth)}", "plates named right by majority of their pixels")
+    elif rows:
+        add(str(len(rows)), "patches found")
+    if ctx.pixel_accuracy is not None:
+        add(f"{100 * ctx.pixel_accuracy:.1f} %", "of interior pixels named right")
+    errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
+    if errors:
+        add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")
+    boards = ctx.quality.get("boards")
+    if isinstance(boards, dict) and boards:
+        expected = sum(int(b.get("frames_expected", 0)) for b in boards.values())
+        received = sum(int(b.get("frames_received", 0)) for b in boards.values())
+        if expected:
+            share = 100 * received / expected
+            add(
+                "100 %" if received == expected else f"{min(share, 99.99):.2f} %",
+                f"of {text(expected)} frames received",
+            )
+    seconds = _stage_seconds(ctx.quality)
+    if isinstance(seconds, dict) and seconds:
+        total = sum(float(s) for s in seconds.values() if isinstance(s, int | float))
+        add(f"{total:.1f} s" if total < 100 else f"{total / 60:.1f} min", "of processing, all stages")
+    return out
+
+
+def quality_tables(quality: dict[str, Any]) -> list[Table]:
+    """Tables of the known parts of quality.json, then one of whatever else is in it."""
+    known = {"boards", "residuals", "seconds_per_stage", "seconds", "imaging"}
+    boards = quality.get("boards")
+    residuals = quality.get("residuals") or _residuals_of(boards)
+    parts = (
+        _boards(boards),
+        _residuals(residuals),
+        imaging_table(quality.get("imaging")),
+        _seconds(_stage_seconds(quality)),
+    )
+    out = [part for part in parts if part]
+    rest = [(k, v) for k, v in quality.items() if k not in known]
+    if rest:
+        rows = [_cells(pretty(k), text(v)) for k, v in rest]
+        out.append({"caption": "Rows, masked data and other figures.", "head": [], "rows": rows})
+    return out
+
+
+def _cells(*cells: str, share: float | None = None) -> dict[str, Any]:
+    return {"cells": list(cells), "share": share}
+
+
+def _stage_seconds(quality: dict[str, Any]) -> Any:
+    return quality.get("seconds_per_stage", quality.get("seconds"))
+
+
+def _boards(boards: Any) -> Table | None:
+    """A line for each figure and a column for each board: it stays narrow enough for a phone."""
+    if not isinstance(boards, dict) or not boards:
+        return None
+    keys = [k for k in dict.fromkeys(k for b in boards.values() for k in b) if k != "synchronisation"]
+    rows = [_cells(pretty(k), *(text(b.get(k)) for b in boards.values())) for k in keys]
+    caption = "Frames by board. What is missing is masked, never invented."
+    return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
+
+
+def _residuals_of(boards: Any) -> dict[str, Any]:
+    """{stage: {board: {quantity: std}}} from what the boards hold under `synchronisation`."""
+    out: dict[str, Any] = {}
+    for name, board in boards.items() if isinstance(boards, dict) else ():
+        for stage, value in (board.get("synchronisation") or {}).items():
+            out.setdefault(stage, {})[name] = value
+    return out
+
+
+def _residuals(residuals: Any) -> Table | None:
+    """{stage: {board: {quantity: std}}} or {stage: {quantity: std}} as one table, a column for each quantity."""
+    if not isinstance(residuals, dict) or not residuals:
+        return None
+    flat: dict[str, dict[str, Any]] = {}
+    for stage, value in residuals.items():
+        flat[str(stage)] = _flatten(value) if isinstance(value, dict) else {"std": value}
+    keys = list(dict.fromkeys(k for v in flat.values() for k in v))
+    rows = [_cells(pretty(stage), *(text(v.get(k)) for k in keys)) for stage, v in flat.items()]
+    head = ["After stage", *map(pretty, keys)]
+    caption = (
+        "Residual (standard deviation) after each stage of synchronisation: of one chirp as received and aligned, of"
+        " the direct path in a position's average, and of the object referenced to it; amplitude beside its mean."
+    )
+    return {"caption": caption, "head": head, "rows": rows}
+
+
+def _flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for k, v in value.items():
+        name = f"{prefix} {k}".strip()
+        out.update(_flatten(v, name) if isinstance(v, dict) else {name: v})
+    return out
+
+
+def _seconds(seconds: Any) -> Table | None:
+    if not isinstance(seconds, dict) or not seconds:
+        return None
+    numbers = {str(k): float(v) for k, v in seconds.items() if isinstance(v, int | float)}
+    longest = max([*numbers.values(), 1e-9])
+    rows = [_cells(pretty(k), f"{v:.2f} s", share=round(100 * v / longest, 1)) for k, v in numbers.items()]
+    return {"caption": "Time by stage.", "head": [], "rows": rows}

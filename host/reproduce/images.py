@@ -1,0 +1,213 @@
+"""Fig. 13 and 19 (images of materials) and Fig. 14 (phase of H, V and P), from scans of the simulated rig."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.materials import MaterialsResult, table2
+from host.polarimetry import ratio_from_permittivity
+from host.report import ReportContext, context_of
+from host.report.figures import INK, draw_channel, extent_mm
+from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
+from host.reproduce.scenes import imaged, plate, scanned
+
+PLACES_MM = tuple((60.0 * x, -60.0 * y) for y, x in product((-1, 0, 1), repeat=2))
+"""Nine places; the metal reference lies in the middle."""
+SETS: dict[str, tuple[int, ...]] = {
+    "solids": (13, 12, 19, 3, 14, 6, 15, 21),
+    "liquids": (27, 25, 24, 26),
+    "powders": (33, 34, 35, 36),
+}
+"""Rows of Table 2 beside the metal reference."""
+FIG13 = (13, 12, 18, 3, 14, 6)
+FIG13_DISTANCE_MM = 598.0
+"""Object plane at which the rig file's boards see 50 degrees."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A scan's images and what is known of its plates."""
+
+    result: MaterialsResult
+    context: ReportContext
+
+
+@cache
+def seen(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0) -> Seen:
+    """Scan of plates with the permittivities of these rows of Table 2, and a copper plate in the middle."""
+    around = [p for p in PLACES_MM if p != (0.0, 0.0)]
+    step = len(around) // len(rows)
+    plates = [plate("copper", None, 0.0, 0.0)]
+    for i, n in enumerate(rows):
+        material = table2()[n - 1]
+        plates.append(plate(material.name, material.permittivity, *around[i * step]))
+    with scanned(name, plates, run.config, seed=1300, object_distance_mm=distance_mm) as (source, truth):
+        found = imaged(source, truth)
+    context = context_of(found.result, found.x_m, found.y_m, title=name, simulated=True, plates=truth)
+    return Seen(found.result, context)
+
+
+def _label_plates(ax: Any, ctx: ReportContext, size: float = 6.5) -> None:
+    for t in ctx.truth or []:
+        x0, _, x1, y1 = t["box_mm"]
+        name = str(t["name"]).split(" (")[0]
+        ax.text((x0 + x1) / 2, y1 + 1.5, name, ha="center", va="bottom", fontsize=size, color="white")
+    left, right, bottom, top = extent_mm(ctx)
+    ax.set_xlim(max(left, -110), min(right, 110))
+    ax.set_ylim(max(bottom, -110), min(top, 110))
+
+
+def draw_row(fig: Any, axes: Any, view: Seen, keys: tuple[str, ...], name: str) -> None:
+    """Images of a scan side by side, with colour bars and the plates' names."""
+    for ax, key in zip(axes, keys, strict=True):
+        shown, unit = draw_channel(ax, view.context, key)
+        kind, _, channel = key.partition("_")
+        dress(ax, f"{name}: {kind} {channel.upper()}", "x (mm)", "y (mm)" if ax is axes[0] else "")
+        ax.set_aspect("equal")
+        ax.grid(visible=False)
+        ax.set_facecolor("#3a404a")
+        bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.02)
+        bar.set_label(unit, fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+        if bar.solids is not None:
+            bar.solids.set_alpha(1)
+        _label_plates(ax, view.context)
+
+
+def ratio_table(views: dict[str, Seen]) -> Table:
+    """Ratio of each plate in each view beside Fresnel's."""
+    rows = []
+    for name, view in views.items():
+        theta = float(np.mean(view.result.theta_rad))
+        for patch in view.result.patches:
+            if patch.truth is None:
+                continue
+            eps = patch.truth.permittivity
+            true = 1.0 + 0j if eps is None else complex(ratio_from_permittivity(eps, theta))
+            p = patch.permittivity.ratio
+            told = [f"{20 * np.log10(abs(z)):.2f} dB, {np.degrees(np.angle(z)) + 0.0:.1f}°" for z in (p, true)]
+            error = abs(1 / p - 1 / true)
+            rows.append((f"{name}: {patch.truth.name}", f"{np.degrees(theta):.1f}°", *told, f"{error:.4f}"))
+    return Table(
+        "Ratio P of each plate, median of its interior, and Fresnel's at the scene's permittivity",
+        ("Plate", "incidence", "simulated image", "Fresnel", "|Δ(1/P)|"),
+        tuple(rows),
+    )
+
+
+def ratio_data(views: dict[str, Seen]) -> dict[str, Any]:
+    """The same for the JSON file."""
+    return {
+        name: {p.truth.name: p.permittivity.ratio for p in view.result.patches if p.truth is not None}
+        for name, view in views.items()
+    }
+
+
+def fig13(run: Run) -> Item:
+    """Seven materials at 50 degrees."""
+    view = seen("seven materials at 50 degrees", FIG13, run, FIG13_DISTANCE_MM)
+    fig = new_figure(14.0, 4.4)
+    draw_row(fig, fig.subplots(1, 3), view, ("amplitude_h", "amplitude_v", "amplitude_p"), "50°")
+    views = {"50°": view}
+    return Item(
+        "fig13",
+        "Fig. 13: image of seven materials at 50 degrees",
+        (
+            "The paper's rubber, alumina (Table 2's ceramic), cardboard, acrylic, silicone rubber, plastic (PET) and"
+            " copper, as plates in a grid; its copper tape lay on a plastic plate. The published figure is a picture.",
+        ),
+        (ratio_table(views),),
+        {"image": Picture(fig, "|H|, |V| and |P| relative to metal. P fades where nothing reflects.")},
+        {"ratios": ratio_data(views)},
+    )
+
+
+def fig19(run: Run) -> Item:
+    """Solids, liquids and powders at 55 degrees: H, V and P."""
+    views = {name: seen(name, rows, run) for name, rows in SETS.items()}
+    fig = new_figure(15.5, 12.6)
+    for line, (name, view) in zip(fig.subplots(3, 3), views.items(), strict=True):
+        draw_row(fig, line, view, ("amplitude_h", "amplitude_v", "amplitude_p"), name)
+    return Item(
+        "fig19",
+        "Fig. 19: images of solids, liquids and powders",
+        (
+            "Many materials look alike in H or in V and differ in P. Liquids and powders are plates with the apparent"
+            " permittivity that Table 2 gives them with their container. The published figure is a picture.",
+        ),
+        (ratio_table(views),),
+        {"images": Picture(fig, "|H|, |V| and |P| relative to metal at 55 degrees. P fades where nothing reflects.")},
+        {"ratios": ratio_data(views)},
+    )
+
+
+def _spread_deg(values: npt.NDArray[np.complexfloating]) -> float:
+    """Circular standard deviation of the phase, degrees (Mardia and Jupp, Directional Statistics, section 2.3)."""
+    length = min(float(np.abs(np.mean(values / np.abs(values)))), 1.0)
+    return float(np.degrees(np.sqrt(-2 * np.log(length))))
+
+
+def fig14(run: Run) -> Item:
+    """Phase of H, V and P inside water, oil and metal."""
+    view = seen("liquids", SETS["liquids"], run)
+    shown = ("Water (with glass)", "Corn Oil (with glass)", "copper")
+    fig = new_figure(14.0, 4.4)
+    channels = {"H": view.result.calibrated.h, "V": view.result.calibrated.v, "P": view.result.calibrated.p}
+    patches = {p.truth.name: p for p in view.result.patches if p.truth is not None and p.truth.name in shown}
+    rows, data = [], {}
+    for ax, (channel, values) in zip(fig.subplots(1, 3), channels.items(), strict=True):
+        inside = np.zeros(values.shape, bool)
+        for p in patches.values():
+            inside |= p.patch.interior
+        metal = np.mean(values[patches["copper"].patch.interior])
+        angle = np.angle(values / metal, deg=True)
+        phase = np.ma.masked_array(angle, ~inside)
+        picture = ax.imshow(
+            phase, extent=extent_mm(view.context), origin="lower", cmap="twilight", vmin=-180, vmax=180,
+            interpolation="nearest",
+        )  # fmt: skip
+        dress(ax, f"phase of {channel}", "x (mm)", "y (mm)")
+        ax.grid(visible=False)
+        ax.set_facecolor("#d9dde3")
+        ax.set_xlim(-110, 110)
+        ax.set_ylim(-110, 110)
+        bar = fig.colorbar(picture, ax=ax, fraction=0.046, pad=0.02, ticks=[-180, -90, 0, 90, 180])
+        bar.set_label("degrees", fontsize=8)
+        for p in patches.values():
+            x0, _, x1, y1 = p.patch.box_mm
+            text = f"{p.truth.name if p.truth else ''}\n{np.median(angle[p.patch.interior]) + 0.0:.1f}°"
+            ax.text((x0 + x1) / 2, y1 + 4, text, ha="center", fontsize=8, color=INK)
+    for name, p in patches.items():
+        spreads = {c: _spread_deg(v[p.patch.interior]) for c, v in channels.items()}
+        data[name] = {"phase_std_deg": spreads, "phase_of_P_deg": float(np.degrees(np.angle(p.permittivity.ratio)))}
+        rows.append((name, *(f"{s:.1f}°" for s in spreads.values()), f"{data[name]['phase_of_P_deg'] + 0.0:.1f}°"))
+    return Item(
+        "fig14",
+        "Fig. 14: phase of H, V and P",
+        (
+            "Water, oil and metal; everything outside their interiors is masked. In the paper the phases of H and V"
+            " change over a target, because it is not parallel to the plane of the scan, and the phase of P does not."
+            " In this simulation the plane is parallel, so H and V are steady as well; what tells the materials apart"
+            " is the phase of P, in both.",
+        ),
+        (
+            Table(
+                "Spread of the phase over each plate (circular standard deviation), and the phase of P",
+                ("Plate", "H", "V", "P", "median phase of P"),
+                tuple(rows),
+            ),
+        ),
+        {
+            "phase": Picture(
+                fig,
+                "Phase of each channel less that of metal, in a cyclic map; the number is the median over the plate.",
+            )
+        },
+        data,
+    )

@@ -1,0 +1,71 @@
+"""Scenes for the simulated rig, scanned and processed as a recorded scan is."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import tomli_w
+
+from host.demo import run_simulator
+from host.materials import MaterialsResult, TruthPlate, patches_from_labels, read_truth
+from host.offline import EDGE_MM, TRUTH
+from host.pipeline import Pipeline
+from host.store.scanfolder import ScanFolder
+from host.store.source import ScanSource
+from shared.errors import ScanError
+
+PLATE_MM = 45.0
+GRID = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
+"""The sparse aperture of `examples/nine-materials.toml`, which says why it is enough."""
+
+
+def plate(name: str, eps: complex | None, x_mm: float, y_mm: float) -> dict[str, Any]:
+    """A square plate of the scene file; without permittivity it is metal."""
+    what = {"metal": True} if eps is None else {"permittivity": [eps.real, -eps.imag]}
+    return {"name": name, "centre_mm": [x_mm, y_mm], "size_mm": [PLATE_MM, PLATE_MM], **what}
+
+
+@contextmanager
+def scanned(
+    name: str, plates: Sequence[Mapping[str, Any]], config: Path, seed: int, **more: Any
+) -> Iterator[tuple[ScanFolder, tuple[TruthPlate, ...]]]:
+    """The simulated scan of plates, all disturbances on, with its truth; its files are gone afterwards.
+
+    `more` are further keys of the scene file. Raises ScanError.
+    """
+    content = {"name": name, "seed": seed, "object_distance_mm": 499.0, "grid": GRID, "plates": list(plates)} | more
+    with tempfile.TemporaryDirectory(prefix="polysight-reproduce-") as temporary:
+        file, folder = Path(temporary) / "scene.toml", Path(temporary) / "scan"
+        file.write_text(tomli_w.dumps(content), encoding="utf-8")
+        if run_simulator(["simulate", str(file), "--config", str(config), "--out", str(folder)]):
+            raise ScanError(f"the scene {name!r} could not be simulated", "see above")
+        yield ScanFolder.load(folder), read_truth(folder / TRUTH)
+
+
+@dataclass(frozen=True)
+class Imaged:
+    """What was found in a scan's images, and their axes in the rig frame (float64, metres)."""
+
+    result: MaterialsResult
+    x_m: npt.NDArray[np.float64]
+    y_m: npt.NDArray[np.float64]
+
+
+def imaged(source: ScanSource, plates: tuple[TruthPlate, ...]) -> Imaged:
+    """Images of a scan, its plates' places known (as the paper segments by hand), referenced to its metal plate."""
+    pipeline = Pipeline(source)
+    for row in source.rows():
+        pipeline.add_row(row)
+    images = pipeline.form_images()
+    metal = next(p for p in plates if p.metal)
+    boxes = {p.name: p.box_mm for p in plates}
+    known, _ = patches_from_labels(boxes, images.x_m, images.y_m, unit="mm", margin_mm=EDGE_MM)
+    result = pipeline.find_materials(images, metal.box_mm, plates=plates, segmentation=known)
+    return Imaged(result, images.x_m, images.y_m)

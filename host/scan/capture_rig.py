@@ -1,0 +1,115 @@
+"""All recorded boards at once: their cards and their receiving processes."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+
+from host.capture.card import CardClient
+from host.capture.dca1000 import Status, Version
+from host.capture.receiver import ReceiverProcess
+from host.capture.receiver_words import Progress, RowCapture
+from host.capture.scheduling import receiver_cores
+from host.capture.udp import check_receive_buffer
+from host.store.scanfolder import PART
+from shared.config import Instrument
+from shared.errors import PolysightError
+
+
+class CaptureRig:
+    """Cards and receivers of the boards that are recorded.
+
+    Attributes
+    ----------
+    warnings
+        What is not as asked, but good enough to scan.
+
+    Raises
+    ------
+    DeviceError
+        when a port is in use, or the receive buffer is too small for two bursts.
+    """
+
+    def __init__(self, instrument: Instrument) -> None:
+        self._instrument = instrument
+        self.warnings: list[str] = []
+        self.cards: dict[str, CardClient] = {}
+        self.receivers: dict[str, ReceiverProcess] = {}
+        self._recording = False
+        self._stack = ExitStack()
+        with ExitStack() as stack:
+            for board in instrument.recorded:
+                card = CardClient(board, instrument.limits.command_timeout_s)
+                self.cards[board.name] = stack.enter_context(card)
+            wanted, burst_bytes = instrument.card.receive_buffer_bytes, instrument.burst.pulses * instrument.frame_bytes
+            cores = receiver_cores(len(instrument.recorded))
+            for board, core in zip(instrument.recorded, cores, strict=True):
+                receiver = stack.enter_context(ReceiverProcess(board, wanted, core))
+                self.receivers[board.name] = receiver
+                self.warnings += receiver.warnings
+                if warning := check_receive_buffer(board.name, receiver.granted_bytes, wanted, burst_bytes):
+                    self.warnings.append(warning)
+            self._stack = stack.pop_all()
+
+    def configure(self) -> dict[str, Version]:
+        """Set every card up and stop what it may record; returns the FPGA versions. Raises DeviceError."""
+        found = {}
+        for name, card in self.cards.items():
+            card.alive()
+            card.record_stop()
+            card.configure(self._instrument.card)
+            found[name] = card.version()
+        return found
+
+    def begin_row(self, row: int, take: int, points: int, folder: Path) -> None:
+        """Arm the receivers, then start the records. Raises DeviceError."""
+        frame_bytes = self._instrument.frame_bytes
+        expected = points * self._instrument.burst.pulses * frame_bytes
+        for name, receiver in self.receivers.items():
+            receiver.begin_row(row, take, expected, frame_bytes, folder / "raw" / name / f"{row:04d}{PART}")
+        self._recording = True
+        for card in self.cards.values():
+            card.record_start()
+
+    @property
+    def complete(self) -> bool:
+        """Whether every expected byte of the row is there, on every board."""
+        return all(receiver.poll().complete for receiver in self.receivers.values())
+
+    def reports(self) -> dict[str, Progress]:
+        """How far the row is on every board, asked for."""
+        return {name: receiver.report() for name, receiver in self.receivers.items()}
+
+    def statuses(self) -> dict[str, Status]:
+        """Status bits each card reported since its record start."""
+        return {name: card.take_status() for name, card in self.cards.items()}
+
+    def end_row(self) -> dict[str, RowCapture]:
+        """Stop the records and take the rows: their files are durable when this returns. Raises DeviceError."""
+        self.stop_records()
+        statuses = self.statuses()
+        return {name: receiver.end_row(statuses[name]) for name, receiver in self.receivers.items()}
+
+    def stop_records(self) -> None:
+        """Stop all records. Raises DeviceError."""
+        for card in self.cards.values():
+            card.record_stop()
+        self._recording = False
+
+    def close(self) -> None:
+        """Stop recording where the cards still listen, end the processes, close the sockets. Twice is once."""
+        if self._recording:
+            self._recording = False
+            for card in self.cards.values():
+                with suppress(PolysightError):
+                    card.record_stop()
+        self._stack.close()
+
+    def __enter__(self) -> CaptureRig:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,266 @@
+"""The host's end of the two sockets to the Pi: commands with time-out and retry, events without gaps."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TypeVar
+
+import zmq
+
+from host.scan.heartbeat import HostHeartbeat
+from shared.config import Instrument
+from shared.errors import DeviceError, ProtocolError, ScanError
+from shared.messages import (
+    JOURNALLED,
+    Abort,
+    Accepted,
+    AnyCommand,
+    AnyEvent,
+    AnyReply,
+    BeginRun,
+    EndRun,
+    ExitStatus,
+    Heartbeat,
+    Hello,
+    HelloReply,
+    Home,
+    Refused,
+    Replay,
+    ReplayReply,
+    RowFinished,
+    RowStarted,
+    RunRow,
+    State,
+    Status,
+    StatusReply,
+    pack,
+    unpack_event,
+    unpack_reply,
+)
+from shared.sockets import requester, subscriber
+
+ATTEMPTS = 3
+_REPLAY_LIMIT = 1000
+R = TypeVar("R", bound=AnyReply)
+
+
+class RefusedError(ScanError):
+    """The Pi did not take a command; `number` is of shared/faults.py."""
+
+    def __init__(self, command: str, refusal: Refused) -> None:
+        super().__init__(f"the Pi refused {command}: {refusal.what}", refusal.why, refusal.remedy)
+        self.number = refusal.number
+
+
+class PiClient:
+    """Talks to one Pi. Used by one thread.
+
+    Parameters
+    ----------
+    instrument
+        Addresses, keys and limits.
+
+    Raises
+    ------
+    ConfigError
+        when an address needs keys that are not there.
+    """
+
+    def __init__(self, context: zmq.Context[Any], instrument: Instrument) -> None:
+        self._context, self._instrument = context, instrument
+        self._heartbeat: HostHeartbeat | None = None
+        self._address = instrument.pi.command_address
+        self._event_address = instrument.pi.event_address
+        self._timeout_s = instrument.limits.command_timeout_s
+        self._silence_s = max(10 * instrument.pi.heartbeat_ms / 1e3, instrument.limits.command_timeout_s)
+        self._on_event: Callable[[AnyEvent], None] = _ignore
+        keys = Path(instrument.pi.key_dir)
+        self._events = subscriber(context, self._event_address, keys)
+        self._commands = requester(context, self._address, keys)
+        self._scan_id = ""
+        self._last_seq = 0
+        self._last_heard_s = time.monotonic()
+        self._pending: deque[AnyEvent] = deque()
+        self.gaps_filled = 0  # events that PUB lost and the journal returned
+        self.state: State = "idle"  # of the last heartbeat
+
+    @property
+    def event_socket(self) -> zmq.Socket[bytes]:
+        """The event socket, for a poller."""
+        return self._events
+
+    def follow(self, scan_id: str, last_seq: int, on_event: Callable[[AnyEvent], None]) -> None:
+        """Follow the events of a scan: `on_event` takes each one after `last_seq` exactly once, in order."""
+        self._scan_id, self._last_seq, self._on_event = scan_id, last_seq, on_event
+
+    # --- commands ---
+
+    def hello(self) -> HelloReply:
+        """Who is there? Raises DeviceError when nobody answers, ProtocolError for another release."""
+        return self._ask(Hello(), HelloReply)
+
+    def status(self) -> StatusReply:
+        """Everything the Pi knows about itself. Raises DeviceError."""
+        return self._ask(Status(), StatusReply)
+
+    def begin_run(self, run: BeginRun) -> None:
+        """Begin a run, or take it up again; twice is once. Keeps the promise of `run.heartbeat_ms` until its end.
+
+        Raises RefusedError, DeviceError.
+        """
+        self._ask(run, Accepted)
+        self._fall_silent()
+        if run.heartbeat_ms:
+            self._heartbeat = HostHeartbeat(self._context, self._instrument, run.scan_id, run.heartbeat_ms / 1e3)
+
+    def end_run(self, scan_id: str, exit_status: ExitStatus, reason: str) -> None:
+        """End the run. Raises RefusedError, DeviceError."""
+        self._ask(EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500]), Accepted)
+        self._fall_silent()
+
+    def home(self) -> None:
+        """Begin to home the stage. Raises RefusedError, DeviceError."""
+        if self._once(Home(), self._timeout_s) is None and self.status().state not in ("homing", "ready"):
+            self._ask(Home(), Accepted)
+
+    def run_row(self, scan_id: str, row_index: int, take: int) -> None:
+        """Begin a row. When the reply is lost, it is found out whether the row runs before asking again.
+
+        Raises RefusedError, DeviceError.
+        """
+        command = RunRow(scan_id=scan_id, row_index=row_index, take=take)
+        for _ in range(ATTEMPTS):
+            reply = self._once(command, self._timeout_s / ATTEMPTS)
+            if isinstance(reply, Accepted):
+                self.state = reply.state  # the heartbeat heard last is older
+                return
+            status = self.status()
+            if status.state in ("running", "held") and (status.row_index, status.take) == (row_index, take):
+                return
+            self._catch_up(status.last_seq)
+            if any(_is_of(e, row_index, take) for e in self._pending):
+                return
+        raise self._silent("RunRow")
+
+    def abort(self, reason: str) -> None:
+        """Stop the row now; aborting twice does no harm. Raises RefusedError, DeviceError."""
+        self._ask(Abort(reason=reason), Accepted)
+
+    def _ask(self, command: AnyCommand, kind: type[R]) -> R:
+        """A command that may be sent twice."""
+        for _ in range(ATTEMPTS):
+            reply = self._once(command, self._timeout_s / ATTEMPTS)
+            if isinstance(reply, kind):
+                return reply
+            if reply is not None:
+                raise ProtocolError(f"the Pi answered {type(command).__name__} with {type(reply).__name__}")
+        raise self._silent(type(command).__name__)
+
+    def _once(self, command: AnyCommand, limit_s: float) -> AnyReply | None:
+        """Send once; the reply, or None after `limit_s`. A new request drops the old one (relaxed, correlated REQ)."""
+        self._commands.send(pack(command))
+        if not self._commands.poll(round(limit_s * 1e3)):
+            return None
+        reply = unpack_reply(self._commands.recv())
+        self._last_heard_s = time.monotonic()
+        if isinstance(reply, Refused):
+            raise RefusedError(type(command).__name__, reply)
+        return reply
+
+    def _silent(self, command: str) -> DeviceError:
+        return DeviceError(
+            f"the Pi at {self._address} did not answer {command} within {self._timeout_s:g} s ({ATTEMPTS} attempts)",
+            "`polysight-pi run` is not running there, the address is wrong, or the CURVE keys do not match",
+            "on the Pi: `systemctl status polysight-pi` and `polysight-pi check`; here: check pi.command_address",
+        )
+
+    # --- events ---
+
+    def events(self) -> list[AnyEvent]:
+        """Journalled events of the scan that have come, in order, without waiting; what PUB lost is asked for.
+
+        Raises
+        ------
+        DeviceError
+            when the Pi is silent on both sockets, or its journal lacks what was lost.
+        """
+        while self._events.poll(0):
+            parts = self._events.recv_multipart()
+            self._last_heard_s = time.monotonic()
+            event = unpack_event(parts[-1])
+            if isinstance(event, Heartbeat):
+                self.state = event.state
+            if event.scan_id != self._scan_id or not self._scan_id:
+                continue
+            if isinstance(event, JOURNALLED):
+                if event.seq == self._last_seq + 1:
+                    self._take(event)
+                elif event.seq > self._last_seq:
+                    self._catch_up(event.seq)
+            elif event.seq > self._last_seq:
+                self._catch_up(event.seq)
+        if time.monotonic() - self._last_heard_s > self._silence_s:
+            self._catch_up(self.status().last_seq)  # its heartbeats do not come: does it answer?
+        out = list(self._pending)
+        self._pending.clear()
+        return out
+
+    def _take(self, event: AnyEvent) -> None:
+        self._last_seq = event.seq
+        self._pending.append(event)
+        self._on_event(event)
+
+    def _catch_up(self, to_seq: int) -> None:
+        """Fetch journalled events from the first one not seen up to `to_seq`."""
+        while self._last_seq < to_seq:
+            reply = self._ask(
+                Replay(scan_id=self._scan_id, from_seq=self._last_seq + 1, limit=_REPLAY_LIMIT), ReplayReply
+            )
+            before = self._last_seq
+            for event in reply.events:
+                if event.seq == self._last_seq + 1:
+                    self._take(event)
+                    self.gaps_filled += 1
+            if self._last_seq == before:
+                raise DeviceError(
+                    f"the Pi's journal of scan {self._scan_id} lacks event {before + 1} (it ends at {reply.last_seq})",
+                    "the journal on the Pi was removed or damaged",
+                    "start a new scan; the committed rows of this one stay valid",
+                )
+
+    def drain(self) -> None:
+        """Take the events up to the newest one in the Pi's journal. Raises DeviceError."""
+        self._catch_up(self.status().last_seq)
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._fall_silent()
+        self._events.close()
+        self._commands.close()
+
+    def _fall_silent(self) -> None:
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+            self._heartbeat = None
+
+    def __enter__(self) -> PiClient:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _ignore(event: AnyEvent) -> None:
+    del event
+
+
+def _is_of(event: AnyEvent, row_index: int, take: int) -> bool:
+    if isinstance(event, RowStarted):
+        return event.row.index == row_index and event.take == take
+    return isinstance(event, RowFinished) and (event.row_index, event.take) == (row_index, take)

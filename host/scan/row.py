@@ -1,0 +1,223 @@
+"""Takes rows: from arming the radars to what the receivers got."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+
+import zmq
+
+from host.capture.end_of_record import record_ending
+from host.radar.interface import RadarControl
+from host.scan.capture_rig import CaptureRig
+from host.scan.pi_client import PiClient
+from host.scan.slipped_row import ToldCapture, find_frames
+from host.scan.states import RowState, RowTransaction
+from host.scan.stop import StopRequest
+from host.scan.take import Take
+from host.store.scanfolder import PART
+from shared.config import Instrument
+from shared.errors import ScanError
+from shared.faults import explain
+from shared.messages import Capture, RowFinished
+from shared.raster import Row
+from shared.units import NS_PER_S
+
+_TURN_MS = 50  # how often stop requests and limits are looked at
+_ABORT_LIMIT_S = 10.0
+_DISK_NOTICE_S = 2.0
+ON_REQUEST = "asked for at the host"
+
+
+class RowTaker:
+    """Takes rows, one at a time. `say` is told phase and message of what holds a row up, `on_point` its points."""
+
+    def __init__(
+        self,
+        instrument: Instrument,
+        rig: CaptureRig,
+        radars: RadarControl,
+        pi: PiClient,
+        scan_id: str,
+        folder: Path,
+        stop: StopRequest,
+        on_point: Callable[[int], None],
+        say: Callable[[str, str], None],
+    ) -> None:
+        self._instrument, self._rig, self._radars, self._pi = instrument, rig, radars, pi
+        self._scan_id, self._folder, self._stop = scan_id, folder, stop
+        self._on_point, self._say = on_point, say
+        self._poller = zmq.Poller()
+        self._poller.register(pi.event_socket, zmq.POLLIN)
+        for part in (*rig.receivers.values(), *rig.cards.values()):
+            self._poller.register(part.fileno(), zmq.POLLIN)
+
+    def take(self, row: Row, number: int, transaction: RowTransaction) -> Take:
+        """Run the row and receive it; `transaction` is left in `checking`.
+
+        Raises
+        ------
+        PolysightError
+            when the Pi, a card, a receiver or a radar's control does not do its part at all.
+        """
+        take = Take(row, number)
+        transaction.to(RowState.ARMING)
+        self._radars.arm(row.points * self._instrument.burst.pulses)
+        self._rig.begin_row(row.index, number, row.points, self._folder)
+        take.radars = self._radars.states()
+        if self._stop.now:
+            take.aborted = ON_REQUEST
+        elif take.stopped_radars:
+            take.aborted = "the row was not begun"
+        else:
+            transaction.to(RowState.RUNNING)
+            self._radars.row_begins()
+            self._pi.run_row(self._scan_id, row.index, number)
+            self._wait_for_row(take, transaction)
+            if take.bursts_are_whole:
+                transaction.to(RowState.COLLECTING)
+                self._wait_for_data()
+                take.not_done = self._radars.wait_done(self._instrument.limits.end_of_record_s)
+        transaction.to(RowState.WRITING)
+        self._end_records(take)
+        take.radars = self._radars.states()
+        if take.bursts_are_whole:
+            self._find_missed_pulses(take)
+        transaction.to(RowState.CHECKING)
+        return take
+
+    def _wait_for_row(self, take: Take, transaction: RowTransaction) -> None:
+        """Until the Pi says how the row ended. Aborts it when asked to stop now, or when it is in vain."""
+        limit_s = row_limit_s(self._instrument, take.row)
+        deadline = time.monotonic() + limit_s
+        silence = _Silence(self._instrument, self._rig)
+        held = False
+        while take.finished is None:
+            self._turn(take)
+            reason = ON_REQUEST if self._stop.now else "" if take.aborted else self._in_vain(take, silence)
+            if take.finished is None and reason and not take.aborted:
+                take.aborted = reason
+                deadline = time.monotonic() + _ABORT_LIMIT_S
+                transaction.to(RowState.ABORTING)
+                self._pi.abort(reason)
+            if take.finished is None and self._pi.state in ("fault", "idle"):
+                self._check_stopped(take)
+            if self._pi.state == "held" and not take.aborted:
+                deadline = time.monotonic() + limit_s  # however long somebody looks at it
+                if not held:
+                    self._say("held", f"row {take.row.index} is held; it goes on when the Pi is told to resume")
+                held = True
+            if time.monotonic() > deadline:
+                if take.aborted:
+                    return
+                raise ScanError(
+                    f"row {take.row.index} did not end within {limit_s:.0f} s",
+                    "the stage stands still, or the Pi's program hangs",
+                    f"`polysight-pi check` on the Pi, then `polysight resume {self._folder}`",
+                )
+
+    def _in_vain(self, take: Take, silence: _Silence) -> str:
+        """Why the row cannot become whole any more and is not worth its time; "" while it can."""
+        take.radars = self._radars.states()
+        if take.stopped_radars:
+            return "; ".join(f"{name}: the radar has stopped: {s.detail}" for name, s in take.stopped_radars.items())
+        if boards := silence.boards(take.told):
+            return f"no data from {', '.join(boards)}"
+        return ""
+
+    def _check_stopped(self, take: Take) -> None:
+        """A Pi that cannot write its journal, or was started anew, cannot tell how the row ended, only where it is."""
+        status = self._pi.status()
+        if status.state not in ("fault", "idle"):
+            return  # the heartbeat was older than this row
+        if status.scan_id == self._scan_id:
+            self._pi.drain()
+        self._collect(take)
+        if take.finished is None and status.scan_id != self._scan_id:
+            raise ScanError(
+                f"the Pi's program was started anew in row {take.row.index}",
+                "power was lost there, or the program ended",
+                f"`polysight resume {self._folder}`; why it ended: `journalctl -u polysight-pi` on the Pi",
+            )
+        if take.finished is None:
+            e = explain(status.fault)
+            raise ScanError(
+                f"the Pi stopped in row {take.row.index}: {e.what}: {status.reason}",
+                e.why,
+                f"{e.remedy}, then `polysight resume {self._folder}`",
+            )
+
+    def _turn(self, take: Take) -> None:
+        self._poller.poll(_TURN_MS)
+        self._rig.statuses()  # reads what the cards report by themselves
+        _ = self._rig.complete  # reads what the receivers say
+        self._collect(take)
+
+    def _collect(self, take: Take) -> None:
+        for event in self._pi.events():
+            if isinstance(event, Capture) and (event.row_index, event.take) == (take.row.index, take.number):
+                take.told.append(ToldCapture(event, time.monotonic_ns()))
+                self._on_point(event.point + 1)
+            elif isinstance(event, RowFinished) and (event.row_index, event.take) == (take.row.index, take.number):
+                take.finished = event
+
+    def _wait_for_data(self) -> None:
+        """Until every byte is there, or the record has ended on every board that lacks some."""
+        finished_ns = time.monotonic_ns()
+        limit_ns = int(self._instrument.limits.end_of_record_s * NS_PER_S)
+        while not self._rig.complete and not self._stop.now:
+            self._poller.poll(_TURN_MS)
+            now, statuses, reports = time.monotonic_ns(), self._rig.statuses(), self._rig.reports()
+            if all(record_ending(r, statuses[n], finished_ns, now, limit_ns) for n, r in reports.items()):
+                return
+
+    def _end_records(self, take: Take) -> None:
+        """Stop the records and make the rows durable. A slow disk is waited for, and that is told."""
+        began = time.monotonic()
+        with ThreadPoolExecutor(1, thread_name_prefix="disk") as beside:
+            ending = beside.submit(self._rig.end_row)
+            while not wait([ending], _DISK_NOTICE_S).done:
+                waited_s = time.monotonic() - began
+                self._say("wait", f"row {take.row.index}: the disk has not taken it after {waited_s:.0f} s; waiting")
+            take.captures = ending.result()
+
+    def _find_missed_pulses(self, take: Take) -> None:
+        """For boards that are short of frames though every pulse was sent: which pulses they missed."""
+        for name, capture in take.captures.items():
+            if capture.slipped:
+                path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
+                take.placed[name] = find_frames(path, take.row, take.told, self._instrument)
+
+
+class _Silence:
+    """Notices boards of which nothing has come long after bursts were sent: those radars are not armed."""
+
+    def __init__(self, instrument: Instrument, rig: CaptureRig) -> None:
+        self._rig = rig
+        self._limit_ns = int(instrument.limits.end_of_record_s * NS_PER_S)
+        # So many bursts fill two packets at least.
+        burst_bytes = instrument.burst.pulses * instrument.frame_bytes
+        self._bursts = -(-2 * instrument.card.packet_bytes // burst_bytes)
+        self._looked_ns = 0
+        self._all_heard = False
+
+    def boards(self, told: list[ToldCapture]) -> list[str]:
+        """The silent ones, [] while none is."""
+        now = time.monotonic_ns()
+        if self._all_heard or len(told) < self._bursts or now - self._looked_ns < self._limit_ns:
+            return []
+        if now - told[self._bursts - 1].told_ns < self._limit_ns:
+            return []
+        self._looked_ns = now
+        silent = [name for name, progress in self._rig.reports().items() if progress.received == 0]
+        self._all_heard = not silent
+        return silent
+
+
+def row_limit_s(instrument: Instrument, row: Row) -> float:
+    """A row takes longer than this only when something hangs: four times the way there and along it, and a minute."""
+    stage = instrument.stage
+    there_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
+    return 60.0 + 4 * (there_s + abs(row.step_mm) * row.points / stage.speed_mm_s)

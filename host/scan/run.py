@@ -1,0 +1,153 @@
+"""A scan from the first row that is not committed to the last: `run_scan` and `resume_scan`.
+
+Every row is a transaction (docs/spec/scan-folder.md): taken, checked by count, made durable, and only then a line in
+the manifest. Whatever ends the program at any time, `resume_scan` goes on from there.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import zmq
+
+from host.radar.backends import radar_control
+from host.radar.interface import RadarControl
+from host.scan.capture_rig import CaptureRig
+from host.scan.pi_client import PiClient
+from host.scan.processing import OnRow
+from host.scan.result import OnProgress, ScanProgress, ScanResult
+from host.scan.running import RunningScan
+from host.scan.stop import StopRequest, interrupts_wait
+from host.store.manifest import ManifestWriter
+from host.store.scanfolder import ScanFolder, new_scan_id, utc_now
+from host.store.validate import damaged_rows
+from shared.config import Instrument
+from shared.errors import ScanError
+from shared.messages import HelloReply
+from shared.raster import check_burst_fits, plan_raster
+
+__all__ = ["OnRow", "ScanProgress", "ScanResult", "resume_scan", "run_scan"]
+HARDWARE_BACKEND = "gpiod"  # the Pi's backend that drives real lines; any other is simulated
+
+
+def run_scan(
+    instrument: Instrument,
+    folder: Path,
+    *,
+    on_row: OnRow | None = None,
+    progress: OnProgress | None = None,
+    keep_incomplete: bool = False,
+    stop: StopRequest | None = None,
+    radars: RadarControl | None = None,
+) -> ScanResult:
+    """Make a new scan folder and scan the rig into it.
+
+    Parameters
+    ----------
+    instrument
+        The rig, the grid and the limits.
+    folder
+        Scan folder to make.
+    on_row
+        Called with each committed row's index, in order, from one worker thread of low priority.
+    progress
+        Called from the calling thread.
+    keep_incomplete
+        Commit a row that stays incomplete after all retakes, masked, instead of failing.
+    stop
+        Asked to stop once: after this row; twice: now. Ctrl-C asks, where this runs in the main thread.
+    radars
+        What arms the radars for each row; that of the rig file when None. Closed at the end.
+
+    Raises
+    ------
+    PolysightError
+        naming the hop that failed and what to do; the manifest says the same, and all committed rows are safe.
+    """
+    plan = plan_raster(instrument.grid)
+    check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
+    with ExitStack() as stack:
+        pi, rig, hello = _connect(stack, instrument, progress)
+        scan = ScanFolder.create(
+            folder,
+            instrument,
+            plan,
+            simulated=hello.backend != HARDWARE_BACKEND,
+            scan_id=new_scan_id(),
+            extra={"pi": {"release": hello.pi_release, "firmware": hello.firmware, "backend": hello.backend}},
+        )
+        writer = stack.enter_context(scan.writer())
+        radars = stack.enter_context(radars or radar_control(instrument))
+        stop = stop or StopRequest()
+        return RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop).run()
+
+
+def resume_scan(
+    folder: Path,
+    *,
+    on_row: OnRow | None = None,
+    progress: OnProgress | None = None,
+    keep_incomplete: bool = False,
+    stop: StopRequest | None = None,
+    radars: RadarControl | None = None,
+) -> ScanResult:
+    """Go on with a scan at its first row that is not committed; committed rows are compared with their digests.
+
+    A row that is not what was committed is taken again.
+
+    Parameters and errors as :func:`run_scan`. `on_row` is called for the rows committed earlier too.
+    """
+    scan = ScanFolder.load(folder)
+    with ExitStack() as stack:
+        writer = stack.enter_context(scan.writer())
+        scan.reload()
+        withdrawn = _withdraw_damaged(scan, writer, progress)
+        pi, rig, hello = _connect(stack, scan.instrument, progress)
+        if (hello.backend != HARDWARE_BACKEND) != scan.simulated:
+            kind = "simulated" if scan.simulated else "of the real rig"
+            raise ScanError(
+                f"{folder} is a scan that is {kind}, and the Pi's backend is {hello.backend!r}",
+                "simulated and measured rows must never be mixed in one scan",
+                "start the Pi with the backend the scan was begun with, or make a new scan",
+            )
+        missing = scan.plan.rows - len(scan.committed())
+        writer.append({"fact": "scan_resumed", "resumed_utc": utc_now(), "rows_missing": missing})
+        radars = stack.enter_context(radars or radar_control(scan.instrument))
+        stop = stop or StopRequest()
+        running = RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop)
+        running.result.warnings += withdrawn
+        return running.run()
+
+
+def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProgress | None) -> list[str]:
+    """Take back the commit of every row whose files are not what was committed, so that it is taken again.
+
+    Returns what to tell about it. Raises DeviceError.
+    """
+    rows = scan.committed()
+    if progress is not None:
+        progress(ScanProgress("check", f"comparing {len(rows)} committed rows with their digests", scan.plan.rows, 0))
+    damaged = damaged_rows(scan)
+    for row, reasons in damaged.items():
+        fact = {"fact": "row_withdrawn", "row": row, "take": rows[row].take, "reasons": reasons}
+        writer.append({**fact, "withdrawn_utc": utc_now()})
+    scan.reload()
+    return [f"row {row} is taken again: {'; '.join(reasons)}" for row, reasons in damaged.items()]
+
+
+def _connect(
+    stack: ExitStack, instrument: Instrument, progress: OnProgress | None
+) -> tuple[PiClient, CaptureRig, HelloReply]:
+    """Reach the Pi and every card, so that a scan folder is made only when everybody answers."""
+    if progress is not None:
+        progress(ScanProgress("connect", "reaching the Pi and the capture cards", instrument.grid.rows, 0))
+    # A context's plain end waits for ever for a socket that nobody closed, such as one whose making was interrupted.
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    stack.callback(context.destroy, linger=0)
+    with interrupts_wait():
+        pi = stack.enter_context(PiClient(context, instrument))
+    hello = pi.hello()
+    rig = stack.enter_context(CaptureRig(instrument))
+    rig.configure()
+    return pi, rig, hello

@@ -1,0 +1,260 @@
+"""The scan that runs: row after row, each waited for, taken, settled; and its end, whichever it is."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+
+from host.radar.interface import RadarControl
+from host.scan.capture_rig import CaptureRig
+from host.scan.commit import commit_row, gave_up, reject_row
+from host.scan.pi_client import PiClient
+from host.scan.processing import OnRow, ProcessingQueue
+from host.scan.ready import check_disk, make_ready
+from host.scan.result import OnProgress, ScanProgress, ScanResult
+from host.scan.row import ON_REQUEST, RowTaker
+from host.scan.states import RowState, RowTransaction
+from host.scan.stop import StopRequest, interrupts_request
+from host.scan.take import Take
+from host.store.events import EventWriter, read_events
+from host.store.manifest import Fact, ManifestWriter
+from host.store.scanfolder import EVENTS, ScanFolder, utc_now
+from shared.errors import PolysightError
+from shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
+from shared.raster import Row
+
+_LOOK_S = 0.05
+
+
+class RunningScan:
+    """A scan that runs: everything is connected, the folder is locked."""
+
+    def __init__(
+        self,
+        scan: ScanFolder,
+        writer: ManifestWriter,
+        pi: PiClient,
+        rig: CaptureRig,
+        radars: RadarControl,
+        on_row: OnRow | None,
+        progress: OnProgress | None,
+        keep_incomplete: bool,
+        stop: StopRequest,
+    ) -> None:
+        self._scan, self._writer, self._pi, self._rig = scan, writer, pi, rig
+        self._instrument, self._plan = scan.instrument, scan.plan
+        self._progress, self._keep_incomplete, self._stop = progress, keep_incomplete, stop
+        self._radars = radars
+        self._queue = ProcessingQueue(on_row, scan.instrument.limits.rows_waiting)
+        self._committed = set(scan.committed())
+        self._row_seconds: list[float] = []
+        self._current = (-1, 0, 0)
+        self._state = ""
+        self._told_stop = False
+        self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
+
+    def run(self) -> ScanResult:
+        """Take every missing row, and write down how it ended. Raises what :func:`host.scan.run.run_scan` does."""
+        for warning in self.result.warnings:
+            self._say("warning", warning)
+        begun = False
+        events = EventWriter(self._scan.path / EVENTS)
+        try:
+            with interrupts_request(self._stop):
+                self._pi.follow(self._scan.scan_id, events.last_seq, events.append)
+                self._pi.begin_run(self._begin_run(events.last_seq))
+                begun = True
+                self._pi.drain()  # what an earlier program missed belongs to its takes, not to ours
+                self._tell_lost(self._pi.events())
+                events.sync()
+                self._queue.add_earlier(sorted(self._committed))
+                self._keep_radar_report({})
+                self._rows(events)
+                self._end(begun)
+                events.sync()
+        except BaseException as e:
+            aborted = isinstance(e, KeyboardInterrupt)
+            self.result.exit_status = "abort" if aborted else "fail"
+            self.result.reason = e.what if isinstance(e, PolysightError) else f"{type(e).__name__}: {e}"
+            with suppress(PolysightError):  # what failed first is what is told
+                self._end(begun)
+            raise
+        finally:
+            events.close()
+            self.result.processing_error = self._queue.close(now=self._stop.now)
+        self._scan.reload()
+        return self.result
+
+    def _begin_run(self, last_seq: int) -> BeginRun:
+        i = self._instrument
+        return BeginRun(
+            scan_id=self._scan.scan_id,
+            plan=self._plan,
+            pulses=i.burst.pulses,
+            period_us=i.burst.period_us,
+            width_us=i.burst.width_us,
+            speed_mm_s=i.stage.speed_mm_s,
+            last_seq=last_seq,
+            heartbeat_ms=i.pi.host_heartbeat_ms,
+        )
+
+    def _tell_lost(self, events: list[AnyEvent]) -> None:
+        """Say so when the Pi's journal ended before our event log."""
+        for event in events:
+            if isinstance(event, RunStarted) and event.lost:
+                warning = (
+                    f"the Pi's journal of this scan ends {event.lost} events before {self._scan.path / EVENTS}: it was"
+                    f" removed, damaged or cut by a power loss; nothing is missing here, the scan goes on with event"
+                    f" {event.seq}"
+                )
+                self.result.warnings.append(warning)
+                self._say("warning", warning)
+
+    def _rows(self, events: EventWriter) -> None:
+        """Take every row that is not committed, in order."""
+        todo = [row for row in self._plan if row.index not in self._committed]
+        check_disk(self._scan.path, self._instrument, len(todo))
+        takes = takes_so_far(self._scan)
+        taker = RowTaker(
+            self._instrument,
+            self._rig,
+            self._radars,
+            self._pi,
+            self._scan.scan_id,
+            self._scan.path,
+            self._stop,
+            self._point,
+            self._say,
+        )
+        for row in todo:
+            if self._stop.after_row:
+                break
+            began = time.monotonic()
+            self._row(row, takes.get(row.index, 0) + 1, taker, events)
+            if row.index not in self._committed:
+                break
+            self._row_seconds.append(time.monotonic() - began)
+            self._say("committed", f"row {row.index} committed")
+        left = self._plan.rows - len(self._committed)
+        if left == 0:
+            self.result.exit_status, self.result.reason = "success", "every row is committed"
+        else:
+            self.result.exit_status = "abort"
+            self.result.reason = f"stopped on request, {left} of {self._plan.rows} rows are missing"
+
+    def _row(self, row: Row, first_take: int, taker: RowTaker, events: EventWriter) -> None:
+        """Take a row until it is whole or the retakes are used up; commit it. Returns uncommitted when aborted."""
+        last_take = first_take + self._instrument.limits.row_retakes
+        for number in range(first_take, last_take + 1):
+            transaction = RowTransaction(self._entered)
+            try:
+                take = self._take(row, number, taker, transaction)
+                if take is None:
+                    transaction.to(RowState.STOPPED)
+                    return
+                events.sync()
+                if self._settle(take, number == last_take, transaction, events) or self._stop.now:
+                    return
+            except BaseException:
+                transaction.fail()
+                raise
+            faults = take.faults(self._instrument.burst.pulses)
+            if number == last_take:
+                raise gave_up(take, faults, self._instrument, number - first_take + 1)
+            self.result.retakes += 1
+            self._say("retake", f"row {row.index} is taken again: {'; '.join(faults)}")
+
+    def _take(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
+        """Wait until the row may begin, and take it; None when asked to stop before it began."""
+        check_disk(self._scan.path, self._instrument, 1)
+        if not self._wait_for_processing() or not make_ready(self._pi, self._stop, self._say):
+            return None
+        self._current = (row.index, number, row.points)
+        self._say("row", f"row {row.index}" + (f", take {number}" if number > 1 else ""))
+        try:
+            return taker.take(row, number, transaction)
+        finally:
+            self._keep_radar_report({"row": row.index, "take": number})
+
+    def _keep_radar_report(self, of: Fact) -> None:
+        """Write what the radars told since the last time, if they tell anything."""
+        if told := self._radars.report():
+            self._writer.append({"fact": "radars", **of, **told})
+
+    def _wait_for_processing(self) -> bool:
+        """Until processing has caught up; nothing is lost by waiting. False when asked to stop meanwhile."""
+        told = False
+        while waiting := self._queue.behind:
+            if self._stop.after_row:
+                return False
+            if not told:
+                self._say("wait", f"{waiting} rows wait to be processed; the next one begins when they are fewer")
+            told = True
+            self._queue.wait(_LOOK_S)
+            self._pi.events()
+        return not (self._stop.now or (told and self._stop.after_row))
+
+    def _settle(self, take: Take, last: bool, transaction: RowTransaction, events: EventWriter) -> bool:
+        """Commit the take, or reject it and say why. Whether it is committed."""
+        row, faults = take.row.index, take.faults(self._instrument.burst.pulses)
+        keep = last and self._keep_incomplete and take.bursts_are_whole and not self._stop.now
+        if faults and not keep:
+            reject_row(self._scan, self._writer, take, [ON_REQUEST] if self._stop.now else faults)
+            transaction.to(RowState.REJECTED)
+            return False
+        commit_row(self._scan, self._writer, take, faults, events.digest())
+        transaction.to(RowState.KEPT if faults else RowState.COMMITTED)
+        self._committed.add(row)
+        self._queue.add(row)
+        if faults:
+            self.result.incomplete_rows.append(row)
+            self._say("warning", f"row {row} is kept incomplete: {'; '.join(faults)}")
+        return True
+
+    def _end(self, begun: bool) -> None:
+        """Write how the scan ended, and tell the Pi."""
+        status, reason = self.result.exit_status, self.result.reason
+        self._writer.append(
+            {
+                "fact": "scan_ended",
+                "exit_status": status,
+                "reason": reason,
+                "rows_committed": len(self._committed),
+                "events_refetched": self._pi.gaps_filled,
+                "ended_utc": utc_now(),
+            }
+        )
+        self._say("end", reason)
+        if begun:
+            self._pi.end_run(self._scan.scan_id, status, reason)
+            self._pi.drain()
+
+    def _point(self, points: int) -> None:
+        if self._stop.after_row and not self._stop.now and not self._told_stop:
+            self._told_stop = True
+            self._say("stop", "the scan ends after this row; Ctrl-C once more ends it now")
+        self._say("row", "", points)
+
+    def _say(self, phase: str, message: str, points: int = 0) -> None:
+        if self._progress is None:
+            return
+        rows, committed = self._plan.rows, len(self._committed)
+        remaining = None
+        if self._row_seconds:
+            remaining = (rows - committed) * sum(self._row_seconds) / len(self._row_seconds)
+        row, take, row_points = self._current
+        self._progress(
+            ScanProgress(phase, message, rows, committed, row, take, points, row_points, remaining, self._state)
+        )
+
+    def _entered(self, state: RowState) -> None:
+        self._state = str(state)
+        self._say("state", "")
+
+
+def takes_so_far(scan: ScanFolder) -> dict[int, int]:
+    """The highest take of every row that was ever begun, so that no take number is used twice."""
+    begun = [(f["row"], f["take"]) for kind in ("row_committed", "row_rejected") for f in scan.facts(kind)]
+    events = read_events(scan.path / EVENTS).events
+    begun += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]
+    return dict(sorted(begun))  # of one row's takes, the highest is the last

@@ -1,0 +1,103 @@
+"""What one take of a row brought, and why it is not complete."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from host.capture.receiver_words import RowCapture
+from host.radar.interface import BoardState, RadarState
+from host.scan.missed_pulses import PlacedFrames
+from host.scan.slipped_row import ToldCapture, describe
+from shared.faults import explain
+from shared.messages import RowFinished
+from shared.raster import Row
+
+
+@dataclass
+class Take:
+    """What one take of a row brought.
+
+    Attributes
+    ----------
+    finished
+        None when the Pi never said how it ended.
+    captures
+        What each board's receiver got.
+    aborted
+        Why the host had the row aborted, or did not begin it; "" when it did not.
+    told
+        The row's capture events.
+    radars
+        What was known of the radars at the end.
+    not_done
+        Radars that did not say, after the last pulse, that all their frames have ended.
+    placed
+        Of boards that missed pulses: where their frames belong.
+    """
+
+    row: Row
+    number: int
+    finished: RowFinished | None = None
+    captures: dict[str, RowCapture] = field(default_factory=dict)
+    aborted: str = ""
+    told: list[ToldCapture] = field(default_factory=list)
+    radars: dict[str, BoardState] = field(default_factory=dict)
+    not_done: list[str] = field(default_factory=list)
+    placed: dict[str, PlacedFrames] = field(default_factory=dict)
+
+    def faults(self, pulses_per_point: int) -> list[str]:
+        """Why this take is not complete, one line a fault; empty when it is."""
+        pulses = self.row.points * pulses_per_point
+        f = self.finished
+        found = [f"{name}: the radar has stopped: {s.detail}" for name, s in self.stopped_radars.items()]
+        if f is None:
+            found.append(self.aborted or "the Pi did not say how the row ended")
+        elif f.status != "done":
+            found.append(f"the row ended as {f.status}: {f.reason or explain(f.fault).what}")
+        elif (f.points, f.pulses) != (self.row.points, pulses):
+            found.append(f"{f.points} points and {f.pulses} pulses, {self.row.points} and {pulses} planned")
+        found += [f"{name}: the radar still waits for pulses, it missed some" for name in self.not_done]
+        if self.aborted and not self.told:
+            return found  # no data could come
+        for name, capture in self.captures.items():
+            if fault := self._fault_of(name, capture, pulses_per_point):
+                found.append(f"{name}: {fault}")
+        return found
+
+    def _fault_of(self, name: str, capture: RowCapture, pulses_per_point: int) -> str:
+        placed, radar = self.placed.get(name), self.radars.get(name, BoardState(RadarState.UNKNOWN))
+        held = "; the row was held, and a card ends its record after 2 s without data" if self.note else ""
+        if capture.packets == 0:
+            return "no data" + (f": its radar was {radar.detail}, and may not have obeyed" if radar.detail else "")
+        if placed is not None and not placed.reason:
+            return describe(placed, pulses_per_point) + held
+        if not capture.located:
+            untold = f"; where cannot be told: {placed.reason}" if placed is not None else ""
+            waits = "; the radar still waits for pulses" if radar.state is RadarState.ARMED else ""
+            return capture.reason + untold + waits + held
+        if capture.missing:
+            return (
+                f"{capture.missing_bytes} bytes in {len(capture.missing)} places did not come"
+                f" ({capture.kernel_drops} packets dropped by this machine)"
+            )
+        return ""
+
+    @property
+    def bursts_are_whole(self) -> bool:
+        """Whether the Pi sent every pulse, so that what is missing is only data."""
+        return self.finished is not None and self.finished.status == "done"
+
+    @property
+    def note(self) -> str:
+        """What the Pi says of a row that is done: that it was held on the way."""
+        return self.finished.reason if self.finished is not None and self.bursts_are_whole else ""
+
+    @property
+    def stopped_radars(self) -> dict[str, BoardState]:
+        """Radars that have stopped by themselves."""
+        return {name: s for name, s in self.radars.items() if s.state is RadarState.FAULT}
+
+    @property
+    def silent_boards(self) -> list[str]:
+        """Boards from which nothing came though bursts were sent."""
+        return [n for n, c in self.captures.items() if c.packets == 0 and (self.told or self.bursts_are_whole)]

@@ -1,0 +1,1 @@
+"""Scan folders: append-only, self-validating, resumable."""

@@ -1,0 +1,246 @@
+"""The scan folder: raw rows and the manifest that says which of them count (docs/spec/scan-folder.md)."""
+
+from __future__ import annotations
+
+import platform
+import secrets
+import zlib
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+import shared
+from host.capture.segment import read_index
+from host.store import manifest
+from host.store.appending import sync_folder
+from host.store.manifest import Fact, Manifest, ManifestWriter
+from host.store.source import RowData
+from shared.config import Instrument, to_builtins
+from shared.config import decode as decode_config
+from shared.errors import DataError, DeviceError
+from shared.raster import RasterPlan
+
+FORMAT = 1
+MANIFEST = "manifest.jsonl"
+EVENTS = "events.msgpack"
+PART = ".part"  # suffix of a row that is being received
+
+
+class BoardRow(msgspec.Struct, frozen=True):
+    """One board's share of a committed row. `file` is relative to the scan folder; the index is beside it."""
+
+    file: str
+    bytes: int
+    frames_expected: int
+    frames_received: int
+    missing_bytes: int
+    crc32: str
+    index_crc32: str = ""
+
+
+class CommittedRow(msgspec.Struct, frozen=True):
+    """A row that counts."""
+
+    row: int
+    take: int
+    direction: int
+    boards: dict[str, BoardRow]
+    pulses: int
+
+
+def new_scan_id(now: datetime | None = None) -> str:
+    """A scan's name: when it started, and four hex digits against a second one in that second."""
+    now = now or datetime.now(UTC)
+    return f"{now:%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
+
+
+def versions() -> dict[str, str]:
+    """Releases of everything that shapes the data."""
+    found = {"python": platform.python_version(), "numpy": np.__version__, "shared": shared.__version__}
+    for package in ("polysight-host", "scipy", "scikit-learn"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+class ScanFolder:
+    """A scan on disk, read. Build with :meth:`create` or :meth:`load`; :meth:`writer` opens it for appending."""
+
+    def __init__(self, path: Path, content: Manifest) -> None:
+        self.path = path
+        self.content = content
+        started = next((f for f in content.facts if f["fact"] == "scan_started"), None)
+        if started is None:
+            raise DataError(
+                f"{path / MANIFEST}: no scan_started",
+                "the scan ended before its first line was written, or that line is damaged",
+                f"restore it from a copy: without it rig and plan are unknown; when {path} is otherwise empty, nothing"
+                " was recorded, and `polysight scan` begins there anew",
+            )
+        source = f"{path / MANIFEST} (scan_started)"
+        try:
+            self.instrument: Instrument = decode_config(started["instrument"], Instrument, f"{source} instrument")
+            self.plan: RasterPlan = decode_config(started["plan"], RasterPlan, f"{source} plan")
+            self.scan_id = str(started["scan_id"])
+            self.simulated = bool(started["simulated"])
+        except KeyError as e:
+            raise DataError(f"{source}: no {e}", "written by another program or release") from None
+
+    @staticmethod
+    def create(
+        path: Path,
+        instrument: Instrument,
+        plan: RasterPlan,
+        *,
+        simulated: bool = False,
+        scan_id: str = "",
+        extra: dict[str, Any] | None = None,
+    ) -> ScanFolder:
+        """Make a scan folder with its first fact, durably. `extra` adds keys to that fact (calibration, operator...).
+
+        Raises
+        ------
+        DeviceError
+            when the folder holds a scan already or cannot be written.
+        """
+        fact: Fact = {
+            **(extra or {}),
+            "fact": "scan_started",
+            "format": FORMAT,
+            "scan_id": scan_id or new_scan_id(),
+            "simulated": simulated,
+            "started_utc": utc_now(),
+            "instrument": to_builtins(instrument),
+            "plan": msgspec.to_builtins(plan),
+            "versions": versions(),
+        }
+        _make(path)
+        if (path / MANIFEST).exists() and not manifest.read(path / MANIFEST).length:
+            (path / MANIFEST).unlink()  # an earlier start ended before its first line was written
+        with ManifestWriter(path / MANIFEST, create=True) as writer:
+            writer.append(fact)
+        return ScanFolder.load(path)
+
+    @staticmethod
+    def load(path: Path) -> ScanFolder:
+        """Read a scan folder. Raises DataError or ConfigError when it is not one."""
+        return ScanFolder(path, manifest.read(path / MANIFEST))
+
+    def reload(self) -> None:
+        """Read the manifest again."""
+        self.content = manifest.read(self.path / MANIFEST)
+
+    def writer(self) -> ManifestWriter:
+        """Open the scan for appending; a torn last line is cut off. Raises DeviceError when the scan is in use."""
+        writer = ManifestWriter(self.path / MANIFEST, create=False)
+        try:
+            for board in self.instrument.recorded:
+                _make(self.path / "raw" / board.name)
+        except DeviceError:
+            writer.close()
+            raise
+        return writer
+
+    def facts(self, kind: str) -> list[Fact]:
+        """All facts of one kind, in order."""
+        return [f for f in self.content.facts if f["fact"] == kind]
+
+    def committed(self) -> dict[int, CommittedRow]:
+        """Committed rows by index; the last valid take wins, unless it was withdrawn."""
+        rows: dict[int, CommittedRow] = {}
+        for fact in self.content.facts:
+            if fact["fact"] == "row_withdrawn":
+                rows.pop(fact["row"], None)
+            if fact["fact"] != "row_committed":
+                continue
+            row = decode_config(
+                {k: fact.get(k) for k in CommittedRow.__struct_fields__}, CommittedRow, f"{self.path / MANIFEST}"
+            )
+            rows[row.row] = row
+        return dict(sorted(rows.items()))
+
+    def rows(self) -> Iterator[int]:
+        """Indices of the committed rows, ascending."""
+        return iter(self.committed())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every row of the plan is committed."""
+        return len(self.committed()) == self.plan.rows
+
+    def row_path(self, board: str, row: int) -> Path:
+        """Where a committed row's payload is."""
+        return self.path / "raw" / board / f"{row:04d}.bin"
+
+    def read_row(self, board_name: str, row: int) -> RowData:
+        """One board's payload of a committed row, checked against its CRC.
+
+        Raises
+        ------
+        DataError
+            when the row is not committed, or its files are absent or damaged.
+        """
+        found = self.committed().get(row)
+        board = None if found is None else found.boards.get(board_name)
+        if board is None:
+            raise DataError(
+                f"{self.path}: row {row} of {board_name} is not committed",
+                "the scan was interrupted before it, or the board was not recorded",
+                f"`polysight resume {self.path}` takes the rows that are missing",
+            )
+        path = self.path / board.file
+        try:
+            payload = np.fromfile(path, dtype=np.uint8)
+        except OSError as e:
+            raise DataError(f"{path}: cannot be read: {e.strerror}", "the file was removed", self._remedy()) from None
+        if payload.size != board.bytes or f"{zlib.crc32(payload.data):08x}" != board.crc32:
+            raise DataError(
+                f"{path}: not the bytes that were committed ({payload.size} bytes, {board.bytes} expected)",
+                "the file was changed, truncated or damaged after the scan",
+                self._remedy(),
+            )
+        return RowData(payload, self._missing(path.with_suffix(".idx"), board), board.frames_expected, board.crc32)
+
+    def _missing(self, path: Path, board: BoardRow) -> list[tuple[int, int]]:
+        if board.missing_bytes == 0:
+            return []
+        facts, _ = read_index(path)
+        missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
+        damaged = board.index_crc32 and f"{zlib.crc32(path.read_bytes()):08x}" != board.index_crc32
+        if damaged or sum(b - a for a, b in missing) != board.missing_bytes:
+            raise DataError(f"{path}: not the index that was committed", "the file was changed", self._remedy())
+        return missing
+
+    def _remedy(self) -> str:
+        return (
+            f"restore it from a copy, or `polysight resume {self.path}` takes its row again;"
+            f" `polysight validate {self.path}` names every damaged file"
+        )
+
+
+def _make(folder: Path) -> None:
+    """Make a folder and those above it, durably. Raises DeviceError."""
+    if folder.is_dir():
+        return
+    _make(folder.parent)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as e:
+        raise DeviceError(
+            f"{folder}: cannot be made: {e.strerror}",
+            "the disk is full or read-only",
+            "free space, or choose another folder",
+        ) from None
+    sync_folder(folder.parent)
+
+
+def utc_now() -> str:
+    """The time for people, ISO 8601 in UTC."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")

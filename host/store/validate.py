@@ -1,0 +1,205 @@
+"""Checks a scan folder by itself and names every fault."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+from host.capture.segment import read_index
+from host.store import manifest
+from host.store.events import read_events
+from host.store.raw import dropped_files
+from host.store.scanfolder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
+from shared.errors import PolysightError
+from shared.raster import plan_raster
+
+_CHUNK = 1 << 22
+_COPY = "restore it from a copy, or resume takes its row again"
+_FETCHED = "resume fetches the rest from the Pi's journal"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One fault (`error`), or something worth knowing that damages nothing (`note`)."""
+
+    severity: Literal["error", "note"]
+    where: str
+    what: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.severity}: {self.where}: {self.what}" + (f" ({self.remedy})" if self.remedy else "")
+
+
+def validate(path: Path) -> list[Finding]:
+    """Every fault of a scan folder; empty when it is whole and finished. Raises DataError when it is no scan."""
+    content = manifest.read(path / MANIFEST)
+    found = []
+    if content.torn:
+        found.append(
+            Finding("note", MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off and goes on")
+        )
+    try:
+        scan = ScanFolder(path, content)
+        rows = scan.committed()
+    except PolysightError as e:
+        return [*found, *_damaged_lines(content, True), Finding("error", MANIFEST, e.what, e.remedy)]
+    found += _damaged_lines(content, not scan.complete)
+    if scan.plan != plan_raster(scan.instrument.grid):
+        found.append(Finding("error", MANIFEST, "the plan is not that of the rig file's grid"))
+    for row in rows.values():
+        found += _row(scan, row)
+    found += _dropped(scan)
+    found += _strays(scan, rows)
+    found += _events(scan)
+    missing = scan.plan.rows - sum(0 <= r < scan.plan.rows for r in rows)
+    ended = scan.facts("scan_ended")
+    if missing:
+        remedy = f"`polysight resume {path}` takes them"
+        found.append(Finding("note", MANIFEST, f"{missing} of {scan.plan.rows} rows are not committed", remedy))
+    elif not ended:
+        found.append(Finding("note", MANIFEST, "no scan_ended: the program ended before it was written"))
+    return found
+
+
+def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
+    """Committed rows that are not, on the disk, what was committed: row to what is wrong with it. Reads every byte."""
+    found = {row.row: [str(f) for f in _row(scan, row)] for row in scan.committed().values()}
+    return {row: faults for row, faults in found.items() if faults}
+
+
+def _damaged_lines(content: manifest.Manifest, matters: bool) -> list[Finding]:
+    """Damaged lines lose a fact. When every row is committed all the same, nothing is missing."""
+    remedy = "its fact is lost; resume takes a row again" if matters else "every row is committed"
+    return [
+        Finding("error" if matters else "note", f"{MANIFEST} line {n}", "damaged: its CRC is wrong", remedy)
+        for n in content.damaged
+    ]
+
+
+def _row(scan: ScanFolder, row: CommittedRow) -> list[Finding]:
+    where = f"row {row.row}"
+    if not 0 <= row.row < scan.plan.rows:
+        return [Finding("error", where, f"outside the plan's {scan.plan.rows} rows")]
+    found = []
+    planned = scan.plan.row(row.row)
+    pulses = planned.points * scan.instrument.burst.pulses
+    if row.direction != planned.direction:
+        found.append(Finding("error", where, f"direction {row.direction}, planned {planned.direction}"))
+    if row.pulses != pulses:
+        found.append(Finding("error", where, f"{row.pulses} pulses, {pulses} planned"))
+    boards = {board.name for board in scan.instrument.recorded}
+    if set(row.boards) != boards:
+        found.append(Finding("error", where, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
+    for board in row.boards.values():
+        found += _board(scan, board, pulses)
+    return found
+
+
+def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
+    where, path = board.file, scan.path / board.file
+    found = []
+    expected = frames * scan.instrument.frame_bytes
+    if (board.bytes, board.frames_expected) != (expected, frames):
+        found.append(
+            Finding("error", where, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}")
+        )
+    kept = board.file not in dropped_files(scan) or path.exists()
+    try:
+        # Of a payload dropped by choice the committed digest is what is left.
+        size, crc = _digest(path) if kept else (board.bytes, int(board.crc32, 16))
+    except OSError as e:
+        return [*found, Finding("error", where, f"cannot be read: {e.strerror}", _COPY)]
+    if size != board.bytes:
+        found.append(Finding("error", where, f"{size} bytes, {board.bytes} were committed", _COPY))
+    elif f"{crc:08x}" != board.crc32:
+        found.append(Finding("error", where, "not the bytes that were committed (CRC)", _COPY))
+    index = path.with_suffix(".idx")
+    where = str(index.relative_to(scan.path))
+    if not index.exists():
+        needed = board.missing_bytes > 0 or board.index_crc32 != ""
+        return [*found, Finding("error", where, "absent", _COPY)] if needed else found
+    if board.index_crc32 and f"{zlib.crc32(index.read_bytes()):08x}" != board.index_crc32:
+        return [*found, Finding("error", where, "not the bytes that were committed (CRC)", _COPY)]
+    try:
+        facts, _ = read_index(index)
+        gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
+    except (PolysightError, TypeError, ValueError) as e:
+        return [*found, Finding("error", where, str(e))]
+    ordered = all(a < b for a, b in gaps) and all(x[1] < y[0] for x, y in pairwise(gaps))
+    inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
+    if not ordered or not inside or sum(b - a for a, b in gaps) != board.missing_bytes:
+        found.append(Finding("error", where, f"its gaps do not make the {board.missing_bytes} missing bytes"))
+    return found
+
+
+def _digest(path: Path) -> tuple[int, int]:
+    size = crc = 0
+    with path.open("rb") as f:
+        while chunk := f.read(_CHUNK):
+            size += len(chunk)
+            crc = zlib.crc32(chunk, crc)
+    return size, crc
+
+
+def _dropped(scan: ScanFolder) -> list[Finding]:
+    files = dropped_files(scan)
+    if not files:
+        return []
+    last = list(files.values())[-1]
+    what = f"the raw data of {len({f['row'] for f in files.values()})} rows was dropped after processing"
+    found = [Finding("note", "raw", f"{what} into {last['products']} ({last['dropped_utc']}); digests are kept")]
+    left = [file for file in files if (scan.path / file).exists()]
+    if left:
+        remedy = f"`polysight drop-raw {scan.path}` removes them"
+        found.append(Finding("note", "raw", f"{len(left)} files to be dropped are still there", remedy))
+    return found
+
+
+def _strays(scan: ScanFolder, rows: dict[int, CommittedRow]) -> list[Finding]:
+    known = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
+    known |= {p.with_suffix(".idx") for p in known}
+    return [
+        Finding("note", str(p.relative_to(scan.path)), "belongs to no committed row", "resume replaces it")
+        for p in sorted((scan.path / "raw").rglob("*"))
+        if p.is_file() and p not in known and p.suffix in (".bin", ".idx", PART)
+    ]
+
+
+def _events(scan: ScanFolder) -> list[Finding]:
+    path = scan.path / EVENTS
+    try:
+        log = read_events(path)
+    except PolysightError as e:
+        return [Finding("error", EVENTS, e.what, e.remedy)]
+    found = []
+    if log.torn:
+        found.append(Finding("note", EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
+    if log.damage:
+        found.append(Finding("error", EVENTS, log.damage, _FETCHED))
+    if {e.scan_id for e in log.events} - {scan.scan_id}:
+        found.append(Finding("error", EVENTS, "holds events of another scan"))
+    if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
+        found.append(Finding("error", EVENTS, "the sequence of the events has gaps"))
+    last = next((f for f in reversed(scan.facts("row_committed")) if "events" in f), None)
+    return found if last is None or log.damage else found + _committed_events(path, log.length, last)
+
+
+def _committed_events(path: Path, length: int, fact: dict[str, Any]) -> list[Finding]:
+    """Compare the events with their digest at the last commit."""
+    size, crc, when = fact["events"]["bytes"], fact["events"]["crc32"], f"row {fact['row']} was committed"
+    if length < size:
+        return [Finding("error", EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
+    with path.open("rb") as f:
+        whole = f"{zlib.crc32(f.read(size)):08x}" == crc
+    what = f"not the events that were there when {when} (CRC)"
+    return [] if whole else [Finding("error", EVENTS, what, "restore it from a copy")]
+
+
+def to_json(findings: list[Finding]) -> str:
+    """Findings for machines."""
+    return json.dumps([vars(f) for f in findings], indent=2)

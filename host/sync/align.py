@@ -1,0 +1,259 @@
+"""Burst alignment: the chirps of a position differ by a frequency and a phase each; find them, undo them, average.
+
+A board samples SYNC_IN with its own clock, so each chirp is the same signal times `exp(j(2 pi df t + dphi))` (paper,
+eq. 4). Its conjugate product with a reference chirp, summed over the RX, is a pure tone under a positive envelope
+`|s(t)|^2`: its strongest frequency is the maximum-likelihood offset, whatever paths make up `s`. The paper divides by
+the reference chirp instead, which blows up wherever direct path and object cancel each other.
+
+Once every chirp is mixed to zero by what the products say, its signal fills a few range bins, and four samples in a row
+are worth their mean: filter compensation and the second estimate, each chirp against the sum of all others, see a
+quarter of the samples. Only the average is taken at the full rate.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.fft
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from host.sync import hpf
+from host.sync.passes import FOLD, Passes, passes
+from host.sync.tone import Real, Tone, block_edges, block_times, cis, refine, search_size, strongest
+
+_REFERENCES = 4  # reference chirps to try before a position is given up
+_GOOD = 0.5  # a good chirp has at least this part of the coherence of the position's median chirp
+_BAND_BINS = 9  # IF bins over which the signal's centre is sought: direct path and object lie within
+
+
+class AlignedRow(NamedTuple):
+    """The averaged chirps of every position of a row, mixed down by `centre`.
+
+    Attributes
+    ----------
+    mean
+        complex64 [position, rx, sample], in the frame of each position's reference chirp.
+    halves
+        complex64 [position, 2, rx, block]: what every other good chirp adds to `mean`, averaged over blocks of `FOLD`
+        linear samples.
+    centre
+        float64 [position]: middle of the signal's band in the reference chirp, cycles a sample.
+    good
+        bool [position, chirp]: chirps in the average.
+    frequency, phase
+        float64 [position, chirp]: offset of each chirp from the average, cycles a sample, and radians at the centre
+        of the linear samples.
+    amplitude
+        float64 [position, chirp]: amplitude beside the average's, after compensation.
+    gain
+        float64 [position, chirp]: what compensation multiplied the chirp by, at its centre.
+    error
+        float64 [2, position, chirp]: frequency (cycles a sample) and phase (rad) error of a chirp after alignment,
+        measured as half the disagreement between two halves of the RX; zero where not good.
+    coherence
+        float64 [position, chirp]: normalised correlation with the average, 0..1.
+    peak
+        int32 [position, chirp]: largest |I| or |Q|, ADC counts.
+    """
+
+    mean: NDArray[np.complex64]
+    halves: NDArray[np.complex64]
+    centre: NDArray[np.float64]
+    good: NDArray[np.bool_]
+    frequency: NDArray[np.float64]
+    phase: Real
+    amplitude: NDArray[np.float64]
+    gain: NDArray[np.float64]
+    error: NDArray[np.float64]
+    coherence: NDArray[np.float64]
+    peak: NDArray[np.int32]
+
+
+def align_row(
+    words: NDArray[np.int16],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None = None,
+    full_scale: int = 32767,
+    by: Passes = passes,
+) -> AlignedRow:
+    """Align and average the burst of every position.
+
+    Parameters
+    ----------
+    words
+        int16 [position, chirp, sample, 2, rx]: raw frames, I before Q.
+    valid
+        bool [position, chirp]: chirps that were received whole.
+    linear
+        Samples `[a, b)` in which the chirp is linear; only these are used to estimate, all are averaged.
+    equaliser
+        Compensates the receiver's filter; None leaves it in.
+    full_scale
+        A chirp with a sample at it was clipped, and is left out: its IF holds tones that are not there.
+    by
+        The passes over raw samples, compiled or plain.
+    """
+    pieces = [
+        _align(words[i : i + by.CHUNK], valid[i : i + by.CHUNK], linear, equaliser, full_scale, by)
+        for i in range(0, valid.shape[0], by.CHUNK)
+    ]
+    columns = zip(AlignedRow._fields, zip(*pieces, strict=True), strict=True)
+    return AlignedRow(*(np.concatenate(column, axis=1 if name == "error" else 0) for name, column in columns))
+
+
+def _align(
+    words: NDArray[np.int16],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None,
+    full_scale: int,
+    by: Passes,
+) -> AlignedRow:
+    """The same for a few positions."""
+    linear = whole_blocks(linear)
+    frames = by.load(words)
+    first, centre, coherence, usable, peak = _against_one(frames, valid, linear, words.shape[-1], full_scale, by)
+    good = _coherent(coherence, usable)
+    frequency = centre[:, None] + first.frequency
+    taps = _taps(equaliser, frequency)
+    start = np.angle(first.amplitude * taps.sum(axis=-1))
+
+    # Second pass: each chirp against the sum of the others, which is the sum less the chirp's own energy.
+    edges = block_edges((linear[1] - linear[0]) // FOLD)
+    turned = taps * cis(-start)[..., None]
+    sums, own, level = by.against_others(frames, frequency, _c64(turned), good, linear, edges)
+    times, n = block_times(edges) * FOLD, good.sum(axis=1)
+    second = refine(sums[0] + sums[1] - np.where(good[..., None], own, 0), times, steps=2)
+    level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
+    others = n[:, None] - good
+    amplitude = np.abs(second.amplitude) / np.maximum(others, 1) / level
+    # What a chirp differs by from the mean of the others, it differs by less from the mean of all.
+    part = others / np.maximum(n, 1)[:, None]
+    correction, shift = part * second.frequency, part * np.angle(second.amplitude)
+    coherence = amplitude * np.sqrt(level / np.maximum(own.sum(axis=2), 1e-30))
+    good = _coherent(coherence, usable)
+
+    # What is filtered and then turned by the correction is what is turned and then filtered by turned taps.
+    lag = np.arange(taps.shape[-1]) - taps.shape[-1] // 2
+    turned *= cis(2 * np.pi * FOLD * lag * correction[..., None] - shift[..., None])
+    weights = turned * (good / np.maximum(good.sum(axis=1), 1)[:, None])[..., None]
+    second_half = np.cumsum(good, axis=1) % 2 == 0
+    mean, halves = by.average(frames, frequency + correction, _c64(weights), second_half, linear)
+
+    at_rest = cis(-2 * np.pi * second.frequency[..., None] * times - np.angle(second.amplitude)[..., None])
+    split = refine(sums * at_rest, times, steps=1)
+    disagreement = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
+    return AlignedRow(
+        mean,
+        halves,
+        centre,
+        good,
+        first.frequency + correction,
+        np.angle(cis(start + shift)),
+        amplitude,
+        np.abs(taps.sum(axis=-1)),
+        _centred(np.stack(disagreement) / 2, good),
+        coherence,
+        peak,
+    )
+
+
+def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
+    """The linear samples that fill blocks of `FOLD`; estimates count time from their middle."""
+    a, b = linear
+    return a, b - (b - a) % FOLD
+
+
+def _against_one(
+    frames: NDArray[Any],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    rx: int,
+    full_scale: int,
+    by: Passes,
+) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]:
+    """Offsets from one chirp of each position; another one is taken where the first matches few of the others.
+
+    Returns them, the middle of the signal's band [position], and [position, chirp]: coherence with the chirp they are
+    from, usable chirps (received whole, not clipped, not silent), and the largest count.
+    """
+    positions, chirps = valid.shape
+    n = linear[1] - linear[0]
+    noise = 4.0 / np.sqrt(rx * n)  # coherence of two records of noise: four times the rms of a sum of random phases
+    order = np.argsort(~valid, axis=1, kind="stable")  # the valid ones, first to last
+    reference, todo = order[:, 0], np.arange(positions)
+    frequency, amplitude, centre = np.zeros(valid.shape), np.zeros(valid.shape, complex), np.zeros(positions)
+    coherence, usable, peak = np.zeros(valid.shape), valid, np.zeros(valid.shape, np.int32)
+    for attempt in range(min(_REFERENCES, chirps)):
+        tried = order[todo, attempt]
+        z, chosen, energy, highest = by.products(
+            frames if attempt == 0 else frames[todo], tried, linear, search_size(n)
+        )
+        if attempt == 0:
+            usable, peak = valid & (highest < full_scale) & (energy > 0), highest
+        tone = strongest(z, n)
+        at = np.arange(todo.size), tried
+        c = np.abs(tone.amplitude) / np.sqrt(np.maximum(energy * energy[at][:, None], 1e-30)) * usable[todo]
+        c[at] = 0  # a chirp always matches itself
+        better = c.sum(axis=1) >= coherence[todo].sum(axis=1)
+        won = todo[better]
+        reference[won], coherence[won] = tried[better], c[better]
+        frequency[won], amplitude[won] = tone.frequency[better], tone.amplitude[better]
+        centre[won] = _band_centre(chosen, n)[better]
+        matching = (c > noise).sum(axis=1)
+        todo = todo[2 * matching < usable[todo].sum(axis=1) - 1]
+        if todo.size == 0:
+            break
+    best = coherence.max(axis=1)
+    every = np.arange(positions)
+    coherence[every, reference] = np.where(usable[every, reference], best, 0)  # as good as its best match
+    return Tone(frequency, amplitude), centre, coherence, usable, peak
+
+
+def _band_centre(chosen: NDArray[np.complex64], samples: int) -> NDArray[np.float64]:
+    """Middle of the band that holds the signal, cycles a sample, [position]: where the smoothed spectrum is highest.
+
+    `chosen` is complex64 [position, rx, size], zero beyond `samples`; overwritten.
+    """
+    size = chosen.shape[-1]
+    spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(chosen, axis=-1, overwrite_x=True))
+    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
+    for _ in range(3):  # three boxes make a bell: two tones within it give one peak, between them
+        power = scipy.ndimage.uniform_filter1d(power, _BAND_BINS * size // samples // 2, axis=-1, mode="wrap")
+    return np.argmax(power, axis=-1) / size
+
+
+def _taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Filter taps of every chirp, [position, chirp, tap]; without an equaliser a single one."""
+    return np.ones((*frequency.shape, 1), complex) if equaliser is None else equaliser.taps(frequency)
+
+
+def _coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Chirps that match as well as the median one of their position does."""
+    rising = np.sort(np.where(usable, coherence, np.inf), axis=1)
+    middle = np.maximum(usable.sum(axis=1) - 1, 0) // 2
+    median = np.take_along_axis(rising, middle[:, None], axis=1)
+    return usable & (coherence >= _GOOD * median)
+
+
+def _c64(x: NDArray[np.complex128]) -> NDArray[np.complex64]:
+    return np.ascontiguousarray(x, np.complex64)
+
+
+def _centred(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Values [..., position, chirp] less the mean over the good chirps of their position; zero where not good."""
+    mean = (values * good).sum(axis=-1) / np.maximum(good.sum(axis=-1), 1)
+    return (values - mean[..., None]) * good
+
+
+def _spread(pair: tuple[NDArray[np.float64], NDArray[np.float64]], good: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Std over the good chirps of two quantities, [position, 2]; 0 where fewer than two are good."""
+    n = np.maximum(good.sum(axis=1), 1)
+    out = np.zeros((len(good), 2))
+    for i, x in enumerate(pair):
+        mean = np.where(good, x, 0).sum(axis=1) / n
+        out[:, i] = np.sqrt(np.where(good, (x - mean[:, None]) ** 2, 0).sum(axis=1) / n)
+    return out

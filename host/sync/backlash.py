@@ -1,0 +1,112 @@
+"""Stage backlash, from the data: how far odd rows lie from where the plan puts them beside the even ones.
+
+A row's echo is that of its neighbours on either side, but for the row spacing. Rows that run the other way and lie `d`
+further along +x differ from them by `d` times the slope of the echo along x: least squares gives `d`, and leaving out
+groups of rows tells how well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.sync.chain import SyncedRow
+from host.sync.direct_path import excess_path_m
+from shared.config import Board, Instrument
+from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from shared.raster import mean_burst_travel_mm, plan_raster
+from shared.units import SPEED_OF_LIGHT_M_S
+
+_GROUPS = 10  # of rows, for the standard deviation
+_STEPS = 3  # Gauss-Newton
+_ALIASED = 0.02  # part of the echo's power in the upper fifth of the spectrum that says it goes on beyond
+
+
+def object_filter(rig: Instrument, board: Board) -> NDArray[np.complex64]:
+    """Weights [sample] that pick the mirror point's range cell out of referenced samples, and leave the direct path."""
+    a, b = rig.chirp.linear_samples
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    excess = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).mean()
+    n = np.arange(b - a)
+    weights = np.zeros(rig.chirp.samples, np.complex64)
+    weights[a:b] = np.hanning(b - a + 2)[1:-1] / (b - a)
+    weights[a:b] *= np.exp(-2j * np.pi * rig.chirp.hz_per_sample * n * excess / SPEED_OF_LIGHT_M_S)
+    return weights
+
+
+def echo_of_row(row: SyncedRow, weights: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """The echo of a row through :func:`object_filter`, complex64 [rx, position], positions as they were met."""
+    return (row.samples @ weights) * row.valid
+
+
+@dataclass(frozen=True)
+class Backlash:
+    """Odd rows lie `shift_mm` further along +x than planned, beside the even ones; `std_mm` is its uncertainty."""
+
+    shift_mm: float
+    std_mm: float
+
+
+def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -> Backlash | None:
+    """Backlash of a scan.
+
+    Parameters
+    ----------
+    rows
+        Echoes by row index, as :func:`echo_of_row` gives them. Rows without both neighbours are left out.
+    rig
+        The scan's rig file.
+
+    Returns
+    -------
+    Backlash | None
+        None when the rows do not tell: too few, steps too coarse for the echo's changes along x, or a standard
+        deviation above a quarter of the step.
+    """
+    plan = plan_raster(rig.grid)
+    inner = [r for r in sorted(rows) if r - 1 in rows and r + 1 in rows]
+    if len(inner) < _GROUPS:
+        return None
+    k = 2 * np.pi * np.fft.fftfreq(2 * plan.columns, plan.step_x_mm)
+    travel = mean_burst_travel_mm(rig.burst, rig.stage)
+    window = np.pad(np.hanning(plan.columns + 2)[1:-1], (0, plan.columns))
+
+    def spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
+        """Along x from the smallest, brought to the plan's positions; `shift_mm` is how far odd rows lie off.
+
+        The row goes there and back, so that no jump between its ends rings through it.
+        """
+        direction = plan.row(r).direction
+        off = direction * travel + (shift_mm if r % 2 else 0.0)
+        there = rows[r][:, ::direction]
+        return np.fft.fft(np.concatenate([there, there[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * off)
+
+    def sums(shift_mm: float) -> NDArray[np.float64]:
+        """Slope times difference, slope squared, and power at all and at the highest k, of groups of rows."""
+        out = np.zeros((_GROUPS, 4))
+        recent = {r: spectrum(r, shift_mm) for r in (inner[0] - 1, inner[0])}
+        for i, r in enumerate(inner):
+            recent = {q: recent[q] if q in recent else spectrum(q, shift_mm) for q in (r - 1, r, r + 1)}
+            mean = (recent[r - 1] + recent[r + 1]) / 2
+            slope, rest = np.fft.ifft(1j * k * mean, axis=-1), np.fft.ifft(recent[r] - mean, axis=-1)
+            power = np.abs(mean) ** 2
+            out[i * _GROUPS // len(inner)] += (
+                (1 if r % 2 else -1) * (window * slope.conj() * rest).real.sum(),
+                (window * np.abs(slope) ** 2).sum(),
+                power.sum(),
+                power[:, np.abs(k) > 0.8 * np.abs(k).max()].sum(),
+            )
+        return out
+
+    shift, without = 0.0, np.zeros(_GROUPS)
+    for _ in range(_STEPS):
+        s = sums(shift)
+        left = s.sum(axis=0) - s  # without one group: jackknife, Efron 1982
+        if s[:, 1].sum() == 0 or left[:, 1].min() <= 0 or s[:, 3].sum() > _ALIASED * s[:, 2].sum():
+            return None
+        without = shift + left[:, 0] / left[:, 1]
+        shift += float(np.clip(s[:, 0].sum() / s[:, 1].sum(), -plan.step_x_mm / 2, plan.step_x_mm / 2))
+    std = float(np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2)))
+    return Backlash(shift, std) if std < plan.step_x_mm / 4 else None

@@ -1,0 +1,132 @@
+"""One board's row from raw chirps to samples referenced to the direct path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.capture.decode import raw_words
+from host.sync import direct_path, hpf, residuals
+from host.sync.align import align_row
+from host.sync.passes import FOLD
+from shared.config import Board, Chirp, Instrument
+from shared.errors import DataError
+
+_FULL_SCALE = 32767  # largest int16: a sample at it was clipped
+
+
+@dataclass(frozen=True)
+class BoardSetup:
+    """What synchronisation needs to know of a board. Build with :meth:`of`; one serves for a whole scan."""
+
+    chirp: Chirp
+    pulses: int
+    equaliser: hpf.Equaliser | None
+    path: direct_path.DirectPath
+
+    @classmethod
+    def of(
+        cls, rig: Instrument, board: Board, compensate_filter: bool = True, model: hpf.HighPass | None = None
+    ) -> BoardSetup:
+        """The setup of a board of a rig.
+
+        `model` is the receiver's filter as `hpf.fit_high_pass` found it; None takes the corners that the chirp profile
+        programs. `compensate_filter=False` leaves the filter in.
+        """
+        model = (model or hpf.high_pass(rig.chirp)) if compensate_filter else hpf.HighPass()
+        equaliser = hpf.Equaliser.of(model, rig.chirp, FOLD) if model.corners_hz else None
+        return cls(rig.chirp, rig.burst.pulses, equaliser, direct_path.prepare(rig, board))
+
+
+@dataclass(frozen=True)
+class SyncedRow:
+    """A row of one board, every position referenced to its direct path.
+
+    Attributes
+    ----------
+    samples
+        complex64 [rx, position, sample]: an echo of excess path d is `a exp(+j 2 pi f(t) d / c)`; zero where not valid.
+    valid
+        bool [position].
+    chirps
+        int [position]: chirps in each average.
+    direct_hz, direct_amplitude
+        float64 [position]: IF and amplitude (ADC counts) of the direct path.
+    freq_residual_hz, phase_residual_rad
+        float64 [position]: std of one chirp's error after alignment within its burst.
+    noise
+        float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), nan
+        where fewer than two were good; None: not known.
+    errors
+        Error samples of the row after each stage (`residuals.errors`), {stage: float64 [3, n]}.
+    """
+
+    samples: NDArray[np.complex64]
+    valid: NDArray[np.bool_]
+    chirps: NDArray[np.int64]
+    direct_hz: NDArray[np.float64]
+    direct_amplitude: NDArray[np.float64]
+    freq_residual_hz: NDArray[np.float64]
+    phase_residual_rad: NDArray[np.float64]
+    errors: residuals.Errors = field(default_factory=dict)
+    noise: NDArray[np.float64] | None = None
+
+    @property
+    def stages(self) -> dict[str, tuple[float, float, float]]:
+        """Frequency (Hz), phase (rad) and relative amplitude std after each stage."""
+        return {name: residuals.spread(values) for name, values in self.errors.items() if values.size}
+
+
+def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
+    """Compensate, align, average and reference one row of one board (paper, section 5.2).
+
+    Parameters
+    ----------
+    frames
+        int16 [frame, sample, 2, rx] as `decode.row_words` gives them (fastest), or complex64 [rx, frame, sample] in ADC
+        counts; positions in the order they were met, `setup.pulses` frames each.
+    valid
+        bool [frame]: frames that were received whole.
+    setup
+        The board's.
+
+    Raises
+    ------
+    DataError
+        when the frames are not whole bursts of the configured chirp.
+    """
+    words = raw_words(frames) if np.iscomplexobj(frames) else frames
+    count, samples, _, rx = words.shape
+    expected = setup.path.steering.shape
+    if (rx, samples) != expected or count % setup.pulses or valid.shape != (count,):
+        raise DataError(
+            f"{count} frames of {rx} RX x {samples} samples are not bursts of {setup.pulses} frames"
+            f" of {expected[0]} RX x {expected[1]} samples",
+            "the data and the rig file do not belong together",
+            "use the rig file of this scan",
+        )
+    shape = (count // setup.pulses, setup.pulses)
+    aligned = align_row(
+        words.reshape(*shape, samples, 2, rx),
+        valid.reshape(shape),
+        setup.chirp.linear_samples,
+        setup.equaliser,
+        _FULL_SCALE,
+    )
+    done = direct_path.reference(aligned, setup.path, setup.chirp)
+    chirps, rate = aligned.good.sum(axis=1), setup.chirp.sample_rate_hz
+    residual = np.sqrt((aligned.error**2).sum(axis=-1) / np.maximum(chirps, 1))
+    return SyncedRow(
+        done.samples,
+        done.found,
+        chirps,
+        done.frequency * rate,
+        np.abs(done.amplitude),
+        residual[0] * rate,
+        residual[1],
+        residuals.errors(aligned, done, setup.path, rate),
+        residuals.noise_power(aligned),
+    )

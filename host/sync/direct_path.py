@@ -1,0 +1,293 @@
+"""The direct path from TX to RX: found in every position's average, and made its zero of frequency and phase.
+
+The object's echo has the same strength and lies only 3.5 IF bins above the direct path, so whatever measures the
+direct path must not hear it. Both are known from the geometry: the direct path comes from the TX along the RX array
+with delays that never change, and the object can only be where the object plane is. With the object as coloured noise
+of covariance R, the best linear unbiased estimate of a direct path `A exp(j w t)` near `w = 0`, of model `x = A g + A
+w (jt g)`, is
+
+    [A, A w] = (G^H R^-1 G)^-1 G^H R^-1 x,   G = [g, j t g]
+
+(generalised least squares; Kay 1993, section 6.4), a fixed 2 x (4 RX x samples) matrix: a beamformer in space and
+frequency at once, with its nulls where the object is. Gauss-Newton steps `w += Re(A w / A)` converge. The estimate
+sees the average as burst alignment left it: mixed to zero, every four samples averaged.
+
+The boards' crystals differ by parts per million, so their slopes do too, and all IF drift by some kilohertz within a
+chirp, equally for every path and position. With a third column `jt^2/2 g` the same estimate gives that drift; its
+median over the row is taken out first.
+
+A scan's direct path never changes, so neither does its amplitude. Where a position's is out of line with its row's,
+the other of the two strongest peaks is tried; nothing is smoothed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+import scipy.linalg
+from numpy.typing import NDArray
+
+from host.sync.align import AlignedRow, whole_blocks
+from host.sync.passes import FOLD
+from host.sync.tone import Complex, cis, phasor
+from shared.config import Board, Chirp, Instrument
+from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from shared.units import SPEED_OF_LIGHT_M_S
+
+_FFT = 256  # of averaged samples
+_STEPS = 3
+_SPREAD_M = 0.1  # where echoes come from, relative to the mirror point: std of a normal distribution in x and y
+_GAIN_SPREAD = 0.3  # relative gain and phase differences of the RX that the nulls must bear with
+_NOISE = 1e-2  # noise power of one sample beside an echo as strong as the direct path
+_COMPARABLE = 0.35  # a second peak this strong, one object distance below the first, is the direct path
+_LOST = 0.3  # a direct path under this part of the row's median is not the direct path
+_OUTLIER = 5.0  # standard deviations at which an amplitude is out of line with its row's
+_PRESENT = 30.0  # nor is one under this power beside its estimate's noise: the best of 100,000 noises has 12
+
+
+class DirectPath(NamedTuple):
+    """What is known of a board's direct path before any data is seen: fixed for a scan, so that the phase zero is.
+
+    Attributes
+    ----------
+    steering
+        complex64 [rx, sample]: `exp(-j 2 pi f(t) (tau_r - tau_0))`, after which all RX share the direct path's tone.
+    folded_steering
+        complex64 [rx, block]: the same at the middle of each block of `FOLD` linear samples.
+    estimator
+        complex128 [2, rx * block]: rows give A and A w (w in radians a sample) of the steered, demodulated samples.
+    drift_estimator
+        complex128 [3, rx * block]: A, A w and A q, q the drift in radians a sample squared.
+    half_estimators
+        complex128 [2, 2, rx / 2 * block]: A and A w from every other RX alone.
+    beam
+        complex64 [rx]: weights of the steered RX for the search, sum 1, weak where the object is.
+    object_bins
+        IF distance of the nearest and farthest echo from the direct path, in bins of the search FFT.
+    """
+
+    steering: NDArray[np.complex64]
+    folded_steering: NDArray[np.complex64]
+    estimator: NDArray[np.complex128]
+    drift_estimator: NDArray[np.complex128]
+    half_estimators: NDArray[np.complex128]
+    beam: NDArray[np.complex64]
+    object_bins: tuple[float, float]
+
+
+class Referenced(NamedTuple):
+    """Samples referenced to the direct path.
+
+    Attributes
+    ----------
+    samples
+        complex64 [rx, position, sample]: an echo of excess path d is `exp(j 2 pi f(t) d / c)`, the direct path a
+        constant.
+    frequency
+        float64 [position]: direct path's IF in cycles a sample, 0..1 (complex 1x) or -1/2..1/2.
+    amplitude
+        complex128 [position]: its amplitude, phase at the centre of the linear samples.
+    found
+        bool [position]: False where no credible direct path was found.
+    drift
+        IF drift common to the row, radians a sample squared.
+    halves
+        complex64 [position, 2, rx, block]: the two halves of the burst, steered and turned as `samples` are.
+    """
+
+    samples: NDArray[np.complex64]
+    frequency: NDArray[np.float64]
+    amplitude: NDArray[np.complex128]
+    found: NDArray[np.bool_]
+    drift: float
+    halves: NDArray[np.complex64]
+
+
+def excess_path_m(
+    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], points_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """`|v - tx| + |v - rx| - |tx - rx|`, metres, [rx, point], for rx [rx, 3] and points [point, 3]."""
+    out = np.linalg.norm(points_m - tx_m, axis=-1) + np.linalg.norm(points_m[None] - rx_m[:, None], axis=-1)
+    return out - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
+
+
+def prepare(rig: Instrument, board: Board) -> DirectPath:
+    """Steering, search beam and estimator of a board, from the geometry alone."""
+    chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    middles = sweep[a:b].reshape(-1, FOLD).mean(axis=1)
+    direct = np.linalg.norm(rx - tx, axis=-1)
+    lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
+
+    # Echoes as the steered, demodulated samples see them: a tone at the excess path, with the object's own RX phases.
+    grid = np.linspace(-3, 3, 25) * _SPREAD_M
+    dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
+    weight = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
+    points = np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1)
+    excess = excess_path_m(tx, rx, points)
+    echoes = np.exp(2j * np.pi * middles * excess.T[:, :, None] / SPEED_OF_LIGHT_M_S)
+    echoes *= (weight / np.linalg.norm(weight))[:, None, None]
+    n_rx, n = len(rx), middles.size
+    flat = echoes.reshape(len(points), n_rx * n)
+    same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
+    noise = _NOISE / FOLD * np.eye(n_rx * n)
+    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + noise
+    time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
+    model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
+    own = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
+
+    centre = echoes[:, :, n // 2]
+    spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
+    beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
+    bins = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
+    return DirectPath(
+        cis(-2 * np.pi * sweep * lag_s),
+        cis(-2 * np.pi * middles * lag_s),
+        _least_squares(model[:, :2], covariance),
+        _least_squares(model, covariance),
+        np.stack([_least_squares(model[at, :2], covariance[np.ix_(at, at)]) for at in own]),
+        (beam / beam.sum()).astype(np.complex64),
+        (float(excess.min() * bins), float(excess.max() * bins)),
+    )
+
+
+def _least_squares(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """`(G^H R^-1 G)^-1 G^H R^-1` of a model G [sample, parameter] and a covariance R."""
+    whitened = np.asarray(scipy.linalg.solve(covariance, model, assume_a="pos"), np.complex128)
+    return np.linalg.solve(model.conj().T @ whitened, whitened.conj().T).astype(np.complex128)
+
+
+def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp) -> Referenced:
+    """Find the direct path of every position and take its frequency and phase out of all RX.
+
+    Parameters
+    ----------
+    aligned
+        A row's averages, compensated. Positions without a good chirp are not found.
+    path
+        From :func:`prepare`.
+    chirp
+        The chirp the samples were taken with.
+    """
+    a, b = whole_blocks(chirp.linear_samples)
+    n = (b - a) // FOLD
+    usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
+    halves = aligned.halves * path.folded_steering
+    folded = halves[:, 0] + halves[:, 1]
+    peaks, floor = _search(np.einsum("r,prn->pn", path.beam, folded), path.object_bins)
+    frequency, estimate, _ = _refine(folded, peaks[0], path.drift_estimator)
+    drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
+    drift = float(np.median(drifts)) if usable.any() else 0.0
+    time = (np.arange(n) - (n - 1) / 2) * FOLD
+    flat = cis(-0.5 * drift * time**2)
+    folded *= flat
+    halves *= flat
+    frequency, estimate, step = _refine(folded, frequency, path.estimator)
+    _try_others(folded, peaks, usable, path.estimator, frequency, estimate, step)
+
+    # An IF outside the receiver's band was aliased or filtered away; a step that does not shrink has found no tone.
+    amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging shrank the tone
+    heard = aligned.centre + frequency
+    heard = heard % 1.0 if chirp.if_mode == "complex1x" else (heard + 0.5) % 1.0 - 0.5
+    band = heard < 0.9 if chirp.if_mode == "complex1x" else np.abs(heard) < 0.45
+    strength = np.abs(amplitude)
+    chirps = np.maximum(aligned.good.sum(axis=1), 1)
+    floor = np.median((floor * chirps)[usable]) / chirps if usable.any() else floor  # a chirp's noise is the row's
+    noise = floor / (np.abs(path.beam) ** 2).sum()  # of an averaged sample of one RX
+    present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
+    found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
+    if found.any():
+        found &= strength > _LOST * np.median(strength[found])
+
+    halves *= phasor(-frequency * FOLD, -np.angle(amplitude), n, (n - 1) / 2)[:, None, None]
+    every = np.arange(chirp.samples) - (a + b - 1) / 2
+    turn = phasor(-frequency, -np.angle(amplitude), chirp.samples, (a + b - 1) / 2) * found[:, None]
+    samples = np.empty((len(path.beam), *turn.shape), np.complex64)
+    np.multiply(aligned.mean.swapaxes(0, 1), (path.steering * cis(-0.5 * drift * every**2))[:, None], out=samples)
+    samples *= turn
+    return Referenced(samples, heard, amplitude, found, drift, halves)
+
+
+def _refine(
+    folded: Complex, frequency: NDArray[np.float64], estimator: NDArray[np.complex128]
+) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
+    """Gauss-Newton: frequency [position], the estimate [position, 2 or 3] there, and the last step taken."""
+    positions, _, n = folded.shape
+    weights = estimator.T.astype(np.complex64)
+    zero = step = np.zeros(positions)
+    reach = 1 / (n * FOLD)
+
+    def estimate_at(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+        demodulated = folded * phasor(-frequency * FOLD, zero, n, (n - 1) / 2)[:, None]
+        return (demodulated.reshape(positions, -1) @ weights).astype(complex)
+
+    estimate = estimate_at(frequency)
+    for _ in range(_STEPS):
+        step = np.clip(_ratio(estimate[:, 1], estimate[:, 0]) / (2 * np.pi), -reach, reach)
+        frequency = frequency + step
+        estimate = estimate_at(frequency)
+    return frequency, estimate, step
+
+
+def _try_others(
+    folded: Complex,
+    peaks: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    estimator: NDArray[np.complex128],
+    *found: NDArray[np.generic],
+) -> None:
+    """Where the amplitude is out of line with the row's, take the other peak if it is in line; changes `found`.
+
+    `found` is frequency, estimate and last step, as :func:`_refine` gives them. Out of line is beyond `_OUTLIER`
+    standard deviations, from the row's own median deviation.
+    """
+    level = np.log(np.maximum(np.abs(found[1][:, 0]), 1e-30))
+    if not usable.any():
+        return
+    middle = np.median(level[usable])
+    spread = 1.4826 * np.median(np.abs(level[usable] - middle))  # of a normal distribution
+    odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
+    if odd.size == 0:
+        return
+    other = _refine(folded[odd], peaks[1, odd], estimator)
+    theirs = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
+    better = np.abs(theirs - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
+    for whole, part in zip(found, other, strict=True):
+        whole[odd[better]] = part[better]
+
+
+def _ratio(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:
+    ratio = np.zeros(amplitude.shape, complex)
+    np.divide(moment, amplitude, out=ratio, where=amplitude != 0)
+    return np.real(ratio)
+
+
+def _search(
+    beam: NDArray[np.complex64], object_bins: tuple[float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Frequency of the direct path (cycles a sample), and of what else it might be, within a bin, [2, position]; and
+    the noise power of an averaged sample [position].
+
+    The object's echo is later, so higher in IF by a distance the geometry tells. When the strongest peak has a
+    comparable one that far below it, the strongest is the object. Noise is the median bin's: tones fill few bins.
+    """
+    n = beam.shape[-1]
+    window = np.hanning(n + 2)[1:-1].astype(np.float32)
+    spectrum = np.abs(np.asarray(scipy.fft.fft(beam * window, _FFT, axis=-1)))
+    floor = np.median(spectrum, axis=-1) ** 2 / np.log(2) / (window**2).sum()
+    rows = np.arange(len(beam))
+    top = np.argmax(spectrum, axis=-1)
+    below = top[:, None] - np.arange(int(object_bins[0] * 0.9), int(object_bins[1] * 1.1) + 1)
+    values = spectrum[rows[:, None], below % _FFT]
+    is_peak = (values >= spectrum[rows[:, None], (below - 1) % _FFT]) & (
+        values >= spectrum[rows[:, None], (below + 1) % _FFT]
+    )
+    values = np.where(is_peak, values, 0)
+    best = np.argmax(values, axis=-1)
+    lower = np.where(values[rows, best] > 0, below[rows, best], top)
+    comparable = values[rows, best] > _COMPARABLE * spectrum[rows, top]
+    peaks = np.where(comparable, [lower, top], [top, lower])
+    return ((peaks + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD, floor

@@ -1,0 +1,177 @@
+"""The receiver's high-pass filter, and its compensation.
+
+The AWR2243 filters the IF twice, with corners chosen in the profile (175/235/350/700 kHz and 350/700/1400/2800 kHz).
+The direct path and the object sit at different IF, and both move with every chirp's timing: amplitude and phase of
+the filter must go before anything else is estimated (paper, section 5.2).
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from shared.config import Chirp
+from shared.errors import DataError
+
+SMALLEST_GAIN = 0.25
+"""A gain below this is not undone further."""
+
+REACH_BINS = 3.0
+"""Direct path and object lie within so many IF bins of their middle."""
+
+
+@dataclass(frozen=True)
+class HighPass:
+    """A linear constant-coefficient filter: a product of first-order high-pass sections.
+
+    `H(f) = prod_i (jf / f_i) / (1 + jf / f_i)`, the response of `y' + 2 pi f_i y = x'` for each corner `f_i`.
+    No corners: the identity.
+    """
+
+    corners_hz: tuple[float, ...] = ()
+
+    def response(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Complex response at IF frequencies (Hz, any shape)."""
+        h = np.ones(np.shape(frequency_hz), complex)
+        for corner in self.corners_hz:
+            x = 1j * np.asarray(frequency_hz) / corner
+            h *= x / (1 + x)
+        return h
+
+    def inverse(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """`conj(H) / max(|H|^2, 1/16)`: exactly 1/H where signal can be used, never more than fourfold noise."""
+        f = np.where(np.abs(frequency_hz) < 1.0, 1.0, frequency_hz)
+        inverse: NDArray[np.complex128] = np.ones(np.shape(f), complex)
+        for corner in self.corners_hz:
+            inverse *= 1 - 1j * corner / f
+        return inverse * np.minimum(1.0, (inverse.real**2 + inverse.imag**2) ** -1 / SMALLEST_GAIN**2)
+
+
+@dataclass(frozen=True)
+class Equaliser:
+    """Undoes the filter on the narrow band that a chirp's signal fills, with three taps.
+
+    Mixed down by its centre f, a chirp's signal lies within some tens of kHz of zero. Taps t at -spacing, 0 and
+    +spacing samples have the response `t_0 exp(-jw) + t_1 + t_2 exp(jw)`; they are chosen to equal the inverse at f and
+    `reach` on either side, and repeat beyond, so that noise far away is not raised by the slope of 1/H.
+
+    Attributes
+    ----------
+    model
+        The filter.
+    sample_rate_hz, signed
+        Sampling, and whether IF is -1/2..1/2 of it (complex 2x) or 0..1 (complex 1x).
+    spacing
+        Samples between taps.
+    reach
+        Cycles a sample.
+    """
+
+    model: HighPass
+    sample_rate_hz: float
+    signed: bool
+    spacing: int
+    reach: float
+
+    @classmethod
+    def of(cls, model: HighPass, chirp: Chirp, spacing: int) -> Equaliser:
+        """For a chirp profile: exact at its signal's centre and `REACH_BINS` bins of its linear samples away."""
+        a, b = chirp.linear_samples
+        return cls(model, chirp.sample_rate_hz, chirp.if_mode == "complex2x", spacing, REACH_BINS / (b - a))
+
+    def taps(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Taps [..., 3] of signals centred at frequencies [...] in cycles a sample."""
+        f = frequency[..., None] + self.reach * np.array([-1.0, 0.0, 1.0])
+        f = ((f + 0.5) % 1.0 - 0.5 if self.signed else f % 1.0) * self.sample_rate_hz
+        low, middle, high = np.moveaxis(self.model.inverse(f), -1, 0)
+        w = 2 * np.pi * self.reach * self.spacing
+        both = ((low + high) / 2 - middle) / (np.cos(w) - 1)
+        apart = (high - low) / (2j * np.sin(w))
+        return np.stack([(both - apart) / 2, middle - both, (both + apart) / 2], axis=-1)
+
+
+def shifted(terms: NDArray[np.complexfloating], spacing: int) -> NDArray[np.complexfloating]:
+    """`terms` [position, tap, rx, sample], each shifted by its tap; a single tap is none.
+
+    Beyond its ends a term is continued by the parabola through three of its samples.
+    """
+    if terms.shape[1] == 1:
+        return terms
+    out, s = terms.copy(), spacing
+    before, after = terms[:, 0], terms[:, 2]
+    out[:, 0, :, s:] = before[..., :-s]
+    out[:, 0, :, :s] = 3 * (before[..., :s] - before[..., s : 2 * s]) + before[..., 2 * s : 3 * s]
+    out[:, 2, :, :-s] = after[..., s:]
+    out[:, 2, :, -s:] = 3 * (after[..., -s:] - after[..., -2 * s : -s]) + after[..., -3 * s : -2 * s]
+    return out
+
+
+def filtered(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Signal [position, chirp, rx, sample] through its chirps' taps [position, chirp, tap], a sample apart."""
+    terms = signal[:, :, None] * taps[..., None, None]
+    return shifted(terms.reshape(-1, *terms.shape[2:]), 1).sum(axis=1).reshape(signal.shape)
+
+
+def high_pass(chirp: Chirp) -> HighPass:
+    """The filter that a chirp profile programs."""
+    return HighPass((chirp.hpf1_khz * 1e3, chirp.hpf2_khz * 1e3))
+
+
+def fit_high_pass(
+    if_hz: NDArray[np.float64],
+    amplitude: NDArray[np.float64],
+    phase_rad: NDArray[np.float64] | None = None,
+    sections: int = 2,
+) -> HighPass:
+    """The filter behind a sweep: one reflector, measured while the receiver's start frequency moves its IF.
+
+    Least squares of log amplitude, and of phase where it is known, over the corners and a common gain (paper, Fig. 9).
+
+    Parameters
+    ----------
+    if_hz, amplitude
+        float64 [point]: IF and linear amplitude, in any unit.
+    phase_rad
+        float64 [point], up to a constant; None where each measurement had its own phase.
+    sections
+        First-order sections to fit.
+
+    Raises
+    ------
+    DataError
+        when there are too few points, or none near enough to a corner to tell it.
+    """
+    if_hz, amplitude = np.asarray(if_hz, np.float64), np.asarray(amplitude, np.float64)
+    if if_hz.size < 2 * (sections + 2) or np.any(amplitude <= 0) or np.any(if_hz <= 0):
+        raise DataError(
+            f"{if_hz.size} points do not tell {sections} corners",
+            "a sweep needs IF and amplitude above zero, at twice as many points as unknowns",
+            "measure the same reflector at more start frequencies",
+        )
+    measured = np.log(amplitude)
+    turns = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
+
+    def misfit(log_corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        h = HighPass(tuple(np.exp(log_corners))).response(if_hz)
+        gain = measured - np.log(np.abs(h))
+        out = gain - gain.mean()
+        if turns is None:
+            return out
+        turn = turns * np.conj(h) / np.abs(h)
+        return np.concatenate([out, np.angle(turn * np.conj(turn.mean()))])
+
+    limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)
+    starts = itertools.combinations(np.linspace(*limits, 6)[1:-1], sections)  # the corners may be in any two octaves
+    fits = [scipy.optimize.least_squares(misfit, start, bounds=limits, loss="soft_l1", f_scale=0.1) for start in starts]
+    corners = np.exp(np.sort(min(fits, key=lambda fit: fit.cost).x))
+    if corners[0] < 1.1 * np.exp(limits[0]) or corners[-1] > 0.9 * np.exp(limits[1]):
+        raise DataError(
+            f"no filter fits the sweep: corners of {', '.join(f'{c / 1e3:.0f}' for c in corners)} kHz",
+            "the IF range does not reach down to the filter's corners, or the reflector moved",
+            "sweep the IF from about half the lower corner to several times the upper one",
+        )
+    return HighPass(tuple(float(c) for c in corners))

@@ -1,0 +1,112 @@
+"""What is left of frequency, phase and amplitude errors after each stage of synchronisation (paper, Fig. 15).
+
+Measured on the scan itself, whatever is in it: an error is half the difference between two measurements of the same
+thing that share no noise. For a chirp, and for the direct path, these are two halves of the RX; for the object beside
+the direct path, two averages of every other chirp.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.sync.align import AlignedRow
+from host.sync.direct_path import DirectPath, Referenced
+from host.sync.passes import FOLD
+from host.sync.tone import Complex, Real, block_edges, block_times, phasor, refine
+
+STAGES = {
+    "received": "one chirp as the hardware trigger left it",
+    "aligned": "one chirp after burst alignment",
+    "averaged": "the direct path in a position's average",
+    "referenced": "the object beside the direct path in a position's average",
+}
+
+Errors = dict[str, NDArray[np.float64]]
+
+
+def errors(aligned: AlignedRow, done: Referenced, path: DirectPath, sample_rate_hz: float) -> Errors:
+    """Errors after each stage in a row's valid positions, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
+
+    Empty when no position is valid. `referenced` holds only the positions that have an echo.
+    """
+    if not done.found.any():
+        return {}
+    good, found = aligned.good[done.found], done.found
+    received = np.stack(
+        [
+            done.frequency[found, None] + aligned.frequency[found],
+            np.angle(done.amplitude)[found, None] + aligned.phase[found],
+            np.abs(done.amplitude)[found, None] * aligned.amplitude[found] / aligned.gain[found],
+        ]
+    )[:, good]
+    turns = np.exp(1j * received[1])
+    received[0] -= received[0].mean()
+    received[1] = np.angle(turns * np.conj(turns.mean()))
+    received[2] = received[2] / received[2].mean() - 1
+
+    own = (aligned.amplitude[found] * good).sum(axis=1) / good.sum(axis=1)
+    one = np.stack([*aligned.error[:, found], aligned.amplitude[found] / own[:, None] - 1])[:, good]
+
+    two = found & (aligned.good.sum(axis=1) > 1)
+    n = aligned.good[two].sum(axis=1)
+    halves = done.halves[two] * (n[:, None] / np.stack([(n + 1) // 2, n // 2], axis=1))[..., None, None]
+    out = {
+        "received": received,
+        "aligned": one,
+        "averaged": _direct_path(done.halves[found].sum(axis=1), path),
+        "referenced": _object(halves.astype(np.complex64), path),
+    }
+    for values in out.values():
+        values[0] *= sample_rate_hz
+    return out
+
+
+def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
+    """Noise power of a sample of one channel of one chirp, [position], from what two averages differ by; else nan."""
+    n = aligned.good.sum(axis=1)
+    parts = np.stack([(n + 1) // 2, n // 2], axis=1)
+    each = aligned.halves * (n[:, None] / np.maximum(parts, 1))[..., None, None]
+    power = (np.abs(each[:, 0] - each[:, 1]) ** 2).mean(axis=(1, 2))
+    return np.where(n > 1, power * FOLD / (1 / np.maximum(parts, 1)).sum(axis=1), np.nan)
+
+
+def _direct_path(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
+    """Errors of the direct path [3, n] in referenced averages [position, rx, block], from two halves of the RX."""
+    frequency, phase, size = [], [], []
+    for h in (0, 1):
+        amplitude, w = _estimate(mean[:, h::2], path.half_estimators[h])
+        frequency.append(w / (2 * np.pi))
+        phase.append(np.angle(amplitude * np.conj(amplitude.mean())))  # less what the RX differ by, always
+        size.append(np.abs(amplitude) / np.abs(amplitude).mean())
+    return np.stack([x[0] - x[1] for x in (frequency, phase, size)]) / 2
+
+
+def _estimate(signal: NDArray[np.complex64], estimator: NDArray[np.complex128]) -> tuple[Complex, Real]:
+    """Amplitude and remaining frequency (radians a sample), [...], of a direct path in signals [..., rx, block]."""
+    estimate = signal.reshape(*signal.shape[:-2], -1) @ estimator.T.astype(np.complex64)
+    return estimate[..., 0].astype(complex), np.real(estimate[..., 1] / estimate[..., 0])
+
+
+def _object(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
+    """Errors of the object [3, n], from two referenced averages [position, 2, rx, block]; of positions with an echo."""
+    rx, n = halves.shape[2:]
+    # Each half referenced to its own direct path, which is then taken away: what is left is the object.
+    amplitude, w = _estimate(halves, path.estimator)
+    back = phasor(-w * FOLD / (2 * np.pi), -np.angle(amplitude), n, (n - 1) / 2)
+    echo = halves * back[:, :, None] - np.abs(amplitude)[..., None, None]
+    product = (echo[:, 0] * echo[:, 1].conj()).sum(axis=1)
+    edges = block_edges(n)
+    tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
+    size = np.abs((echo * echo.mean(axis=1, keepdims=True).conj()).sum(axis=(2, 3)))
+    contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
+    energy = (echo.real**2 + echo.imag**2).sum(axis=(2, 3))
+    # Two records of noise are this coherent by chance; an echo that is no more so is none.
+    echoing = np.abs(tone.amplitude) > 4 / np.sqrt(rx * n) * np.sqrt(energy.prod(axis=1))
+    return np.stack([tone.frequency / 2, np.angle(tone.amplitude) / 2, contrast])[:, echoing]
+
+
+def spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Root mean square of errors [3, n]."""
+    f, p, a = np.sqrt((values**2).mean(axis=1))
+    return float(f), float(p), float(a)

@@ -1,0 +1,271 @@
+"""The row executor: one thread that takes commands, stage news and bursts from one queue, in order.
+
+It answers the host's commands and keeps the run; what stage and row do is machine.py. docs/spec/wire.md says what each
+command does in each state.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from pi_controller.burst import BurstSpec
+from pi_controller.journal import JournalFullError
+from pi_controller.ledger import Ledger
+from pi_controller.machine import Machine
+from pi_controller.rows import RefusedError, check_run, row_of
+from pi_controller.running_row import RunningRow
+from pi_controller.stage_driver import StageDriver
+from pi_controller.stage_link import StageLost, StageNews
+from pi_controller.trigger_loop import BurstSent, LoopFault, TriggerLoop
+from shared import messages as m
+from shared.errors import DataError, ProtocolError
+from shared.faults import PiFault, explain
+from shared.stage_line import Reply
+from shared.units import us_to_ns
+
+EVENTS_PER_TURN = 256
+
+
+class Request(NamedTuple):
+    """A command and where its reply goes."""
+
+    command: m.AnyCommand
+    answer: Callable[[m.AnyReply], None]
+
+
+class Snapshot(NamedTuple):
+    """What Hello, Status and heartbeats tell; replaced as a whole, so that other threads may read it."""
+
+    status: m.StatusReply
+    firmware: str = ""
+
+
+class Executor:
+    """Runs in a thread of its own; :meth:`post` and :attr:`snapshot` are for all threads.
+
+    Parameters
+    ----------
+    stage, loop, ledger
+        The stage, the trigger loop and the events.
+    check_width
+        Whether a pulse that may have been too long is a fault (no hardware one-shot).
+    """
+
+    def __init__(self, stage: StageDriver, loop: TriggerLoop, ledger: Ledger, check_width: bool = True) -> None:
+        self._loop, self._ledger, self._check_width = loop, ledger, check_width
+        self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._machine = Machine(stage, loop, ledger, self._inbox.put, self._row_ended)
+        self._run: m.BeginRun | None = None
+        self._last_row: tuple[int, int] | None = None
+        self._after_row: Callable[[], None] | None = None
+        self._replies: list[tuple[Callable[[m.AnyReply], None], m.AnyReply]] = []
+        self._ending = self._ended = False
+        self.crash: BaseException | None = None
+        self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
+        self._refresh()
+
+    # --- for other threads ------------------------------------------------------------------------------------------
+
+    def post(self, item: Request | StageNews | BurstSent | LoopFault | Callable[[], None]) -> None:
+        """Hand something over; returns at once."""
+        self._inbox.put(item)
+
+    def host_alive(self, scan_id: str) -> m.Accepted | m.Refused:
+        """The host of this run was heard. Answers at once, whatever the executor does."""
+        run = self._run
+        if run is None or run.scan_id != scan_id:
+            e = explain(PiFault.NOT_READY)
+            return m.Refused(
+                number=int(PiFault.NOT_READY), what=f"run {scan_id} is not begun", why=e.why, remedy="BeginRun"
+            )
+        self._machine.host.heard(time.monotonic())
+        return m.Accepted(state=self.snapshot.status.state)
+
+    def start(self) -> None:
+        """Start the thread. The stage is connected by now."""
+        self._refresh()
+        self._thread.start()
+
+    def stop(self, limit_s: float) -> None:
+        """Stop the stage, end the row as aborted, end the thread."""
+        self.post(self._end)
+        self._thread.join(limit_s)
+
+    # --- the thread -------------------------------------------------------------------------------------------------
+
+    def _live(self) -> None:
+        try:
+            while not self._ended:
+                self._turn()
+        except BaseException as e:
+            self.crash = e
+            raise
+
+    def _turn(self) -> None:
+        try:
+            item = self._inbox.get(timeout=self._machine.seconds_left())
+            for _ in range(EVENTS_PER_TURN):
+                self._take(item)
+                item = self._inbox.get_nowait()
+            self._take(item)
+        except queue.Empty:
+            pass
+        self._machine.check_limits()
+        try:
+            self._ledger.commit()
+        except JournalFullError as e:
+            self._machine.fail(PiFault.JOURNAL_FULL, str(e), wait=True)
+            self._ledger.commit()
+        self._refresh()
+        replies, self._replies = self._replies, []
+        if replies:  # while a command waited for its reply, no other could come
+            self._machine.host.heard(time.monotonic())
+        for answer, reply in replies:
+            answer(reply)
+
+    def _take(self, item: Any) -> None:
+        if isinstance(item, BurstSent):
+            self._machine.take_burst(item)
+        elif isinstance(item, LoopFault):
+            self._machine.take_loop_fault(item)
+        elif isinstance(item, Request):
+            try:
+                reply = self._on_command(item)
+            except RefusedError as e:
+                reply = m.Refused(number=e.number, what=e.what, why=e.why, remedy=e.remedy)
+            if reply is not None:
+                self._replies.append((item.answer, reply))
+        elif isinstance(item, Reply):
+            self._machine.take_stage(item)
+        elif isinstance(item, StageLost):
+            self._machine.fail(PiFault.STAGE_LOST, item.reason)
+        else:
+            item()
+
+    # --- commands ---------------------------------------------------------------------------------------------------
+
+    def _on_command(self, request: Request) -> m.AnyReply | None:
+        command = request.command
+        if isinstance(command, m.Replay):
+            try:
+                return self._ledger.replay(command.scan_id, command.from_seq, command.limit)
+            except (DataError, ProtocolError) as e:
+                raise RefusedError(PiFault.BAD_REQUEST, e.what, e.why, e.remedy) from None
+        if self._ending:
+            raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
+        if isinstance(command, m.BeginRun):
+            return self._begin(request, command)
+        if isinstance(command, m.EndRun):
+            return self._end_run(command)
+        if isinstance(command, m.Home):
+            self._machine.home()
+            return self._accept()
+        if isinstance(command, m.RunRow):
+            return self._run_row(command)
+        if isinstance(command, m.Hold | m.Resume):
+            self._machine.hold(isinstance(command, m.Hold))
+            return self._accept()
+        if isinstance(command, m.Abort):
+            self._machine.abort(command.reason or "asked for by the host")
+            return self._accept()
+        raise RefusedError(PiFault.BAD_REQUEST, f"{type(command).__name__} is not answered here")
+
+    def _accept(self) -> m.Accepted:
+        return m.Accepted(state=self._machine.state)
+
+    def _begin(self, request: Request, run: m.BeginRun) -> m.AnyReply | None:
+        check_run(run, self._machine.stage.config)
+        if self._machine.row is None:
+            return self._begin_now(run)
+
+        def begin_later() -> None:
+            self._take(request)
+
+        # The host that asked for the running row is gone; what it would have recorded is not committed.
+        self._after_row = begin_later
+        self._machine.end_row("aborted", PiFault.ABORTED, f"run {run.scan_id} was begun anew", wait=True)
+        return None
+
+    def _begin_now(self, run: m.BeginRun) -> m.Accepted:
+        try:
+            resumed, lost = self._ledger.open(run.scan_id, run.plan, run.last_seq)
+        except JournalFullError as e:
+            raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
+        except (DataError, ProtocolError) as e:
+            raise RefusedError(PiFault.BAD_REQUEST, e.what, e.why, e.remedy) from None
+        self._run, self._last_row = run, None
+        self._machine.begin_run(run.heartbeat_ms)
+        self._machine.emit(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
+        return self._accept()
+
+    def _end_run(self, command: m.EndRun) -> m.Accepted:
+        if self._run is None and command.scan_id == self._ledger.scan_id:
+            return self._accept()  # a repeated request
+        self._need_run(command.scan_id)
+        if self._machine.row is not None:
+            raise RefusedError(PiFault.NOT_READY, "a row is running", "", "abort it, or wait for its end")
+        self._machine.emit(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
+        self._run = None
+        self._machine.end_run()
+        return self._accept()
+
+    def _need_run(self, scan_id: str) -> m.BeginRun:
+        if self._run is None or self._run.scan_id != scan_id:
+            now = f"run {self._run.scan_id} is" if self._run else "no run is"
+            raise RefusedError(PiFault.NOT_READY, f"{now} begun, not {scan_id}", "the Pi was started anew", "BeginRun")
+        return self._run
+
+    def _run_row(self, command: m.RunRow) -> m.Accepted:
+        run, machine = self._need_run(command.scan_id), self._machine
+        wanted = (command.row_index, command.take)
+        current = machine.row and (machine.row.row.index, machine.row.take)
+        if wanted in (current, self._last_row):
+            return self._accept()  # a repeated request: the row runs, or has run
+        if machine.state != "ready":
+            raise RefusedError(
+                PiFault.NOT_READY,
+                f"the state is {machine.state}" + (f": {machine.reason}" if machine.reason else ""),
+                remedy="wait for the row's end" if current else "home the stage",
+            )
+        row = row_of(run.plan, command.row_index)
+        spec = BurstSpec(run.pulses, us_to_ns(run.period_us), us_to_ns(run.width_us), self._check_width)
+        machine.start_row(row, command.take, spec, run.speed_mm_s)
+        return self._accept()
+
+    def _row_ended(self, row: RunningRow) -> None:
+        self._last_row = (row.row.index, row.take)
+        then, self._after_row = self._after_row, None
+        if then is not None:
+            then()
+        self._ended = self._ending
+
+    def _end(self) -> None:
+        self._ending = True
+        self._ended = not self._machine.end()
+
+    # --- small things -----------------------------------------------------------------------------------------------
+
+    def _refresh(self) -> None:
+        machine = self._machine
+        row, counts = machine.row, self._loop.counts
+        self.snapshot = Snapshot(
+            m.StatusReply(
+                state=machine.state,
+                homed=machine.homed,
+                x_mm=machine.stage.x_mm,
+                y_mm=machine.stage.y_mm,
+                scan_id=self._ledger.scan_id,
+                row_index=row.row.index if row else -1,
+                take=row.take if row else 0,
+                points=counts.bursts if row else 0,
+                pulses=counts.pulses if row else 0,
+                last_seq=self._ledger.last_seq,
+                fault=machine.fault,
+                reason=machine.reason,
+            ),
+            machine.stage.firmware,
+        )

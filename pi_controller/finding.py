@@ -1,0 +1,28 @@
+"""What one check found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+from shared.errors import PolysightError
+
+Verdict = Literal["ok", "warn", "fail"]
+
+
+class Finding(NamedTuple):
+    """One check: its name, how it went, what was found, and what to do when it is not ok."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    remedy: str = ""
+
+
+def attempt(name: str, check: Callable[[], str | Finding]) -> Finding:
+    """Run a check: ok with what it returns, its own finding, or fail with the error it raises."""
+    try:
+        found = check()
+    except PolysightError as e:
+        return Finding(name, "fail", e.what + (f" ({e.why})" if e.why else ""), e.remedy)
+    return found if isinstance(found, Finding) else Finding(name, "ok", found)

@@ -1,0 +1,265 @@
+"""The journal: every event of a scan on disk before it is published, so that a lost message can be asked for again.
+
+One file a scan, append-only: 8 bytes of magic, then records of `<length, sequence, crc32(sequence + payload)>` (three
+little-endian u32) and the packed event. Sequence numbers count up from 1; they jump only where a lost journal was begun
+anew behind what the host has. A torn or damaged tail, as a power cut leaves it, is cut off at the last good record when
+the file is opened. Specification: docs/spec/wire.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import struct
+import zlib
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from shared.errors import ConfigError, DataError, DeviceError
+
+MAGIC = b"PSJRNL1\n"
+MAX_RECORD_BYTES = 1 << 20
+_HEAD = struct.Struct("<III")
+
+
+class JournalFullError(DeviceError):
+    """The journal cannot be written. Nothing of the failed batch is in it."""
+
+
+def _crc(seq: int, payload: bytes) -> int:
+    return zlib.crc32(payload, zlib.crc32(seq.to_bytes(4, "little")))
+
+
+def frame(seq: int, payload: bytes) -> bytes:
+    """One record as bytes."""
+    return _HEAD.pack(len(payload), seq, _crc(seq, payload)) + payload
+
+
+def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
+    """Good records of an open journal from its beginning: (offset, sequence, payload). Ends at the first bad one.
+
+    Raises
+    ------
+    DataError
+        when the file is no journal at all.
+    """
+    magic = file.read(len(MAGIC))
+    if not magic.strip(b"\0"):
+        return  # made, and the power was cut before its first bytes were on the disk
+    if magic != MAGIC[: len(magic)]:
+        raise DataError(
+            f"{getattr(file, 'name', 'journal')}: not a journal",
+            "another program wrote this file",
+            "move it out of the journal folder",
+        )
+    offset, last = len(MAGIC), 0
+    while len(head := file.read(_HEAD.size)) == _HEAD.size:
+        length, seq, crc = _HEAD.unpack(head)
+        if length > MAX_RECORD_BYTES or seq <= last:
+            return
+        payload = file.read(length)
+        if len(payload) < length or _crc(seq, payload) != crc:
+            return
+        yield offset, seq, payload
+        offset, last = offset + _HEAD.size + length, seq
+
+
+class Journal:
+    """The journal of one scan, open for appending.
+
+    Parameters
+    ----------
+    path
+        The file; made when absent, cut at its last good record otherwise.
+
+    Raises
+    ------
+    DataError
+        when the file exists and is no journal.
+    JournalFullError
+        when it cannot be made or written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as e:
+            raise _full(path, e) from None
+        self._offsets, self._seqs = array("Q"), array("I")  # of all records, those of the batch included
+        self._passed = 0  # numbers up to this one are the host's
+        self._batch: list[bytes] = []
+        self._synced = True
+        try:
+            self._recover()
+        except OSError as e:
+            os.close(self._fd)
+            raise _full(path, e) from None
+        except DataError:
+            os.close(self._fd)
+            raise
+
+    def _recover(self) -> None:
+        self._end = len(MAGIC)
+        with path_reader(self.path) as file:
+            size = os.fstat(self._fd).st_size
+            for offset, seq, payload in records(file):
+                self._offsets.append(offset)
+                self._seqs.append(seq)
+                self._end = offset + _HEAD.size + len(payload)
+        self.cut_bytes = max(0, size - self._end)
+        if not self._seqs:
+            os.pwrite(self._fd, MAGIC, 0)
+        os.ftruncate(self._fd, self._end)
+        os.fsync(self._fd)
+        folder = os.open(self.path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+        self._batched_end = self._end
+
+    @property
+    def last_seq(self) -> int:
+        """Sequence number of the newest record, appended or still in the batch; 0 when there is none."""
+        return max(self._passed, self._seqs[-1] if self._seqs else 0)
+
+    def number_behind(self, seq: int) -> int:
+        """Number the next record behind `seq`. Returns how many numbers this passes over, which others have used."""
+        lost = max(0, seq - self.last_seq)
+        self._passed = max(self._passed, seq)
+        return lost
+
+    def append(self, payload: bytes) -> int:
+        """Add a record to the batch and return its sequence number. :meth:`commit` writes it."""
+        seq = self.last_seq + 1
+        record = frame(seq, payload)
+        self._offsets.append(self._batched_end)
+        self._seqs.append(seq)
+        self._batch.append(record)
+        self._batched_end += len(record)
+        return seq
+
+    def commit(self, sync: bool = False) -> None:
+        """Write the batch; with `sync`, wait until it is on the disk.
+
+        Raises
+        ------
+        JournalFullError
+            when the disk is full or broken. The batch is then dropped and the file is as before.
+        """
+        if not self._batch and (self._synced or not sync):
+            return
+        data = memoryview(b"".join(self._batch))
+        done = 0
+        try:
+            while done < len(data):
+                done += os.pwrite(self._fd, data[done:], self._end + done)
+            if sync:
+                os.fsync(self._fd)
+        except OSError as e:
+            self._roll_back()
+            raise _full(self.path, e) from None
+        self._batch.clear()
+        self._end = self._batched_end
+        self._synced = sync
+
+    def _roll_back(self) -> None:
+        with suppress(OSError):  # what is left of the batch is overwritten, or cut off when the file is next opened
+            os.ftruncate(self._fd, self._end)
+        whole = len(self._offsets) - len(self._batch)
+        del self._offsets[whole:], self._seqs[whole:]
+        self._batch.clear()
+        self._batched_end = self._end
+
+    def read(self, from_seq: int, limit: int) -> list[bytes]:
+        """Payloads of committed records from `from_seq` on, at most `limit` of them."""
+        whole = len(self._offsets) - len(self._batch)
+        first = bisect_left(self._seqs, from_seq)
+        found = []
+        part = slice(first, min(whole, first + limit))
+        for seq, offset in zip(self._seqs[part], self._offsets[part], strict=True):
+            length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
+            payload = os.pread(self._fd, length, offset + _HEAD.size)
+            if _crc(seq, payload) != crc:
+                raise DataError(f"{self.path}: record {seq} is damaged", "the disk or card fails", "replace it")
+            found.append(payload)
+        return found
+
+    def close(self) -> None:
+        """Write what is left and close. Raises JournalFullError."""
+        try:
+            self.commit(sync=True)
+        finally:
+            os.close(self._fd)
+
+
+class JournalFolder:
+    """The folder of journals, held by one process at a time.
+
+    Raises
+    ------
+    ConfigError
+        when the folder cannot be made or written.
+    DeviceError
+        when another process holds it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as e:
+            raise ConfigError(
+                f"journal folder {path}: {e.strerror}",
+                "it does not exist and cannot be made, or this user may not write there",
+                "make it, or choose another with --journal or pi.journal_dir",
+            ) from None
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            raise DeviceError(
+                f"journal folder {path} is in use", "another polysight-pi runs", "stop it, or give another --journal"
+            ) from None
+
+    def path_of(self, scan_id: str) -> Path:
+        """The journal file of a scan."""
+        return self.path / f"{scan_id}.journal"
+
+    def open(self, scan_id: str) -> Journal:
+        """The journal of a scan, made when absent."""
+        return Journal(self.path_of(scan_id))
+
+    def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
+        """Payloads from `from_seq` on and the newest sequence number of a scan that is not open; ([], 0) if absent."""
+        found, last = [], 0
+        try:
+            with path_reader(self.path_of(scan_id)) as file:
+                for _, seq, payload in records(file):
+                    last = seq
+                    if seq >= from_seq and len(found) < limit:
+                        found.append(payload)
+        except FileNotFoundError:
+            pass
+        return found, last
+
+    def close(self) -> None:
+        """Let another process have the folder."""
+        os.close(self._lock)
+
+
+def path_reader(path: Path) -> BinaryIO:
+    """A buffered reader of a journal file."""
+    return path.open("rb")
+
+
+def _full(path: Path, e: OSError) -> JournalFullError:
+    why = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else "the disk is read-only or broken"
+    return JournalFullError(f"journal {path} cannot be written: {e.strerror}", why, "free space on the Pi")

@@ -1,0 +1,79 @@
+"""Lines of a simulated rig: edges come and go over a local socket, each with its wire time (shared/wires.py).
+
+Wire time is the simulated stage's clock. Here it is the latest of the edges seen and of the deadlines slept until, so a
+burst takes no wall time, and its pulses lie exactly on their deadlines however loaded the machine is.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from pi_controller.trigger_lines import Edge
+from shared.config import Pi
+from shared.wires import WireClient, WireEdge
+
+
+class WireLines:
+    """Trigger lines on simulated wires.
+
+    Parameters
+    ----------
+    path
+        Unix socket of the hub.
+    pi
+        Which lines.
+
+    Raises
+    ------
+    DeviceError
+        when no hub listens at `path`.
+    """
+
+    def __init__(self, path: Path, pi: Pi, timeout_s: float = 10.0) -> None:
+        self.name = "wires"
+        self._trigger, self._outputs = pi.trigger_in, pi.sync_out
+        self._client = WireClient(path, listen=(pi.trigger_in,), timeout_s=timeout_s)
+        self._now_ns = 0
+        self._seqno = 0
+        self._active = False
+        self._unsent: list[WireEdge] = []
+
+    def now_ns(self) -> int:
+        """Wire time."""
+        return self._now_ns
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Advance wire time; returns at once."""
+        self._now_ns = max(self._now_ns, t_ns)
+
+    def wait_edge(self, limit_s: float) -> Edge | None:
+        """The next rising edge of the trigger line. Raises DeviceError when the hub is gone."""
+        deadline = time.monotonic() + limit_s
+        while (left := deadline - time.monotonic()) > 0:
+            message = self._client.receive(left)
+            if isinstance(message, WireEdge) and message.line == self._trigger and message.value:
+                self.sleep_until(message.t_ns)
+                self._seqno += 1
+                return Edge(message.t_ns, self._seqno)
+        return None
+
+    def set_output(self, active: bool) -> None:
+        """Note the change of all output lines at wire time now; :meth:`flush` sends it."""
+        if active != self._active:
+            self._active = active
+            self._unsent += [WireEdge(self._now_ns, line, int(active)) for line in self._outputs]
+
+    def flush(self) -> None:
+        """Send all changes in one write. Raises DeviceError when the hub is gone."""
+        if self._unsent:
+            unsent, self._unsent = self._unsent, []
+            self._client.send(*unsent)
+
+    def close(self) -> None:
+        """Leave the wires, outputs low."""
+        try:
+            self.set_output(False)
+            self.flush()
+        finally:
+            self._client.close()

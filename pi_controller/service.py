@@ -1,0 +1,171 @@
+"""`polysight-pi run`: puts lines, stage, executor and sockets together, and takes them apart in a safe order."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from pi_controller import realtime
+from pi_controller.executor import Executor
+from pi_controller.journal import JournalFolder, JournalFullError
+from pi_controller.ledger import Ledger
+from pi_controller.lines_gpiod import GpiodLines, load_gpiod
+from pi_controller.lines_gpiomem import GpiomemLines
+from pi_controller.lines_wires import WireLines
+from pi_controller.server import Server
+from pi_controller.stage_driver import StageDriver
+from pi_controller.stage_link import StageNews
+from pi_controller.trigger_lines import TriggerLines
+from pi_controller.trigger_loop import BurstSent, LoopFault, TriggerLoop
+from pi_controller.wiring import check_wiring, read_model
+from shared.config import Instrument
+from shared.errors import DeviceError
+
+END_LIMIT_S = 0.8
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line adds to the rig file, or replaces in it."""
+
+    wires: Path | None = None
+    stage_port: str | None = None
+    journal: Path | None = None
+    command_address: str | None = None
+    event_address: str | None = None
+
+
+def log(text: str) -> None:
+    """One line to the log (stderr)."""
+    sys.stderr.write(f"polysight-pi: {text}\n")
+    sys.stderr.flush()
+
+
+def open_lines(instrument: Instrument, wires: Path | None, model: str | None = None) -> TriggerLines:
+    """GPIO lines, or simulated wires. What this wiring costs on this computer is told in the log.
+
+    Raises
+    ------
+    ConfigError, DeviceError
+        when they cannot be had, or this wiring cannot work on this computer (`model`: what it calls itself).
+    """
+    if wires is not None:
+        return WireLines(wires, instrument.pi)
+    warning = check_wiring(instrument, read_model() if model is None else model)
+    if warning:
+        log(warning)
+    kind = GpiomemLines if instrument.pi.wiring == "gpiomem" else GpiodLines
+    return kind(instrument.pi, load_gpiod())
+
+
+def _prepare_trigger_thread() -> None:
+    realtime.prepare_thread()  # what is not permitted to it was not permitted to the process, which has said so
+
+
+class Service:
+    """The Pi half as a whole.
+
+    Parameters
+    ----------
+    instrument, options
+        The rig, and what replaces parts of it.
+    lines
+        Trigger lines to use instead of opening those of the rig.
+
+    Raises
+    ------
+    ConfigError, DeviceError
+        when an address, a line, the journal or the stage cannot be had. What was opened before is closed again.
+    """
+
+    def __init__(self, instrument: Instrument, options: Options, lines: TriggerLines | None = None) -> None:
+        self._simulated = options.wires is not None
+        pi = instrument.pi
+        with ExitStack() as opened:
+            folder = JournalFolder(options.journal or Path(pi.journal_dir))
+            opened.callback(folder.close)
+            self.server = Server(
+                options.command_address or pi.command_address,
+                options.event_address or pi.event_address,
+                Path(pi.key_dir),
+                pi.heartbeat_ms,
+                "wires" if self._simulated else "gpiod",
+            )
+            opened.callback(self.server.close)
+            self._ledger = Ledger(folder, self.server.publish)
+            opened.callback(self._close_ledger)
+            stage = StageDriver(instrument.stage, options.stage_port or instrument.stage.port, self._post)
+            opened.callback(stage.close)
+            loop = TriggerLoop(
+                lines or open_lines(instrument, options.wires),
+                self._post,
+                (lambda: None) if self._simulated else _prepare_trigger_thread,
+            )
+            opened.callback(loop.stop)
+            self._loop = loop
+            self.executor = Executor(stage, loop, self._ledger, check_width=not pi.one_shot)
+            stage.connect()
+            self._opened = opened.pop_all()
+
+    def _post(self, item: StageNews | BurstSent | LoopFault) -> None:
+        self.executor.post(item)
+
+    def _close_ledger(self) -> None:
+        try:
+            self._ledger.close()
+        except JournalFullError as e:
+            log(str(e))
+
+    def serve(self) -> None:
+        """Serve until :meth:`stop`; then stop the stage and end the row.
+
+        Raises
+        ------
+        DeviceError
+            when a part of this program failed.
+        """
+        self._loop.start()
+        self.executor.start()
+        self.server.run(self.executor)
+        self.executor.stop(END_LIMIT_S)
+        self.server.drain()
+        if self.executor.crash is not None:
+            raise DeviceError(
+                f"the executor failed: {self.executor.crash!r}", "a fault of this program", "report it with its trace"
+            )
+
+    def stop(self) -> None:
+        """End :meth:`serve`. From any thread, or a signal handler."""
+        self.server.stop()
+
+    def close(self) -> None:
+        """Outputs low, everything closed."""
+        self._opened.close()
+
+
+def run(instrument: Instrument, options: Options) -> int:
+    """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout when it serves.
+
+    Raises
+    ------
+    ConfigError, DeviceError
+        when it cannot start.
+    """
+    if options.wires is not None:
+        realtime.die_with_parent(signal.SIGTERM)
+    else:
+        for sentence in realtime.prepare_process():
+            log(sentence)
+    service = Service(instrument, options)
+    try:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: service.stop())
+        sys.stdout.write(f"ready {service.server.command_address}\nevents {service.server.event_address}\n")
+        sys.stdout.flush()
+        service.serve()
+    finally:
+        service.close()
+    return 0

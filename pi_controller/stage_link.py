@@ -1,0 +1,275 @@
+"""The serial link to the stage: numbered lines that are sent again until answered, and bytes that act at once.
+
+A reader thread separates answers to lines from what comes by itself (done, alarm, status, banner), and asks for the
+stage's status at an interval, which is also the heartbeat without which a moving stage stops.
+Protocol: docs/spec/stage-line.md.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import serial
+
+from pi_controller.supervision import StatusWatch
+from shared.errors import DeviceError, ProtocolError
+from shared.faults import StageError, explain
+from shared.stage_line import MAX_LINE_BYTES, MAX_SEQUENCE, PROTOCOL_VERSION, Command, Immediate, Reply
+
+# Opening the port resets an UNO: its boot loader takes up to 2 s before the sketch sends its banner.
+BANNER_LIMIT_S = 3.0
+# Longer than the longest line and its answer take at 115200 baud (14 ms), with room for a busy machine.
+ANSWER_LIMIT_S = 0.5
+TRIES = 4
+SEND_AGAIN = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
+
+
+class StageLostError(DeviceError):
+    """The stage does not answer, or its port is gone."""
+
+
+class StageRefusedError(DeviceError):
+    """The stage answered a line with `error:<number>`."""
+
+    def __init__(self, verb: str, number: int) -> None:
+        what, why, remedy = explain(number)
+        super().__init__(f"stage refused {verb}: error {number}, {what}", why, remedy)
+        self.number = number
+
+
+class StageLost(NamedTuple):
+    """News: the link is dead, and why."""
+
+    reason: str
+
+
+StageNews = Reply | StageLost
+
+
+class StageLink:
+    """One open serial link.
+
+    Parameters
+    ----------
+    port, baud
+        Serial device.
+    news
+        Takes, from the reader thread, every reply that answers no line, every `ok` (it divides what came before a
+        command from what came after), and one :class:`StageLost` when the link dies. Must return at once.
+    silence_s
+        The stage is lost when a status byte stays unanswered for this long.
+    read_slice_s
+        How often the reader looks whether a status byte is due.
+    banner_limit_s
+        How long to wait for the banner of a stage that the opening reset; without one it is greeted all the same.
+
+    Raises
+    ------
+    StageLostError
+        from every method, when the port cannot be opened, or the stage does not answer.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        baud: int,
+        news: Callable[[StageNews], None],
+        silence_s: float = 1.0,
+        read_slice_s: float = 0.05,
+        banner_limit_s: float = BANNER_LIMIT_S,
+    ) -> None:
+        self.port = port
+        self._news = news
+        try:
+            self._serial = serial.Serial(port, baud, timeout=read_slice_s, write_timeout=1.0, exclusive=True)
+        except (OSError, ValueError) as e:  # SerialException is an OSError
+            reason = os.strerror(e.errno) if isinstance(e, OSError) and e.errno else str(e)
+            raise StageLostError(
+                f"stage port {port} cannot be opened: {reason}",
+                "cable unplugged, wrong port, no permission (group dialout), or another program uses it",
+                "check stage.port in instrument.toml and `ls -l /dev/ttyACM* /dev/ttyUSB*`",
+            ) from None
+        self._write_lock = threading.Lock()
+        self._request_lock = threading.Lock()
+        self._answers: queue.SimpleQueue[Reply | None] = queue.SimpleQueue()
+        self._banner: Reply | None = None
+        self._banner_seen = threading.Event()
+        self._greeted = False
+        self._sequence = 0
+        self._last_line = b""
+        self._watch = StatusWatch(silence_s, time.monotonic())
+        self._lost = ""
+        self._closing = False
+        self.bad_lines = 0
+        self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
+        self._reader.start()
+        try:
+            self._greet(banner_limit_s)
+        except DeviceError:
+            self.close()
+            raise
+
+    def _greet(self, banner_limit_s: float) -> None:
+        self._banner_seen.wait(banner_limit_s)
+        self._write(b"\n")  # whatever half a line came before is forgotten
+        hello = self.request("HELLO")
+        fields = {**(self._banner.fields if self._banner else {}), **hello.fields}
+        self.firmware, self.steps_per_mm = fields.get("fw", ""), fields.get("steps", "")
+        if fields.get("proto", str(PROTOCOL_VERSION)) != str(PROTOCOL_VERSION):
+            raise StageLostError(
+                f"stage at {self.port} speaks protocol {fields['proto']}, this program speaks {PROTOCOL_VERSION}",
+                "firmware and Pi program are of different releases",
+                "flash the sketch of this release",
+            )
+        self._greeted = True
+
+    def request(self, verb: str, *args: int) -> Reply:
+        """Send a line, again with the same sequence number when it is lost or damaged, until it is answered.
+
+        Raises
+        ------
+        StageRefusedError
+            when the stage refuses it.
+        StageLostError
+            when it does not answer.
+        """
+        with self._request_lock:
+            answer = self._exchange(verb, args)
+            if answer.number == StageError.SEQUENCE and verb != "HELLO":
+                self._exchange("HELLO", ())
+                answer = self._exchange(verb, args)
+        if answer.kind == "error":
+            raise StageRefusedError(verb, answer.number)
+        return answer
+
+    def _exchange(self, verb: str, args: tuple[int, ...]) -> Reply:
+        sequence = self._sequence
+        self._sequence = sequence + 1 if sequence < MAX_SEQUENCE else 0
+        self._last_line = line = Command(sequence, verb, args).encode()
+        while not self._answers.empty():
+            self._answers.get()
+        for _ in range(TRIES):
+            self._write(line)
+            answer = self._answer(sequence)
+            if answer is not None and answer.number not in SEND_AGAIN:
+                return answer
+        raise StageLostError(
+            f"stage at {self.port} does not answer {verb}" + (f": {self._lost}" if self._lost else ""),
+            "cable unplugged, board without the sketch, or wrong port",
+            "check the USB cable, stage.port and stage.baud; `make flash` puts the sketch on the board",
+        )
+
+    def _answer(self, sequence: int) -> Reply | None:
+        deadline = time.monotonic() + ANSWER_LIMIT_S
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                answer = self._answers.get(timeout=left)
+            except queue.Empty:
+                return None
+            if answer is None:
+                return None
+            if answer.sequence == sequence or (answer.kind == "error" and answer.sequence is None):
+                return answer
+        return None
+
+    def send_byte(self, byte: Immediate) -> None:
+        """Send an immediate byte. Raises StageLostError when the port is gone."""
+        self._write(bytes([byte]))
+
+    def repeat(self) -> None:
+        """Send the last line again: the stage repeats its answer, and how the motion ended, without moving.
+
+        Raises StageLostError when the port is gone.
+        """
+        self._write(self._last_line)
+
+    def ask_status_every(self, interval_s: float) -> None:
+        """Ask for the status from now on: the heartbeat of a moving stage. 0 stops asking."""
+        self._watch.interval_s = interval_s
+
+    @property
+    def lost(self) -> str:
+        """Why the link is dead; empty while it lives."""
+        return self._lost
+
+    def close(self) -> None:
+        """Close the port and end the reader."""
+        self._closing = True
+        if self._serial.is_open:
+            self._serial.cancel_read()
+        if threading.current_thread() is not self._reader:
+            self._reader.join(1.0)
+        self._serial.close()
+
+    def _write(self, data: bytes) -> None:
+        if self._lost:
+            raise StageLostError(f"stage at {self.port} is lost: {self._lost}", "see above", "polysight-pi home")
+        try:
+            with self._write_lock:
+                self._serial.write(data)
+        except OSError as e:
+            self._die(f"writing failed: {e}")
+            raise StageLostError(
+                f"stage at {self.port} is lost: {e}", "cable unplugged, or the board lost power", "check the USB cable"
+            ) from None
+
+    def _die(self, reason: str) -> None:
+        if self._lost or self._closing:
+            return
+        self._lost = reason
+        self._answers.put(None)
+        if self._greeted:
+            self._news(StageLost(f"stage at {self.port}: {reason}"))
+
+    def _read(self) -> None:
+        buffer = b""
+        while not self._closing and not self._lost:
+            try:
+                data = self._serial.read(1)
+                data += self._serial.read(self._serial.in_waiting)
+            except (OSError, TypeError) as e:  # pyserial raises TypeError when the port is closed under a read
+                self._die(f"reading failed: {e}")
+                return
+            now = time.monotonic()
+            if data:
+                self._watch.heard()
+                *lines, buffer = (buffer + data).split(b"\n")
+                for line in lines:
+                    self._take(line + b"\n")
+                buffer = buffer[-MAX_LINE_BYTES:]
+            elif (silent_s := self._watch.silent_s(now)) and not self._unread():
+                self._die(f"silent for {silent_s:.1f} s")
+                return
+            if self._watch.is_due(now):
+                try:
+                    self._write(bytes([Immediate.STATUS]))
+                except StageLostError:
+                    return
+
+    def _unread(self) -> bool:
+        """Whether something has come since the last look: it may have been us who had no turn."""
+        try:
+            return self._serial.in_waiting > 0
+        except (OSError, TypeError):
+            return False
+
+    def _take(self, line: bytes) -> None:
+        try:
+            reply = Reply.decode(line.replace(b"\r\n", b"\n"))
+        except ProtocolError:
+            self.bad_lines += 1  # the line it may have answered is sent again
+            return
+        if reply.kind in ("ok", "error"):
+            self._answers.put(reply)
+            if reply.kind == "ok" and self._greeted:
+                self._news(reply)
+        elif reply.kind == "banner" and not self._greeted:
+            self._banner = reply
+            self._banner_seen.set()
+        elif self._greeted:
+            self._news(reply)

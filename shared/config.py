@@ -1,0 +1,425 @@
+"""The checked rig file `instrument.toml`: one typed declaration for every number of the instrument.
+
+Unknown keys, wrong types and broken rules are refused with the file, the key, the value and the rule.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+
+from shared.errors import ConfigError
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
+Vector = tuple[float, float, float]
+T = TypeVar("T")
+HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
+DEBOUNCE_TICKS_US = 5_000
+HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
+
+
+class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of the rig file: frozen, unknown keys refused."""
+
+
+def _require(ok: bool, rule: str) -> None:
+    if not ok:
+        raise ValueError(rule)
+
+
+class Chirp(_Section, frozen=True):
+    """FMCW chirp and ADC window (AWR2243 profile)."""
+
+    start_hz: Positive
+    slope_hz_per_s: Positive
+    adc_start_us: NonNegative
+    samples: Count
+    sample_rate_hz: Positive
+    ramp_end_us: Positive
+    if_mode: Literal["complex1x", "complex2x"] = "complex1x"
+    hpf1_khz: float = 175.0
+    hpf2_khz: float = 350.0
+    linear_samples: tuple[int, int] = (0, 192)
+
+    def __post_init__(self) -> None:
+        window_us = self.samples / self.sample_rate_hz * 1e6
+        _require(
+            self.adc_start_us + window_us <= self.ramp_end_us,
+            f"ADC window {self.adc_start_us} + {window_us:.2f} us must end inside the ramp of {self.ramp_end_us} us",
+        )
+        top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
+        _require(self.start_hz >= 76e9 and top <= 81.1e9, f"sweep {self.start_hz:.4g}..{top:.5g} Hz must be 76..81 GHz")
+        _require(self.hpf1_khz in HPF_FIRST_KHZ, f"hpf1_khz must be one of {HPF_FIRST_KHZ}")
+        _require(self.hpf2_khz in HPF_SECOND_KHZ, f"hpf2_khz must be one of {HPF_SECOND_KHZ}")
+        a, b = self.linear_samples
+        _require(0 <= a < b <= self.samples, f"linear_samples must be a range inside 0..{self.samples}")
+
+    @property
+    def first_sample_hz(self) -> float:
+        """Transmit frequency at the first ADC sample."""
+        return self.start_hz + self.slope_hz_per_s * self.adc_start_us * 1e-6
+
+    @property
+    def hz_per_sample(self) -> float:
+        """Transmit frequency step from one ADC sample to the next."""
+        return self.slope_hz_per_s / self.sample_rate_hz
+
+    @property
+    def swept_hz(self) -> float:
+        """Bandwidth swept within the ADC window."""
+        return self.hz_per_sample * self.samples
+
+
+class Burst(_Section, frozen=True):
+    """SYNC_IN pulses of one position; each starts one frame of one chirp."""
+
+    pulses: Count
+    period_us: Positive
+    width_us: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        _require(self.period_us >= 300.0, "period_us must be at least 300 us (shortest frame period of the AWR2243)")
+        _require(0.025 <= self.width_us <= 4.0, "width_us must be 0.025..4 us (SYNC_IN pulse of the AWR2243)")
+
+
+class Grid(_Section, frozen=True):
+    """Serpentine raster of stage positions."""
+
+    columns: Count
+    rows: Count
+    step_x_mm: Positive
+    step_y_mm: Positive
+
+
+class Stage(_Section, frozen=True):
+    """Motion stage and its serial link."""
+
+    port: str
+    baud: Count = 115200
+    steps_per_mm: Positive = 200.0
+    speed_mm_s: Positive = 20.0
+    travel_speed_mm_s: Positive = 40.0
+    accel_mm_s2: Positive = 200.0
+    heartbeat_ms: Count = 500
+    trigger_width_us: Count = 20
+    travel_x_mm: Positive = 800.0
+    travel_y_mm: Positive = 500.0
+    centre_x_mm: NonNegative = 400.0
+    centre_y_mm: NonNegative = 250.0
+    backlash_mm: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        _require(self.centre_x_mm <= self.travel_x_mm, "centre_x_mm must lie within travel_x_mm")
+        _require(self.centre_y_mm <= self.travel_y_mm, "centre_y_mm must lie within travel_y_mm")
+
+
+class Pi(_Section, frozen=True):
+    """Raspberry Pi: lines, sockets, journal."""
+
+    gpio_chip: str = "pinctrl-bcm2711"
+    trigger_in: GpioLine = 26
+    sync_out: tuple[GpioLine, ...] = (22,)
+    wiring: Literal["fanout", "lines", "gpiomem"] = "fanout"
+    one_shot: bool = False  # a hardware one-shot makes the width of the pulses, so that the line's own does not matter
+    command_address: str = "tcp://127.0.0.1:5601"
+    event_address: str = "tcp://127.0.0.1:5602"
+    journal_dir: str = "journal"
+    key_dir: str = "keys"
+    heartbeat_ms: Count = 500
+    trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
+    trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
+    gpiomem: str = "/dev/gpiomem"
+    host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # how often the host says that it lives; 0: never
+
+    def __post_init__(self) -> None:
+        _require(len(self.sync_out) > 0, "sync_out needs at least one line")
+        _require(self.trigger_in not in self.sync_out, "trigger_in must not be one of sync_out")
+        _require(
+            self.wiring != "fanout" or len(self.sync_out) == 1, 'wiring = "fanout" drives exactly one line in sync_out'
+        )
+        _require(
+            self.wiring != "gpiomem" or max(self.sync_out) < 32, 'wiring = "gpiomem" drives lines 0..31 of one register'
+        )
+
+
+class MountStep(_Section, frozen=True):
+    """One step of a mount: a shift, or a turn about an axis of the rig."""
+
+    shift_mm: Vector | None = None
+    turn_deg: float | None = None
+    about: Literal["x", "y", "z"] | None = None
+
+    def __post_init__(self) -> None:
+        _require(
+            (self.shift_mm is not None) != (self.turn_deg is not None and self.about is not None),
+            "a mount step is either { shift_mm = [x, y, z] } or { turn_deg = a, about = axis }",
+        )
+
+
+class Antennas(_Section, frozen=True):
+    """Antenna positions on one board, board frame, millimetres from RX1."""
+
+    rx_mm: tuple[Vector, ...]
+    tx_mm: tuple[Vector, ...]
+
+
+class Board(_Section, frozen=True):
+    """One radar board and its capture card."""
+
+    name: str
+    role: Literal["transmit", "receive_h", "receive_v"]
+    card_address: str
+    host_address: str
+    command_port: Port
+    data_port: Port
+    mount: tuple[MountStep, ...]
+    record: bool = True
+    tx_antenna: Annotated[int, msgspec.Meta(ge=0)] = 1
+    start_offset_hz: float = 0.0
+
+
+class Card(_Section, frozen=True):
+    """DCA1000 settings common to all boards."""
+
+    packet_bytes: Annotated[int, msgspec.Meta(ge=24, le=1470)] = 1470
+    packet_delay_us: NonNegative = 25.0
+    receive_buffer_bytes: Count = 8 << 20
+
+
+class NativeRadar(_Section, frozen=True):
+    """One board under `radar.control = "native"`.
+
+    `ldo_bypass` can destroy a board with 1.3 V on its RF supplies: it needs the board's own USB serial number, again,
+    in `ldo_bypass_acknowledged`.
+    """
+
+    usb_serial: Annotated[str, msgspec.Meta(min_length=1)]
+    ldo_bypass: bool = False
+    ldo_bypass_acknowledged: str = ""
+
+
+class Radar(_Section, frozen=True):
+    """How the radars are made to wait for the pulses of a row.
+
+    `endless`: started once, with frames without end; nothing is needed. `line_server`: each board's control server is
+    sent a line before each row; `servers` holds its `address:port` by board name. `native`: this host configures the
+    boards over USB; `native` holds their serial numbers by board name, the rest is for all of them.
+    """
+
+    control: Literal["endless", "line_server", "native"] = "endless"
+    servers: dict[str, Annotated[str, msgspec.Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")]] = {}
+    native: dict[str, NativeRadar] = {}
+    idle_us: Positive = 100.0  # before each chirp
+    rx_gain_db: int = 30
+    rf_gain_target_db: Literal[30, 33, 36] = 30
+    tx_backoff_db: Annotated[int, msgspec.Meta(ge=0)] = 0
+
+    def __post_init__(self) -> None:
+        for board, address in self.servers.items():
+            port = int(address.rpartition(":")[2])
+            _require(0 < port <= 65535, f"port {port} of radar.servers.{board} is outside 1..65535")
+        serials = [b.usb_serial for b in self.native.values()]
+        _require(len(set(serials)) == len(serials), f"each of radar.native needs its own usb_serial, not {serials}")
+
+
+class Geometry(_Section, frozen=True):
+    """Where the object plane is."""
+
+    object_distance_mm: Positive
+
+
+class Image(_Section, frozen=True):
+    """Image grid, centred on the specular midpoint of TX and H."""
+
+    columns: Count = 150
+    rows: Count = 150
+    pixel_mm: Positive = 2.0
+    apodisation: Literal["none", "kaiser", "taylor"] = "kaiser"
+
+
+class Polarimetry(_Section, frozen=True):
+    """Cross-polar leakage of the receivers as [real, imaginary] amplitude, and the Gaussian filter against speckle."""
+
+    leakage_h: tuple[float, float] = (0.0, 0.0)
+    leakage_v: tuple[float, float] = (0.0, 0.0)
+    smooth_px: NonNegative = 1.5
+
+
+class Limits(_Section, frozen=True):
+    """How much a scan puts up with."""
+
+    row_retakes: Annotated[int, msgspec.Meta(ge=0)] = 2
+    command_timeout_s: Positive = 5.0
+    end_of_record_s: Positive = 3.0
+    free_disk_bytes: Annotated[int, msgspec.Meta(ge=0)] = 1 << 30
+    rows_waiting: Count = 8  # rows that may wait to be processed before the next one is not begun
+
+
+class Instrument(_Section, frozen=True):
+    """The whole rig file."""
+
+    name: str
+    chirp: Chirp
+    burst: Burst
+    grid: Grid
+    stage: Stage
+    pi: Pi
+    antennas: Antennas
+    boards: tuple[Board, ...]
+    geometry: Geometry
+    card: Card = Card()
+    radar: Radar = Radar()
+    image: Image = Image()
+    polarimetry: Polarimetry = Polarimetry()
+    limits: Limits = Limits()
+
+    def __post_init__(self) -> None:
+        for role in ("transmit", "receive_h", "receive_v"):
+            n = sum(b.role == role for b in self.boards)
+            _require(n == 1, f'boards must hold exactly one with role = "{role}", found {n}')
+        # Where the chip does not debounce (no Pi's does), the kernel looks at the level some ticks after the edge.
+        _require(
+            self.pi.trigger_debounce_us == 0
+            or self.stage.trigger_width_us >= self.pi.trigger_debounce_us + DEBOUNCE_TICKS_US,
+            f"pi.trigger_debounce_us needs stage.trigger_width_us of at least {DEBOUNCE_TICKS_US} us more, or it"
+            " swallows every trigger; 0 switches it off",
+        )
+        names = [b.name for b in self.boards]
+        _require(len(set(names)) == len(names), f"board names must differ: {names}")
+        hosts = [(b.host_address, b.data_port) for b in self.boards]
+        _require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")
+        unknown = sorted(set(self.radar.servers) - set(names))
+        _require(not unknown, f"radar.servers names no board: {unknown}; the boards are {names}")
+        without = [n for n in names if n not in self.radar.servers]
+        _require(
+            self.radar.control != "line_server" or not without,
+            f'radar.control = "line_server" needs one of radar.servers for every board, none for {without}',
+        )
+        _require(
+            self.radar.control != "native" or set(self.radar.native) == set(names),
+            f'radar.control = "native" needs radar.native for each of the boards {names}, not {[*self.radar.native]}',
+        )
+        _require(self.transmitter.tx_antenna < len(self.antennas.tx_mm), "tx_antenna is not one of antennas.tx_mm")
+        for axis, n, step, centre, travel in (
+            ("x", self.grid.columns, self.grid.step_x_mm, self.stage.centre_x_mm, self.stage.travel_x_mm),
+            ("y", self.grid.rows, self.grid.step_y_mm, self.stage.centre_y_mm, self.stage.travel_y_mm),
+        ):
+            half = (n - 1) / 2 * step
+            _require(
+                half <= centre and centre + half <= travel,
+                f"grid of {n} x {step} mm in {axis} does not fit the travel 0..{travel} mm around centre {centre} mm",
+            )
+
+    @property
+    def transmitter(self) -> Board:
+        """The board that transmits."""
+        return self.by_role("transmit")
+
+    @property
+    def receivers(self) -> tuple[Board, Board]:
+        """The two boards that make the images: H (s-polarised) first, then V (p-polarised)."""
+        return self.by_role("receive_h"), self.by_role("receive_v")
+
+    @property
+    def recorded(self) -> tuple[Board, ...]:
+        """Boards whose data is recorded."""
+        return tuple(b for b in self.boards if b.record)
+
+    def by_role(self, role: str) -> Board:
+        """The board with this role."""
+        return next(b for b in self.boards if b.role == role)
+
+    def by_name(self, name: str) -> Board:
+        """The board with this name. Raises KeyError when there is none."""
+        for b in self.boards:
+            if b.name == name:
+                return b
+        raise KeyError(name)
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of one frame of one chirp: samples x 4 RX x (I, Q) x int16."""
+        return self.chirp.samples * len(self.antennas.rx_mm) * 2 * 2
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes one board sends in one complete row."""
+        return self.grid.columns * self.burst.pulses * self.frame_bytes
+
+
+def _lookup(data: Any, path: str) -> str:
+    """The value a msgspec error path such as `$.boards[0].name` points at, for the message; '' when absent."""
+    node = data
+    for part in path.removeprefix("$").replace("[", ".[").split("."):
+        if not part:
+            continue
+        try:
+            node = node[int(part[1:-1])] if part.startswith("[") else node[part]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return ""
+    return "" if isinstance(node, dict | list) else repr(node)
+
+
+def decode(raw: dict[str, Any], kind: type[T], source: str) -> T:
+    """Check a parsed TOML or JSON table against a typed declaration.
+
+    Raises
+    ------
+    ConfigError
+        naming `source`, the key, its value and the rule that is broken.
+    """
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as e:
+        rule, _, path = str(e).partition(" - at `")
+        path = path.rstrip("`") or "$"
+        value = _lookup(raw, path)
+        key = path.removeprefix("$").lstrip(".") or "(top level)"
+        raise ConfigError(
+            f"{source}: {key}{' = ' + value if value else ''}: {rule}",
+            "the file does not follow its declaration",
+            f"correct {key} in {source}; instrument.toml in the repository shows every key with its meaning",
+        ) from None
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file. Raises ConfigError when it is absent, unreadable or not TOML."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file", "the path is wrong", "give the path of a TOML file") from None
+    except (OSError, UnicodeDecodeError) as e:
+        raise ConfigError(f"{path}: cannot be read: {e}", "not a readable text file", "check the path") from None
+    except tomllib.TOMLDecodeError as e:
+        raise ConfigError(f"{path}: not valid TOML: {e}", "a typing error", "correct that line") from None
+
+
+def load_instrument(path: Path) -> Instrument:
+    """Read and check a rig file.
+
+    Raises
+    ------
+    ConfigError
+        naming file, key, value and rule.
+    """
+    return decode(read_toml(path), Instrument, str(path))
+
+
+def to_builtins(config: Any) -> dict[str, Any]:
+    """A configuration as plain dicts and lists, None left out, for JSON, TOML or msgpack."""
+    return _without_none(msgspec.to_builtins(config))
+
+
+def _without_none(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {k: _without_none(v) for k, v in node.items() if v is not None}
+    if isinstance(node, list | tuple):
+        return [_without_none(v) for v in node]
+    return node

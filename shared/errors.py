@@ -1,0 +1,65 @@
+"""Errors that a person can act on: what happened, the likely cause, and what to do."""
+
+from __future__ import annotations
+
+
+class PolysightError(Exception):
+    """Base of every error this project raises on purpose.
+
+    Parameters
+    ----------
+    what
+        What happened, naming the file, address, line or value.
+    why
+        The likely cause.
+    remedy
+        What to do next.
+    """
+
+    exit_status = 1
+
+    def __init__(self, what: str, why: str = "", remedy: str = "") -> None:
+        super().__init__(what)
+        self.what, self.why, self.remedy = what, why, remedy
+
+    def __str__(self) -> str:
+        parts = [self.what]
+        if self.why:
+            parts.append(f"why: {self.why}")
+        if self.remedy:
+            parts.append(f"do: {self.remedy}")
+        return "\n  ".join(parts)
+
+
+class ConfigError(PolysightError):
+    """A configuration file has a wrong, missing or unknown key."""
+
+    exit_status = 2
+
+
+class DataError(PolysightError):
+    """A file or folder is not what it claims to be, or is damaged."""
+
+    exit_status = 3
+
+
+class ProtocolError(PolysightError):
+    """Bytes that do not follow one of the protocols."""
+
+    exit_status = 4
+
+
+class VersionError(ProtocolError):
+    """The peer speaks another major version."""
+
+
+class DeviceError(PolysightError):
+    """A device, peer or network hop does not do what it should."""
+
+    exit_status = 5
+
+
+class ScanError(PolysightError):
+    """A scan could not be carried out as planned."""
+
+    exit_status = 6

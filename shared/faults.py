@@ -1,0 +1,216 @@
+"""The one table of numbered faults: stage errors 1..99 (firmware and Python get them from here), Pi faults from 100.
+
+`python -m shared.faults` prints the C++ header `arduino_stage/stage_errors.h`.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+
+class Explanation(NamedTuple):
+    """What a number means, its likely cause, and what to do."""
+
+    what: str
+    why: str
+    remedy: str
+
+
+class StageError(IntEnum):
+    """Numbers behind `error:N` and `alarm:N` on the stage line."""
+
+    BAD_CRC = 1
+    MALFORMED = 2
+    LINE_TOO_LONG = 3
+    UNKNOWN_COMMAND = 4
+    ARGUMENT_COUNT = 5
+    OUT_OF_RANGE = 6
+    BUSY = 7
+    NOT_HOMED = 8
+    SOFT_LIMIT = 9
+    IN_ALARM = 10
+    HEARTBEAT_LOST = 11
+    LIMIT_SWITCH = 12
+    HOMING_FAILED = 13
+    EMERGENCY_STOP = 14
+    STOPPED = 15
+    TOO_FAST = 16
+    NO_RUN_UP = 17
+    SEQUENCE = 18
+    DISABLED = 19
+
+
+class PiFault(IntEnum):
+    """Numbers in fault events and refusals of the Pi."""
+
+    STAGE_LOST = 101
+    STAGE_ALARM = 102
+    EDGE_LOST = 103
+    EDGE_DURING_BURST = 104
+    PULSE_TOO_LONG = 105
+    PERIOD_TOO_SHORT = 106
+    TRIGGER_LINE_LOST = 107
+    HOST_LOST = 108
+    JOURNAL_FULL = 109
+    POINTS_MISMATCH = 110
+    NOT_READY = 111
+    BAD_REQUEST = 112
+    ABORTED = 113
+    VERSION = 114
+
+
+EXPLANATIONS: dict[int, Explanation] = {
+    StageError.BAD_CRC: Explanation(
+        "the line's checksum is wrong",
+        "noise on the serial line, or a lost byte",
+        "sent again by itself; check the USB cable if it stays",
+    ),
+    StageError.MALFORMED: Explanation(
+        "the line is not of the protocol's form",
+        "another program talks to the stage",
+        "close other programs on this port",
+    ),
+    StageError.LINE_TOO_LONG: Explanation(
+        "the line is longer than the stage accepts", "a lost line end", "sent again by itself"
+    ),
+    StageError.UNKNOWN_COMMAND: Explanation(
+        "the stage does not know this command",
+        "firmware and host are of different versions",
+        "flash the sketch of this release",
+    ),
+    StageError.ARGUMENT_COUNT: Explanation(
+        "wrong number of arguments", "firmware and host are of different versions", "flash the sketch of this release"
+    ),
+    StageError.OUT_OF_RANGE: Explanation(
+        "an argument is out of range", "the plan does not fit the stage", "check [grid] and [stage] in instrument.toml"
+    ),
+    StageError.BUSY: Explanation(
+        "the stage is moving", "a command was sent before the last one ended", "wait, or stop the stage first"
+    ),
+    StageError.NOT_HOMED: Explanation(
+        "the stage does not know where it is", "it was switched on, or stopped hard", "polysight-pi home"
+    ),
+    StageError.SOFT_LIMIT: Explanation(
+        "the target is outside the travel",
+        "grid, centre or travel are wrong",
+        "check [grid] and [stage] in instrument.toml",
+    ),
+    StageError.IN_ALARM: Explanation(
+        "an alarm is latched", "an earlier fault", "remove its cause, then polysight-pi home"
+    ),
+    StageError.HEARTBEAT_LOST: Explanation(
+        "the Pi was silent while the stage moved",
+        "the Pi program died or was starved",
+        "look at the Pi's log, then polysight-pi home",
+    ),
+    StageError.LIMIT_SWITCH: Explanation(
+        "a limit switch was hit", "lost steps, or a wrong centre", "move the stage free by hand, then polysight-pi home"
+    ),
+    StageError.HOMING_FAILED: Explanation(
+        "homing did not find the switch", "switch, wiring or direction", "check the switch and board.h"
+    ),
+    StageError.EMERGENCY_STOP: Explanation(
+        "the emergency stop is pressed", "somebody pressed it", "release it, then polysight-pi home"
+    ),
+    StageError.STOPPED: Explanation(
+        "the stage was stopped by command", "abort", "polysight-pi home, then resume the scan"
+    ),
+    StageError.TOO_FAST: Explanation(
+        "the speed is above what the firmware can step", "stage.speed_mm_s x steps_per_mm", "lower the speed"
+    ),
+    StageError.NO_RUN_UP: Explanation(
+        "no room to accelerate before the first point",
+        "the grid reaches the end of the travel",
+        "narrow the grid, or raise accel_mm_s2",
+    ),
+    StageError.SEQUENCE: Explanation("the sequence number is not the next one", "a line was lost", "say hello again"),
+    StageError.DISABLED: Explanation("the motors are switched off", "motor enable is off", "enable the motors"),
+    PiFault.STAGE_LOST: Explanation(
+        "the stage does not answer",
+        "cable unplugged, board reset or wrong port",
+        "check the USB cable and stage.port, then polysight-pi home",
+    ),
+    PiFault.STAGE_ALARM: Explanation(
+        "the stage raised an alarm", "see the stage error beside this fault", "remove its cause, then polysight-pi home"
+    ),
+    PiFault.EDGE_LOST: Explanation(
+        "a trigger edge was lost",
+        "the kernel's edge buffer ran over, or a glitch",
+        "the row is taken again; check the load of the Pi",
+    ),
+    PiFault.EDGE_DURING_BURST: Explanation(
+        "the next trigger came before the burst had ended",
+        "stage too fast for burst x period",
+        "lower stage.speed_mm_s or burst.pulses",
+    ),
+    PiFault.PULSE_TOO_LONG: Explanation(
+        "a SYNC_IN pulse may have been longer than 4 us",
+        "the Pi was interrupted inside a pulse",
+        "fit a one-shot after the line; see docs/how-to/wiring.md",
+    ),
+    PiFault.PERIOD_TOO_SHORT: Explanation(
+        "two SYNC_IN pulses came closer than the radar allows",
+        "the Pi was late and caught up",
+        "the row is taken again; check the load of the Pi",
+    ),
+    PiFault.TRIGGER_LINE_LOST: Explanation(
+        "the trigger line is gone", "another program took the line, or the chip vanished", "polysight-pi check"
+    ),
+    PiFault.HOST_LOST: Explanation(
+        "the host is silent", "host program or network down", "polysight resume SCAN on the host"
+    ),
+    PiFault.JOURNAL_FULL: Explanation(
+        "the journal cannot be written", "disk full or read-only", "free space on the Pi"
+    ),
+    PiFault.POINTS_MISMATCH: Explanation(
+        "points passed, edges seen and bursts sent differ",
+        "a lost or spurious trigger edge",
+        "the row is taken again; check the trigger wire",
+    ),
+    PiFault.NOT_READY: Explanation(
+        "the Pi is not ready for this command",
+        "see the state beside this refusal",
+        "home the stage, end the running row, or clear the fault first",
+    ),
+    PiFault.BAD_REQUEST: Explanation(
+        "the request cannot be carried out",
+        "host and Pi have different rig files",
+        "use the same instrument.toml on both",
+    ),
+    PiFault.ABORTED: Explanation("the row was aborted", "asked for by the host or a signal", "resume the scan"),
+    PiFault.VERSION: Explanation(
+        "the peer speaks another major version",
+        "host and Pi are of different releases",
+        "install the same release on both",
+    ),
+}
+
+
+def explain(number: int) -> Explanation:
+    """The table's entry, or one that says that the number is unknown."""
+    return EXPLANATIONS.get(
+        number, Explanation(f"unknown fault {number}", "a newer peer", "install the same release everywhere")
+    )
+
+
+def c_header() -> str:
+    """The stage errors as a C++ header, so that firmware and Python share one table."""
+    lines = [
+        "// Generated by `python -m shared.faults`; do not edit. The table is shared/faults.py.",
+        "#pragma once",
+        "#include <stdint.h>",
+        "",
+        "enum StageError : uint8_t {",
+        "  ERROR_NONE = 0,",
+        *(f"  ERROR_{e.name} = {int(e)},  // {EXPLANATIONS[e].what}" for e in StageError),
+        "};",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    import sys
+
+    sys.stdout.write(c_header())

@@ -1,0 +1,328 @@
+"""Every message between Pi and host, typed, packed with msgpack, checked on decode.
+
+A message is a msgpack map. `type` names it, `version` is "major.minor": another major version is refused by name. New
+fields have defaults and go last, so that old and new programs of one major version understand each other.
+Specification: docs/spec/wire.md.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgpack
+import msgspec
+
+from shared.errors import ProtocolError, VersionError
+from shared.raster import RasterPlan, Row
+
+WIRE_VERSION = "1.0"
+Natural = Annotated[int, msgspec.Meta(ge=0)]
+RowStatus = Literal["done", "aborted", "fault"]
+ExitStatus = Literal["success", "abort", "fail"]
+State = Literal["idle", "homing", "homed", "ready", "running", "held", "done", "fault"]
+
+
+class _Message(msgspec.Struct, frozen=True, tag_field="type", tag=True, kw_only=True):
+    version: str = WIRE_VERSION
+
+
+# --- events: Pi -> host, PUB ------------------------------------------------------------------------------------------
+
+
+class Event(_Message, frozen=True, kw_only=True):
+    """What every event carries.
+
+    `seq` counts the journalled events of one `scan_id` from 1 without gaps. Heartbeats and stage status are not
+    journalled: they carry the `seq` of the last journalled event, so that a subscriber notices a lost last event.
+    """
+
+    scan_id: str
+    seq: Natural
+    t_mono_ns: int
+
+
+class RunStarted(Event, frozen=True, kw_only=True):
+    """A run was begun or taken up again. The journal lacks the `lost` events before this one; the host has them."""
+
+    plan: RasterPlan
+    resumed: bool = False
+    lost: Natural = 0
+
+
+class RunStopped(Event, frozen=True, kw_only=True):
+    """A run was ended by the host."""
+
+    exit_status: ExitStatus
+    reason: str = ""
+
+
+class RowStarted(Event, frozen=True, kw_only=True):
+    """The stage was told to run a row; `take` counts attempts at this row from 1."""
+
+    row: Row
+    take: Annotated[int, msgspec.Meta(ge=1)]
+
+
+class RowFinished(Event, frozen=True, kw_only=True):
+    """A row ended. `points` by the stage's count, `edges` seen and `bursts` and `pulses` sent by the Pi."""
+
+    row_index: Natural
+    take: int
+    status: RowStatus
+    points: Natural
+    edges: Natural
+    bursts: Natural
+    pulses: Natural
+    fault: int = 0
+    reason: str = ""
+
+
+class Capture(Event, frozen=True, kw_only=True):
+    """One trigger edge and its burst. Times are the Pi's monotonic clock.
+
+    `width_max_ns` is the longest time any pulse may have been high (upper bound), `jitter_ns` the largest deviation of
+    a rising edge from its deadline.
+    """
+
+    row_index: Natural
+    take: int
+    point: Natural
+    column: Natural
+    edge_ns: int
+    first_pulse_ns: int
+    last_pulse_ns: int
+    pulses: Natural
+    width_max_ns: Natural
+    jitter_ns: Natural
+
+
+class StageStatus(Event, frozen=True, kw_only=True):
+    """Where the stage is, in stage millimetres. Not journalled."""
+
+    state: str
+    x_mm: float
+    y_mm: float
+    points: Natural = 0
+    alarm: int = 0
+
+
+class Heartbeat(Event, frozen=True, kw_only=True):
+    """The Pi is alive. Not journalled."""
+
+    state: State
+    period_ms: int
+
+
+class Fault(Event, frozen=True, kw_only=True):
+    """Something went wrong; the number is in shared/faults.py. The first fault wins and is kept."""
+
+    number: int
+    what: str
+    why: str = ""
+    remedy: str = ""
+
+
+AnyEvent = RunStarted | RunStopped | RowStarted | RowFinished | Capture | StageStatus | Heartbeat | Fault
+JOURNALLED = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault)
+
+# --- commands: host -> Pi, REQ/REP ------------------------------------------------------------------------------------
+
+
+class Command(_Message, frozen=True, kw_only=True):
+    """Every command gets exactly one reply."""
+
+
+class Hello(Command, frozen=True, kw_only=True):
+    """Who is there? Answered with HelloReply in any state."""
+
+    host_release: str = ""
+
+
+class BeginRun(Command, frozen=True, kw_only=True):
+    """Begin a run, or take up the one with this id again after either side died.
+
+    `last_seq` is the newest event of it that the host has: the sequence goes on behind it, even when the Pi's journal
+    was lost. `heartbeat_ms`: the host promises an `Alive` so often; 0: it promises nothing.
+    """
+
+    scan_id: Annotated[str, msgspec.Meta(min_length=1, max_length=120, pattern=r"^[A-Za-z0-9._-]+$")]
+    plan: RasterPlan
+    pulses: Annotated[int, msgspec.Meta(ge=1)]
+    period_us: float
+    width_us: float
+    speed_mm_s: float
+    last_seq: Annotated[int, msgspec.Meta(ge=0, lt=2**31)] = 0
+    heartbeat_ms: Natural = 0
+
+
+class EndRun(Command, frozen=True, kw_only=True):
+    """End the run. Answered with Accepted after RunStopped is journalled."""
+
+    scan_id: str
+    exit_status: ExitStatus
+    reason: str = ""
+
+
+class Alive(Command, frozen=True, kw_only=True):
+    """The host of this run lives. A row ends with fault 108 when four of the promised heartbeats fail to come."""
+
+    scan_id: str
+
+
+class Home(Command, frozen=True, kw_only=True):
+    """Home the stage. Accepted at once; the state is `homing`, then `ready`."""
+
+
+class RunRow(Command, frozen=True, kw_only=True):
+    """Run one row of the plan. Accepted at once; RowFinished tells how it ended."""
+
+    scan_id: str
+    row_index: Natural
+    take: Annotated[int, msgspec.Meta(ge=1)]
+
+
+class Hold(Command, frozen=True, kw_only=True):
+    """Decelerate and wait."""
+
+
+class Resume(Command, frozen=True, kw_only=True):
+    """Go on after a hold, on the exact grid."""
+
+
+class Abort(Command, frozen=True, kw_only=True):
+    """Stop the row now. RowFinished with status `aborted` follows when a row was running."""
+
+    reason: str = ""
+
+
+class Status(Command, frozen=True, kw_only=True):
+    """Answered with StatusReply in any state."""
+
+
+class Replay(Command, frozen=True, kw_only=True):
+    """Journalled events of a scan from `from_seq` on, at most `limit` of them."""
+
+    scan_id: str
+    from_seq: Annotated[int, msgspec.Meta(ge=1)]
+    limit: Annotated[int, msgspec.Meta(ge=1, le=10000)] = 1000
+
+
+AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume | Abort | Status | Replay
+
+# --- replies: Pi -> host ----------------------------------------------------------------------------------------------
+
+
+class HelloReply(_Message, frozen=True, kw_only=True):
+    """Who answers, and in which state."""
+
+    pi_release: str
+    firmware: str
+    backend: str
+    state: State
+    scan_id: str
+    last_seq: Natural
+
+
+class Accepted(_Message, frozen=True, kw_only=True):
+    """The command was taken; `state` is the state after it."""
+
+    state: State
+
+
+class Refused(_Message, frozen=True, kw_only=True):
+    """The command was not taken, and nothing changed."""
+
+    number: int
+    what: str
+    why: str = ""
+    remedy: str = ""
+
+
+class StatusReply(_Message, frozen=True, kw_only=True):
+    """Everything the Pi knows about itself. `row_index` is -1 when no row runs."""
+
+    state: State
+    homed: bool
+    x_mm: float
+    y_mm: float
+    scan_id: str
+    row_index: int
+    take: int
+    points: Natural
+    pulses: Natural
+    last_seq: Natural
+    fault: int
+    reason: str
+
+
+class ReplayReply(_Message, frozen=True, kw_only=True):
+    """Events in order; `last_seq` is the newest in the journal of that scan (0 when there is none)."""
+
+    events: list[AnyEvent]
+    last_seq: Natural
+
+
+AnyReply = HelloReply | Accepted | Refused | StatusReply | ReplayReply
+
+M = TypeVar("M")
+
+
+def pack(message: AnyEvent | AnyCommand | AnyReply) -> bytes:
+    """A message as msgpack bytes."""
+    packed = msgpack.packb(msgspec.to_builtins(message), use_bin_type=True)
+    if packed is None:
+        raise ProtocolError(f"{type(message).__name__} cannot be packed")
+    return packed
+
+
+def _unpack(raw: bytes, kind: Any, what: str) -> Any:
+    try:
+        node = msgpack.unpackb(raw, raw=False, strict_map_key=True)
+    except (ValueError, msgpack.UnpackException, msgpack.ExtraData) as e:
+        raise ProtocolError(
+            f"{what} of {len(raw)} bytes is not msgpack: {e}", "another program on this port?"
+        ) from None
+    version = node.get("version") if isinstance(node, dict) else None
+    if isinstance(version, str) and version.partition(".")[0] != WIRE_VERSION.partition(".")[0]:
+        raise VersionError(
+            f"{what} {node.get('type')!r} has wire version {version}, this program speaks {WIRE_VERSION}",
+            "host and Pi are of different releases",
+            "install the same release on both",
+        )
+    try:
+        return msgspec.convert(node, kind)
+    except msgspec.ValidationError as e:
+        raise ProtocolError(
+            f"{what} does not follow its declaration: {e}", "host and Pi are of different releases"
+        ) from None
+
+
+def unpack_event(raw: bytes) -> AnyEvent:
+    """Decode and check an event. Raises ProtocolError."""
+    return _unpack(raw, AnyEvent, "event")
+
+
+def pack_kept(event: AnyEvent) -> bytes:
+    """An event as files keep it: its map with a last key `crc`, the CRC-32 of the map packed without it."""
+    raw = pack(event)
+    return msgpack.packb({**msgpack.unpackb(raw), "crc": zlib.crc32(raw)}) or b""
+
+
+def unpack_kept(raw: bytes) -> AnyEvent:
+    """Decode and check an event of a file. Raises ProtocolError."""
+    event = unpack_event(raw)
+    node = msgpack.unpackb(raw)
+    if node.pop("crc", None) != zlib.crc32(msgpack.packb(node) or b""):
+        raise ProtocolError(f"the CRC of event {event.seq} is wrong", "damaged")
+    return event
+
+
+def unpack_command(raw: bytes) -> AnyCommand:
+    """Decode and check a command. Raises ProtocolError."""
+    return _unpack(raw, AnyCommand, "command")
+
+
+def unpack_reply(raw: bytes) -> AnyReply:
+    """Decode and check a reply. Raises ProtocolError."""
+    return _unpack(raw, AnyReply, "reply")

@@ -1,0 +1,120 @@
+"""Construction of every ZeroMQ socket, in one place: time-outs, limits, and CURVE on anything that is not loopback."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from shared.errors import ConfigError, DeviceError
+
+Socket = zmq.Socket[bytes]
+EVENT_TOPIC = b"event"
+
+
+def host_of(address: str) -> str:
+    """The host part of `tcp://host:port`. Raises ConfigError for another form."""
+    scheme, _, rest = address.partition("://")
+    host, _, port = rest.rpartition(":")
+    if scheme != "tcp" or not host or not (port == "*" or port.isdigit()):
+        raise ConfigError(
+            f"address {address!r} is not of the form tcp://host:port", "a typing error", "correct it in instrument.toml"
+        )
+    return host.strip("[]")
+
+
+def is_loopback(address: str) -> bool:
+    """Whether an address never leaves this machine."""
+    host = host_of(address)
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
+    """CURVE on a socket whose address is not loopback.
+
+    `key_dir` holds `pi.key_secret`, `pi.key`, `host.key_secret` and `host.key` as zmq.auth writes them. The server
+    accepts any client that knows its public key; an address that is not loopback is refused without keys.
+    """
+    if is_loopback(address):
+        return
+    own, peer = ("pi", "host") if server else ("host", "pi")
+    secret_file, peer_file = key_dir / f"{own}.key_secret", key_dir / f"{peer}.key"
+    try:
+        from zmq.auth import load_certificate
+
+        public, secret = load_certificate(secret_file)
+        if secret is None:
+            raise OSError(f"{secret_file} holds no secret key")
+        socket.curve_publickey, socket.curve_secretkey = public, secret
+        if server:
+            socket.curve_server = True
+        else:
+            socket.curve_serverkey = load_certificate(peer_file)[0]
+    except (OSError, ValueError) as e:
+        raise ConfigError(
+            f"{address} is not loopback and there are no usable CURVE keys: {e}",
+            f"{key_dir} lacks {secret_file.name} or {peer_file.name}",
+            "make keys with `polysight-pi keys`, or use a loopback address",
+        ) from None
+
+
+def _make(
+    context: zmq.Context[Any],
+    kind: int,
+    address: str,
+    key_dir: Path,
+    bind: bool,
+    options: dict[int, int | bytes] | None = None,
+) -> Socket:
+    host_of(address)
+    socket: Socket = context.socket(kind)
+    for option, value in {zmq.LINGER: 0, **(options or {})}.items():
+        socket.setsockopt(option, value)
+    try:
+        _secure(socket, address, key_dir, server=bind)
+        if bind:
+            socket.bind(address)
+        else:
+            socket.connect(address)
+    except zmq.ZMQError as e:
+        socket.close()
+        raise DeviceError(
+            f"{address}: {e.strerror}" if hasattr(e, "strerror") else f"{address}: {e}",
+            "another program holds this port"
+            if e.errno == zmq.EADDRINUSE
+            else "the address does not exist on this machine",
+            "stop the other program (ss -ltnp shows it), or change the address in instrument.toml",
+        ) from None
+    except ConfigError:
+        socket.close()
+        raise
+    return socket
+
+
+def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """PUB socket of the Pi, bound."""
+    return _make(context, zmq.PUB, address, key_dir, bind=True, options={zmq.SNDHWM: 100_000})
+
+
+def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """SUB socket of the host, connected, subscribed to all events, with a deep queue."""
+    return _make(
+        context, zmq.SUB, address, key_dir, bind=False, options={zmq.RCVHWM: 100_000, zmq.SUBSCRIBE: EVENT_TOPIC}
+    )
+
+
+def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """REP socket of the Pi, bound."""
+    return _make(context, zmq.REP, address, key_dir, bind=True)
+
+
+def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """REQ socket of the host, connected. Relaxed, so that a lost reply does not wedge it."""
+    return _make(context, zmq.REQ, address, key_dir, bind=False, options={zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1})

@@ -1,0 +1,176 @@
+"""The stage line protocol: numbered, checksummed ASCII lines, and single bytes that act while the stage moves.
+
+Specification: docs/spec/stage-line.md. The firmware's half is arduino_stage/protocol.cpp.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+from enum import IntEnum
+
+import msgspec
+
+from shared.errors import ProtocolError
+
+PROTOCOL_VERSION = 1
+MAX_LINE_BYTES = 96
+MAX_SEQUENCE = 65535
+_VALUE = re.compile(r"-?[0-9]{1,10}")
+_COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")
+_FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
+
+
+class Immediate(IntEnum):
+    """Bytes taken in the receive interrupt, even while moving. None is one bit away from a byte used in lines."""
+
+    HOLD = 0x81
+    RESUME = 0x82
+    STATUS = 0x84
+    STOP = 0x88
+
+
+class Parameter(IntEnum):
+    """First argument of `SET`: which value of the stage is set. The unit is that of the second argument."""
+
+    ACCEL = 0  # steps/s^2
+    HEARTBEAT = 1  # ms of silence after which a moving stage stops
+    TRIGGER = 2  # us, width of the trigger pulse
+    TRAVEL_X = 3  # steps, soft limit 0..TRAVEL_X
+    TRAVEL_Y = 4  # steps
+    TRAVEL_SPEED = 5  # steps/s, between rows
+    BACKLASH = 6  # steps of take-up: rows come from below and run up at least so far; 0 = off
+
+
+def crc16(body: bytes) -> int:
+    """CRC-16/XMODEM (polynomial 0x1021, start 0), the same as avr-libc's _crc_xmodem_update."""
+    return binascii.crc_hqx(body, 0)
+
+
+def seal(body: str) -> bytes:
+    """Append `*CRC` and the line end. Raises ProtocolError when the line is too long or not plain ASCII."""
+    try:
+        raw = body.encode("ascii")
+    except UnicodeEncodeError:
+        raise ProtocolError(f"stage line {body!r} is not ASCII") from None
+    if b"*" in raw or b"\n" in raw or b"\r" in raw:
+        raise ProtocolError(f"stage line {body!r} contains a reserved character")
+    line = raw + b"*%04X\n" % crc16(raw)
+    if len(line) > MAX_LINE_BYTES:
+        raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}: {body!r}")
+    return line
+
+
+def unseal(line: bytes) -> str:
+    """Check length, line end and CRC, and return the body.
+
+    Raises
+    ------
+    ProtocolError
+        for anything that is not exactly what :func:`seal` writes.
+    """
+    if len(line) > MAX_LINE_BYTES:
+        raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}")
+    if len(line) < 6 or line[-1:] != b"\n" or line[-6:-5] != b"*":
+        raise ProtocolError(f"not a stage line: {line!r}")
+    body, tail = line[:-6], line[-5:-1]
+    if tail != b"%04X" % crc16(body):
+        raise ProtocolError(f"checksum {tail!r} of stage line {body!r} is wrong, expected {crc16(body):04X}")
+    if any(not 0x20 <= c < 0x7F or c == 0x2A for c in body):
+        raise ProtocolError(f"stage line {body!r} contains a reserved character")
+    return body.decode("ascii")
+
+
+class Command(msgspec.Struct, frozen=True):
+    """Host to stage: `N<sequence> <VERB> [integers]`."""
+
+    sequence: int
+    verb: str
+    args: tuple[int, ...] = ()
+
+    def encode(self) -> bytes:
+        """The sealed line. Raises ProtocolError when a part is out of the protocol's range."""
+        if not 0 <= self.sequence <= MAX_SEQUENCE:
+            raise ProtocolError(f"sequence {self.sequence} is outside 0..{MAX_SEQUENCE}")
+        if not re.fullmatch(r"[A-Z]+", self.verb):
+            raise ProtocolError(f"stage verb {self.verb!r} must be capital letters")
+        if any(not -(2**31) <= a < 2**31 for a in self.args):
+            raise ProtocolError(f"stage arguments {self.args} must be 32-bit integers")
+        return seal(" ".join([f"N{self.sequence}", self.verb, *map(str, self.args)]))
+
+    @staticmethod
+    def decode(line: bytes) -> Command:
+        """Parse a sealed command line. Raises ProtocolError."""
+        body = unseal(line)
+        m = _COMMAND.fullmatch(body)
+        if m is None or int(m[1]) > MAX_SEQUENCE:
+            raise ProtocolError(f"not a stage command: {body!r}")
+        args = tuple(int(a) for a in m[3].split())
+        if any(not -(2**31) <= a < 2**31 for a in args):
+            raise ProtocolError(f"stage arguments {args} must be 32-bit integers")
+        return Command(int(m[1]), m[2], args)
+
+
+class Reply(msgspec.Struct, frozen=True):
+    """Stage to host.
+
+    `kind` is one of
+
+    * `banner`: boot; fields fw, proto
+    * `ok`: command `sequence` accepted (motion) or done (others); fields as the command defines
+    * `error`: command refused with `number`; `sequence` is None when the line could not be read
+    * `done`: motion command `sequence` has ended; a row has fields points, pulses, x, y
+    * `alarm`: latched fault `number`
+    * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits
+    """
+
+    kind: str
+    sequence: int | None = None
+    number: int = 0
+    fields: dict[str, str] = {}
+
+    def encode(self) -> bytes:
+        """The sealed line."""
+        tag = "-" if self.sequence is None else str(self.sequence)
+        head = {
+            "banner": "polysight-stage",
+            "ok": f"ok N{tag}",
+            "error": f"error:{self.number} N{tag}",
+            "done": f"done N{tag}",
+            "alarm": f"alarm:{self.number}",
+            "status": "status",
+        }[self.kind]
+        return seal(" ".join([head, *(f"{k}={v}" for k, v in self.fields.items())]))
+
+    @staticmethod
+    def decode(line: bytes) -> Reply:
+        """Parse a sealed reply line. Raises ProtocolError."""
+        body = unseal(line)
+        words = body.split(" ")
+        head, rest = words[0], words[1:]
+        kind, _, number = head.partition(":")
+        kind = "banner" if kind == "polysight-stage" else kind
+        if kind not in ("banner", "ok", "error", "done", "alarm", "status"):
+            raise ProtocolError(f"not a stage reply: {body!r}")
+        if (kind in ("error", "alarm")) != bool(re.fullmatch(r"[0-9]{1,3}", number)):
+            raise ProtocolError(f"stage reply without a proper number: {body!r}")
+        sequence: int | None = None
+        if kind in ("ok", "error", "done"):
+            if not rest or not re.fullmatch(r"N([0-9]{1,5}|-)", rest[0]):
+                raise ProtocolError(f"stage reply without a sequence number: {body!r}")
+            sequence = None if rest[0] == "N-" else int(rest[0][1:])
+            rest = rest[1:]
+        fields: dict[str, str] = {}
+        for word in rest:
+            m = _FIELD.fullmatch(word)
+            if m is None or m[1] in fields:
+                raise ProtocolError(f"stage reply with a bad field {word!r}: {body!r}")
+            fields[m[1]] = m[2]
+        return Reply(kind, sequence, int(number) if number else 0, fields)
+
+    def integer(self, key: str) -> int:
+        """An integer field. Raises ProtocolError when it is absent or not an integer."""
+        value = self.fields.get(key)
+        if value is None or not _VALUE.fullmatch(value):
+            raise ProtocolError(f"stage reply {self.kind!r} needs an integer field {key!r}, got {value!r}")
+        return int(value)

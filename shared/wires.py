@@ -1,0 +1,152 @@
+"""Simulated wires: a local socket that carries GPIO edges between processes, each edge with its time.
+
+One hub (simulators) relays between the parties: the stage raises the trigger, the Pi makes SYNC_IN pulses, the radars
+listen. Lines of ASCII:
+
+    `S <t_ns> <line> <0|1>`                 a line changed at wire time t_ns
+    `M <t_ns> <x_um> <y_um> <vx_um_s>`      the stage is at (x, y) and moves at vx from here on (stage coordinates)
+    `L <line> [<line> ...]`                 party to hub: send me changes of these lines
+    `W`                                     party to hub: send me the M lines too
+    `K`                                     hub to party: your L and W are in force
+
+Wire time is the simulated stage's clock. It may run faster than the wall clock; whoever reacts to an edge counts from
+the edge's time, so that intervals in a simulated scan are exact however loaded the machine is.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from shared.errors import DeviceError, ProtocolError
+
+
+class WireEdge(NamedTuple):
+    """A line changed."""
+
+    t_ns: int
+    line: int
+    value: int
+
+
+class WireMotion(NamedTuple):
+    """The stage's position (micrometres, stage coordinates) and x speed (micrometres a second) from `t_ns` on."""
+
+    t_ns: int
+    x_um: int
+    y_um: int
+    vx_um_s: int
+
+
+WireMessage = WireEdge | WireMotion
+
+
+def encode(message: WireMessage) -> bytes:
+    """One line of the wire protocol."""
+    tag = "S" if isinstance(message, WireEdge) else "M"
+    return (" ".join([tag, *map(str, message)]) + "\n").encode("ascii")
+
+
+def parse(line: str) -> WireMessage:
+    """Parse an S or M line. Raises ProtocolError."""
+    tag, *rest = line.split() or [""]
+    try:
+        values = [int(w) for w in rest]
+        if tag == "S" and len(values) == 3 and values[2] in (0, 1):
+            return WireEdge(*values)
+        if tag == "M" and len(values) == 4:
+            return WireMotion(*values)
+    except ValueError:
+        pass
+    raise ProtocolError(f"not a wire line: {line!r}")
+
+
+class WireClient:
+    """One party on the simulated wires.
+
+    Parameters
+    ----------
+    path
+        Unix socket of the hub.
+    listen
+        Lines whose changes are wanted.
+    motion
+        Whether M lines are wanted.
+
+    Raises
+    ------
+    DeviceError
+        when nobody listens at `path` within `timeout_s`.
+    """
+
+    def __init__(self, path: Path, listen: tuple[int, ...] = (), motion: bool = False, timeout_s: float = 10.0) -> None:
+        self._path = path
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            try:
+                self._socket.connect(str(path))
+                break
+            except OSError as e:
+                self._socket.close()
+                if time.monotonic() > deadline:
+                    raise DeviceError(
+                        f"simulated wires: nobody listens at {path}: {e}",
+                        "the simulated rig is not running",
+                        "start it first",
+                    ) from None
+                time.sleep(0.02)
+        self._buffer = b""
+        self._pending: list[str] = []
+        hello = b""
+        if listen:
+            hello += ("L " + " ".join(map(str, listen)) + "\n").encode("ascii")
+        if motion:
+            hello += b"W\n"
+        if hello:
+            self._socket.sendall(hello)
+            deadline = time.monotonic() + timeout_s
+            for _ in range(hello.count(b"\n")):
+                if self._next_line(max(0.0, deadline - time.monotonic())) != "K":
+                    raise ProtocolError(f"simulated wires at {path}: no confirmation")
+
+    def fileno(self) -> int:
+        """File descriptor, for select and poll. :meth:`receive` may hold more than the descriptor shows."""
+        return self._socket.fileno()
+
+    def send(self, *messages: WireMessage) -> None:
+        """Send messages in one write. Raises DeviceError when the hub is gone."""
+        try:
+            self._socket.sendall(b"".join(map(encode, messages)))
+        except OSError as e:
+            raise DeviceError(f"simulated wires at {self._path} broke: {e}", "the simulated rig ended") from None
+
+    def receive(self, timeout_s: float | None) -> WireMessage | None:
+        """The next message, or None after `timeout_s`. Raises DeviceError when the hub is gone."""
+        line = self._next_line(timeout_s)
+        return None if line is None else parse(line)
+
+    def _next_line(self, timeout_s: float | None) -> str | None:
+        while not self._pending:
+            self._socket.settimeout(timeout_s if timeout_s is None else max(timeout_s, 1e-6))
+            try:
+                data = self._socket.recv(1 << 16)
+            except (TimeoutError, BlockingIOError):
+                return None
+            except OSError as e:
+                raise DeviceError(f"simulated wires at {self._path} broke: {e}", "the simulated rig ended") from None
+            finally:
+                if self._socket.fileno() >= 0:
+                    self._socket.settimeout(None)
+            if not data:
+                raise DeviceError(f"simulated wires at {self._path} were closed", "the simulated rig ended")
+            lines = (self._buffer + data).split(b"\n")
+            self._buffer = lines.pop()
+            self._pending = [line.decode("ascii", "replace") for line in reversed(lines)]
+        return self._pending.pop()
+
+    def close(self) -> None:
+        """Leave the wires."""
+        self._socket.close()

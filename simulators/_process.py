@@ -1,0 +1,39 @@
+"""How a simulator process lives: it says when it serves, ends on SIGTERM or SIGINT, and never outlives its parent."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:
+    """Ask the kernel to send `sig` to this process when its parent ends (Linux; elsewhere nothing happens)."""
+    if not sys.platform.startswith("linux"):
+        return
+    parent = os.getppid()
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, int(sig), 0, 0, 0)
+    if os.getppid() != parent:  # the parent ended before the request was made
+        os.kill(os.getpid(), sig)
+
+
+def announce_ready(text: str = "") -> None:
+    """Print `ready <text>` for the parent, who waits for it."""
+    sys.stdout.write(f"ready {text}".rstrip() + "\n")
+    sys.stdout.flush()
+
+
+def stop_requested() -> threading.Event:
+    """An event that SIGTERM and SIGINT set from now on. Call in the main thread."""
+    event = threading.Event()
+
+    def stop(_signal: int, _frame: object) -> None:
+        event.set()
+
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
+    return event

@@ -1,0 +1,79 @@
+"""Programs compiled on demand, once for the same sources and command."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from shared.errors import DeviceError
+
+FOLDER = Path(__file__).resolve().parents[1] / "arduino_stage" / "build"  # ignored by git, removed by `make clean`
+
+
+def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_failure: tuple[str, str]) -> Path:
+    """The file that `command` makes of `sources`; the command runs only when there is none of these very sources yet.
+
+    Parameters
+    ----------
+    product
+        Name of the file the command makes, such as "stage" or "arduino_stage.hex".
+    sources
+        Every file the result depends on, headers and build files too.
+    command
+        Its words; each "{folder}" in them stands for the folder where it must leave `product`.
+    on_failure
+        Why it may have failed and what to do, for the error.
+
+    Returns
+    -------
+    Path
+        Named by the product and the hash of sources and command, in arduino_stage/build or, where that cannot be
+        written, in a folder of this user's below the temporary folder. Several processes may ask at once.
+
+    Raises
+    ------
+    DeviceError
+        when the command fails or cannot be started; its message is part of the error.
+    """
+    digest = hashlib.sha256("\0".join(command).encode())
+    for path in sorted(sources):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    name = f"{Path(product).stem}-{digest.hexdigest()[:16]}{Path(product).suffix}"
+    if (FOLDER / name).is_file():  # also where it may be read only
+        return FOLDER / name
+    result = _folder() / name
+    if result.is_file():
+        return result
+    with tempfile.TemporaryDirectory(prefix=".making-", dir=result.parent) as folder:
+        _run([word.replace("{folder}", folder) for word in command], product, on_failure)
+        (Path(folder) / product).replace(result)  # at once: who comes meanwhile sees all of it or nothing
+    return result
+
+
+def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        message, failed = done.stderr.strip(), done.returncode != 0
+    except OSError as e:
+        message, failed = str(e), True
+    if failed:
+        raise DeviceError(f"{product} does not compile on this machine:\n{message}", *on_failure)
+
+
+def _folder() -> Path:
+    try:
+        FOLDER.mkdir(exist_ok=True)
+    except OSError:
+        pass
+    else:
+        if os.access(FOLDER, os.W_OK):
+            return FOLDER
+    fallback = Path(tempfile.gettempdir()) / f"polysight-build-{os.getuid()}"
+    fallback.mkdir(mode=0o700, exist_ok=True)
+    if fallback.stat().st_uid != os.getuid():
+        raise DeviceError(f"{fallback} belongs to another user", "somebody made it first", "set TMPDIR")
+    return fallback

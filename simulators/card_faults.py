@@ -1,0 +1,130 @@
+"""The `[faults]` table of simulated capture cards: what can go wrong, and where it is written down."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from shared.config import decode, read_toml
+from shared.errors import ConfigError
+
+Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Natural = Annotated[int, msgspec.Meta(ge=0)]
+Seconds = Annotated[float, msgspec.Meta(ge=0)]
+Bit = Annotated[int, msgspec.Meta(ge=0, le=15)]
+CommandCode = Annotated[int, msgspec.Meta(ge=1, le=0xFFFF)]
+
+
+class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The `[faults]` table. Probabilities are per data packet (or frame, pulse, request); numbers count from 0 on.
+
+    The network: `loss`, `duplicate`, `reorder` (changes places with the next packet), `late` (comes `late_packets`
+    packets later), `truncate` (half of it arrives), `corrupt` (a bit of the payload turned), `corrupt_header` (a bit of
+    the ten header bytes turned), `lose_packets` (these packets are lost), `link_down` (from pulse n on nothing passes
+    for s seconds of wire time), `request_loss`, `reply_loss` (carried out, but nothing comes back).
+    The card: `overflow`, `ddr_full` (half a frame is lost before packetising: no sequence gap, status bits 9 and 7),
+    `mute` (answers nothing), `answers` (falls silent after so many), `reply_delay_ms`, `deaf_ms` (after command 0x03),
+    `refuse` (these commands fail), `command_status` (this status bit follows the reply to this command),
+    `pulse_status` (this status bit is sent at this pulse), `stop_after_packets` (sends no data packet after so many),
+    `end_pulses` (the record ends by itself before this pulse), `reset_pulses` (FPGA resets before this pulse),
+    `power_cycle_pulses`, `boot_s`, `stop_discards` (record stop loses what does not fill a packet), `first_sequence`,
+    `first_byte_count`.
+    The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame). Its control server:
+    `retrigger_fails` (these lines change nothing), `retrigger_resets` (the connection is reset at these lines). Under
+    native control: `radar_fault_pulses` (the RF core faults at these pulses).
+    """
+
+    loss: Probability = 0.0
+    duplicate: Probability = 0.0
+    reorder: Probability = 0.0
+    late: Probability = 0.0
+    late_packets: Annotated[int, msgspec.Meta(ge=1)] = 100
+    truncate: Probability = 0.0
+    corrupt: Probability = 0.0
+    corrupt_header: Probability = 0.0
+    lose_packets: tuple[Natural, ...] = ()
+    link_down: tuple[tuple[Natural, Seconds], ...] = ()
+    request_loss: Probability = 0.0
+    reply_loss: Probability = 0.0
+    overflow: Probability = 0.0
+    ddr_full: Probability = 0.0
+    mute: bool = False
+    answers: Natural | None = None
+    reply_delay_ms: Seconds = 0.0
+    deaf_ms: Seconds = 0.0
+    refuse: tuple[CommandCode, ...] = ()
+    command_status: tuple[tuple[CommandCode, Bit], ...] = ()
+    pulse_status: tuple[tuple[Natural, Bit], ...] = ()
+    stop_after_packets: Natural | None = None
+    end_pulses: tuple[Natural, ...] = ()
+    reset_pulses: tuple[Natural, ...] = ()
+    power_cycle_pulses: tuple[Natural, ...] = ()
+    boot_s: Seconds = 0.0
+    stop_discards: bool = False
+    first_sequence: Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)] = 1
+    first_byte_count: Annotated[int, msgspec.Meta(ge=0, lt=1 << 48)] = 0
+    missed_pulse: Probability = 0.0
+    miss_pulses: tuple[Natural, ...] = ()
+    retrigger_fails: tuple[Natural, ...] = ()
+    retrigger_resets: tuple[Natural, ...] = ()
+    radar_fault_pulses: tuple[Natural, ...] = ()
+
+    @property
+    def corrupts(self) -> bool:
+        """Whether bits are turned."""
+        return bool(self.corrupt or self.corrupt_header)
+
+    @property
+    def disturbs_network(self) -> bool:
+        """Whether any packet can suffer by itself (a link that is down aside)."""
+        some = self.loss or self.duplicate or self.reorder or self.late or self.truncate or self.lose_packets
+        return bool(some) or self.corrupts or self.stop_after_packets is not None
+
+
+def read_faults(
+    path: Path | None, settings: list[str], boards: tuple[str, ...], base: dict[str, Any] | None = None
+) -> dict[str, Faults]:
+    """Faults per board: `base`, then the file, then the command line's settings.
+
+    Parameters
+    ----------
+    base
+        Where to begin, as a `[faults]` table.
+    boards
+        Names of all boards.
+    path
+        TOML file: keys in `[faults]` count for every board, in `[faults.NAME]` for that board.
+    settings
+        `KEY=VALUE` for every board or `NAME.KEY=VALUE` for one; the value is written as in TOML.
+
+    Raises
+    ------
+    ConfigError
+        for unknown keys, boards or values.
+    """
+    table: dict[str, Any] = dict(base or {})
+    if path is not None:
+        raw = read_toml(path)
+        if set(raw) != {"faults"} or not isinstance(raw["faults"], dict):
+            raise ConfigError(f"{path}: holds {sorted(raw)}", "not a fault file", "write one table, [faults]")
+        _merge(table, raw["faults"])
+    for setting in settings:
+        try:
+            _merge(table, tomllib.loads(setting))
+        except tomllib.TOMLDecodeError as e:
+            raise ConfigError(
+                f"--fault {setting!r}: {e}", "not of the form KEY=VALUE", "write for example loss=0.01 or RH.mute=true"
+            ) from None
+    common = {k: v for k, v in table.items() if not isinstance(v, dict)}
+    own = {k: v for k, v in table.items() if isinstance(v, dict)}
+    if unknown := sorted(set(own) - set(boards)):
+        raise ConfigError(f"faults for unknown boards {unknown}", f"the boards are {list(boards)}", "correct the name")
+    return {name: decode({**common, **own.get(name, {})}, Faults, f"faults of {name}") for name in boards}
+
+
+def _merge(table: dict[str, Any], more: dict[str, Any]) -> None:
+    for key, value in more.items():
+        table[key] = {**table.get(key, {}), **value} if isinstance(value, dict) else value

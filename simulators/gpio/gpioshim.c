@@ -1,0 +1,480 @@
+/* gpioshim - a stand-in GPIO chip for one program, preloaded: the unmodified libgpiod v2 bindings talk to it as to a kernel
+ * (GPIO character device uAPI v2, <linux/gpio.h>). Everything it does is simulated.
+ *
+ *   GPIOSHIM_CHIP=PATH     the device; made here, a link to /dev/null
+ *   GPIOSHIM_WIRES=SOCKET  hub of the simulated wires (shared/wires.py): S lines in are levels on inputs, S lines out are
+ *                          changes of outputs, with the time (CLOCK_MONOTONIC) at which they were made
+ *   GPIOSHIM_LABEL, GPIOSHIM_LINES                                    what the chip says of itself
+ *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US                 faults from the start
+ *   GPIOSHIM_CLOCK=wires   edges carry their wire time; the thread that reads them lives in it: a sleep ends at once and
+ *                          takes as long as was asked for. So a burst is exact however busy the machine is
+ *   SIGUSR1                                                           the chip vanishes, as when a driver is unloaded
+ *
+ * As the kernel does: a request's event buffer drops its oldest event when it is full, and line_seqno tells; edges are
+ * stamped when they arrive; a debounced line reports what stayed; lines go low when their request is released, also by
+ * death of the program, however sudden. The last is the work of a second process, which also carries changes of outputs
+ * to the wires, so that a pulse costs no system call.
+ * Not as a Raspberry Pi: several lines change at exactly the same time. Never let it prove simultaneity. */
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdarg.h>
+#include <stdatomic.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <unistd.h>
+#include <linux/gpio.h>
+#include <sys/eventfd.h>
+#include <sys/ioctl.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+
+#define MAX_FD 1024
+#define MAX_LINES GPIO_V2_LINES_MAX
+#define EDGES (GPIO_V2_LINE_FLAG_EDGE_RISING | GPIO_V2_LINE_FLAG_EDGE_FALLING)
+#define RING 4096
+#define MAX_EVENTS (GPIO_V2_LINES_MAX * 16) /* the kernel's limit */
+#define REAL(f) ({ static __typeof__(&f) real; if (!real) real = (__typeof__(&f))dlsym(RTLD_NEXT, #f); real; })
+
+struct request { /* lines had together, by their file descriptor: an eventfd that is readable while there are events */
+  int n;
+  uint32_t offsets[MAX_LINES], seqno, capacity, head, tail;
+  struct gpio_v2_line_event *events;
+};
+struct line {
+  struct request *owner;
+  int owner_fd, pending, pending_value;
+  uint64_t flags, debounce_ns, pending_wire_ns, pending_due_ns;
+  uint32_t seqno;
+  uint8_t driven, outside;
+  char consumer[GPIO_MAX_NAME_SIZE];
+};
+/* Shared with the second process, which outlives this one for a moment. */
+struct shared {
+  _Atomic uint32_t head, tail;
+  struct change { uint64_t ns; uint32_t line, value; } ring[RING];
+  _Atomic uint8_t high[MAX_LINES];
+};
+
+static char chip[200];
+static unsigned n_lines = 28;
+static int wires = -1, no_edges, denied, slow_us, wire_clock;
+static volatile sig_atomic_t gone;
+static pthread_mutex_t mutex = PTHREAD_MUTEX_INITIALIZER;
+static uint8_t is_chip[MAX_FD];
+static struct request *by_fd[MAX_FD];
+static struct line lines[MAX_LINES];
+static struct shared *shared;
+
+/* ---- time ---- */
+#define ROW_GAP_NS 250000000ULL /* between edges of the wires; then wire time is set to the clock's anew */
+#define CALL_NS 200             /* what looking at the clock takes in wire time */
+static __thread uint64_t thread_ns; /* of a thread that lives in wire time */
+
+static uint64_t to_ns(const struct timespec *t) { return t->tv_sec * 1000000000ULL + t->tv_nsec; }
+
+int clock_gettime(clockid_t clock, struct timespec *t) {
+  if (clock != CLOCK_MONOTONIC || !thread_ns) return REAL(clock_gettime)(clock, t);
+  thread_ns += CALL_NS;
+  *t = (struct timespec){ thread_ns / 1000000000, thread_ns % 1000000000 };
+  return 0;
+}
+
+int clock_nanosleep(clockid_t clock, int flags, const struct timespec *t, struct timespec *left) {
+  if (clock != CLOCK_MONOTONIC || !thread_ns) return REAL(clock_nanosleep)(clock, flags, t, left);
+  const uint64_t end = to_ns(t) + (flags & TIMER_ABSTIME ? 0 : thread_ns);
+  if (end > thread_ns) thread_ns = end;
+  return 0;
+}
+
+static uint64_t now_ns(clockid_t clock) {
+  struct timespec t;
+  clock_gettime(clock, &t);
+  return to_ns(&t);
+}
+
+static uint64_t edge_ns(clockid_t clock, uint64_t wire_ns) { /* the mutex is held */
+  static uint64_t last_wire, last;
+  const uint64_t now = now_ns(clock);
+  if (!wire_clock) return now;
+  const uint64_t since = last + (wire_ns - last_wire);
+  last = wire_ns < last_wire + ROW_GAP_NS || since > now ? since : now;
+  last_wire = wire_ns;
+  return last;
+}
+
+/* ---- outputs ---- */
+static void set_output(unsigned n, int value) {
+  if (shared->high[n] == value) return;
+  if (wires < 0) {
+    shared->high[n] = value;
+    return;
+  }
+  const uint32_t head = shared->head;
+  while (head - shared->tail >= RING) usleep(100); /* nothing is dropped */
+  shared->ring[head % RING] = (struct change){ now_ns(CLOCK_MONOTONIC), n, value };
+  shared->high[n] = value;
+  shared->head = head + 1;
+}
+
+static void tell(uint64_t ns, unsigned line, unsigned value) {
+  char text[64];
+  const int n = snprintf(text, sizeof text, "S %llu %u %u\n", (unsigned long long)ns, line, value);
+  if (wires >= 0 && send(wires, text, n, MSG_NOSIGNAL) != n) wires = -1;
+}
+
+/* The second process. `alive` ends with the program; what it left high then goes low, as its lines are released. */
+static void carry(int alive) {
+  struct pollfd end = { alive, POLLIN, 0 };
+  for (int ended = 0; !ended;) {
+    ended = poll(&end, 1, 1) > 0;
+    for (; shared->tail != shared->head; shared->tail++) {
+      const struct change *c = &shared->ring[shared->tail % RING];
+      tell(c->ns, c->line, c->value);
+    }
+  }
+  for (unsigned n = 0; n < n_lines; n++)
+    if (shared->high[n]) tell(now_ns(CLOCK_MONOTONIC), n, 0);
+  _exit(0);
+}
+
+/* ---- inputs ---- */
+static int level(const struct line *l) {
+  return l->driven ? l->outside : !!(l->flags & GPIO_V2_LINE_FLAG_BIAS_PULL_UP);
+}
+
+static void changed(unsigned n, int value, uint64_t wire_ns) { /* the mutex is held */
+  struct line *l = &lines[n];
+  const int before = level(l);
+  l->driven = 1;
+  l->outside = value;
+  const int active = value ^ !!(l->flags & GPIO_V2_LINE_FLAG_ACTIVE_LOW);
+  struct request *r = l->owner;
+  const clockid_t clock = l->flags & GPIO_V2_LINE_FLAG_EVENT_CLOCK_REALTIME ? CLOCK_REALTIME : CLOCK_MONOTONIC;
+  if (before == value || !r || gone) return;
+  if (!(l->flags & (active ? GPIO_V2_LINE_FLAG_EDGE_RISING : GPIO_V2_LINE_FLAG_EDGE_FALLING))) return;
+  if (r->head - r->tail == r->capacity) r->tail++;
+  r->events[r->head++ % r->capacity] = (struct gpio_v2_line_event){
+    .timestamp_ns = edge_ns(clock, wire_ns),
+    .id = active ? GPIO_V2_LINE_EVENT_RISING_EDGE : GPIO_V2_LINE_EVENT_FALLING_EDGE,
+    .offset = n, .seqno = ++r->seqno, .line_seqno = ++l->seqno };
+  eventfd_write(l->owner_fd, 1);
+}
+
+static void debounced(unsigned n, int value, uint64_t wire_ns) { /* the mutex is held */
+  struct line *l = &lines[n];
+  if (l->flags & GPIO_V2_LINE_FLAG_OUTPUT) return;
+  if (!l->debounce_ns) return changed(n, value, wire_ns);
+  if (l->pending && wire_ns >= l->pending_wire_ns + l->debounce_ns) {
+    l->pending = 0;
+    changed(n, l->pending_value, l->pending_wire_ns);
+  }
+  l->pending = value != level(l);
+  l->pending_value = value;
+  l->pending_wire_ns = wire_ns;
+  l->pending_due_ns = now_ns(CLOCK_MONOTONIC) + l->debounce_ns;
+}
+
+static int settle(void) { /* reports what stayed; returns for how many ms poll may sleep. The mutex is held */
+  const uint64_t now = now_ns(CLOCK_MONOTONIC);
+  int sleep_ms = -1;
+  for (unsigned n = 0; n < n_lines; n++) {
+    if (lines[n].pending && now >= lines[n].pending_due_ns) {
+      lines[n].pending = 0;
+      changed(n, lines[n].pending_value, lines[n].pending_wire_ns);
+    }
+    if (lines[n].pending) sleep_ms = 1;
+  }
+  return sleep_ms;
+}
+
+static void *listen_to_wires(void *unused) {
+  char text[8192];
+  size_t length = 0;
+  struct pollfd p = { wires, POLLIN, 0 };
+  while (1) {
+    pthread_mutex_lock(&mutex);
+    const int sleep_ms = settle();
+    pthread_mutex_unlock(&mutex);
+    if (poll(&p, 1, sleep_ms) <= 0) continue;
+    const ssize_t n = recv(p.fd, text + length, sizeof text - length, 0);
+    if (n <= 0) return unused;
+    length += n;
+    char *line = text, *end;
+    pthread_mutex_lock(&mutex);
+    for (; (end = memchr(line, '\n', text + length - line)); line = end + 1) {
+      unsigned long long ns;
+      unsigned number, value;
+      *end = 0;
+      if (sscanf(line, "S %llu %u %u", &ns, &number, &value) == 3 && number < n_lines) debounced(number, !!value, ns);
+    }
+    pthread_mutex_unlock(&mutex);
+    length -= line - text;
+    memmove(text, line, length);
+  }
+}
+
+/* ---- requests: each returns an error number, 0 for none; the mutex is held ---- */
+static int configure(struct request *r, int fd, const struct gpio_v2_line_config *c) {
+  for (int i = 0; i < r->n; i++) {
+    struct line *l = &lines[r->offsets[i]];
+    uint64_t flags = c->flags, value = 0, debounce_us = 0;
+    for (unsigned a = 0; a < c->num_attrs; a++) {
+      if (!(c->attrs[a].mask >> i & 1)) continue;
+      const struct gpio_v2_line_attribute *t = &c->attrs[a].attr;
+      if (t->id == GPIO_V2_LINE_ATTR_ID_FLAGS) flags = t->flags;
+      if (t->id == GPIO_V2_LINE_ATTR_ID_OUTPUT_VALUES) value = t->values >> i & 1;
+      if (t->id == GPIO_V2_LINE_ATTR_ID_DEBOUNCE) debounce_us = t->debounce_period_us;
+    }
+    if (flags & EDGES && flags & GPIO_V2_LINE_FLAG_OUTPUT) return EINVAL;
+    if (flags & EDGES && no_edges) return ENXIO;
+    l->flags = flags | GPIO_V2_LINE_FLAG_USED;
+    l->debounce_ns = debounce_us * 1000;
+    l->owner = r;
+    l->owner_fd = fd;
+    if (flags & GPIO_V2_LINE_FLAG_OUTPUT) set_output(r->offsets[i], value ^ !!(flags & GPIO_V2_LINE_FLAG_ACTIVE_LOW));
+  }
+  return 0;
+}
+
+static void release(struct request *r) {
+  for (int i = 0; i < r->n; i++) {
+    struct line *l = &lines[r->offsets[i]];
+    if (l->owner != r) continue;
+    set_output(r->offsets[i], 0); /* an input again, pulled down */
+    l->owner = 0;
+    l->flags = l->debounce_ns = l->pending = 0;
+    l->consumer[0] = 0;
+  }
+  free(r->events);
+  free(r);
+}
+
+static int request_lines(struct gpio_v2_line_request *q) {
+  if (q->num_lines == 0 || q->num_lines > MAX_LINES) return EINVAL;
+  for (unsigned i = 0; i < q->num_lines; i++) {
+    if (q->offsets[i] >= n_lines) return EINVAL;
+    if (lines[q->offsets[i]].flags & GPIO_V2_LINE_FLAG_USED) return EBUSY;
+  }
+  const int fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+  if (fd < 0 || fd >= MAX_FD) return EMFILE;
+  struct request *r = calloc(1, sizeof *r);
+  r->n = q->num_lines;
+  memcpy(r->offsets, q->offsets, sizeof r->offsets);
+  r->capacity = q->event_buffer_size ? q->event_buffer_size : 16 * q->num_lines;
+  if (r->capacity > MAX_EVENTS) r->capacity = MAX_EVENTS;
+  r->events = calloc(r->capacity, sizeof *r->events);
+  const int error = configure(r, fd, &q->config);
+  if (error) {
+    release(r);
+    REAL(close)(fd);
+    return error;
+  }
+  for (int i = 0; i < r->n; i++) {
+    struct line *l = &lines[r->offsets[i]];
+    l->seqno = 0;
+    snprintf(l->consumer, sizeof l->consumer, "%s", q->consumer);
+  }
+  by_fd[fd] = r;
+  q->fd = fd;
+  return 0;
+}
+
+static int describe_line(struct gpio_v2_line_info *i) {
+  const unsigned n = i->offset;
+  if (n >= n_lines) return EINVAL;
+  memset(i, 0, sizeof *i);
+  i->offset = n;
+  i->flags = lines[n].flags ? lines[n].flags : GPIO_V2_LINE_FLAG_INPUT;
+  snprintf(i->name, sizeof i->name, "GPIO%u", n);
+  snprintf(i->consumer, sizeof i->consumer, "%s", lines[n].consumer);
+  if (lines[n].debounce_ns) {
+    i->num_attrs = 1;
+    i->attrs[0].id = GPIO_V2_LINE_ATTR_ID_DEBOUNCE;
+    i->attrs[0].debounce_period_us = lines[n].debounce_ns / 1000;
+  }
+  return 0;
+}
+
+static int ask_chip(unsigned long what, void *arg) {
+  struct gpiochip_info *info = arg;
+  switch (what) {
+  case GPIO_GET_CHIPINFO_IOCTL:
+    memset(info, 0, sizeof *info);
+    snprintf(info->name, sizeof info->name, "gpiochip0");
+    snprintf(info->label, sizeof info->label, "%s", getenv("GPIOSHIM_LABEL") ?: "gpioshim");
+    info->lines = n_lines;
+    return 0;
+  case GPIO_V2_GET_LINEINFO_IOCTL: return describe_line(arg);
+  case GPIO_V2_GET_LINE_IOCTL: return request_lines(arg);
+  }
+  return ENOTTY;
+}
+
+static int ask_lines(struct request *r, int fd, unsigned long what, void *arg) {
+  struct gpio_v2_line_values *v = arg;
+  if (what == GPIO_V2_LINE_SET_CONFIG_IOCTL) return configure(r, fd, arg);
+  if (what != GPIO_V2_LINE_GET_VALUES_IOCTL && what != GPIO_V2_LINE_SET_VALUES_IOCTL) return ENOTTY;
+  if (what == GPIO_V2_LINE_GET_VALUES_IOCTL) v->bits = 0;
+  for (int i = 0; i < r->n; i++) {
+    const struct line *l = &lines[r->offsets[i]];
+    const int low = !!(l->flags & GPIO_V2_LINE_FLAG_ACTIVE_LOW), output = !!(l->flags & GPIO_V2_LINE_FLAG_OUTPUT);
+    if (!(v->mask >> i & 1)) continue;
+    if (what == GPIO_V2_LINE_GET_VALUES_IOCTL)
+      v->bits |= (uint64_t)((output ? shared->high[r->offsets[i]] : level(l)) ^ low) << i;
+    else if (!output) return EPERM;
+    else set_output(r->offsets[i], (v->bits >> i & 1) ^ low);
+  }
+  return 0;
+}
+
+/* ---- the calls that are stood in for ---- */
+int open(const char *path, int flags, ...) {
+  va_list more;
+  va_start(more, flags);
+  const int mode = va_arg(more, int);
+  va_end(more);
+  const int ours = chip[0] && !strcmp(path, chip);
+  if (ours && (denied || gone)) {
+    errno = gone ? ENODEV : EACCES;
+    return -1;
+  }
+  const int fd = REAL(open)(path, flags, mode);
+  if (ours && fd >= 0 && fd < MAX_FD) is_chip[fd] = 1;
+  return fd;
+}
+
+int ioctl(int fd, unsigned long what, ...) {
+  va_list more;
+  va_start(more, what);
+  void *arg = va_arg(more, void *);
+  va_end(more);
+  if (fd < 0 || fd >= MAX_FD || !(is_chip[fd] || by_fd[fd])) return REAL(ioctl)(fd, what, arg);
+  what = (uint32_t)what; /* some callers extend the sign */
+  pthread_mutex_lock(&mutex);
+  const int error = gone ? ENODEV : is_chip[fd] ? ask_chip(what, arg) : ask_lines(by_fd[fd], fd, what, arg);
+  pthread_mutex_unlock(&mutex);
+  if (slow_us && what == GPIO_V2_LINE_SET_VALUES_IOCTL) usleep(slow_us);
+  errno = error;
+  return error ? -1 : 0;
+}
+
+ssize_t read(int fd, void *buffer, size_t size) {
+  if (fd < 0 || fd >= MAX_FD || !by_fd[fd]) return REAL(read)(fd, buffer, size);
+  struct request *r = by_fd[fd];
+  struct gpio_v2_line_event *events = buffer;
+  size_t n = 0;
+  if (wire_clock && size > sizeof *events) size = sizeof *events; /* time stands still at each edge until it is answered */
+  while (!n && !gone) {
+    struct pollfd p = { fd, POLLIN, 0 };
+    poll(&p, 1, -1);
+    pthread_mutex_lock(&mutex);
+    for (; n < size / sizeof *events && r->tail != r->head; n++) events[n] = r->events[r->tail++ % r->capacity];
+    uint64_t count;
+    if (r->tail == r->head && !gone) (void)!REAL(read)(fd, &count, sizeof count);
+    pthread_mutex_unlock(&mutex);
+  }
+  if (wire_clock && n && events[n - 1].timestamp_ns > thread_ns) thread_ns = events[n - 1].timestamp_ns;
+  if (!n) errno = ENODEV;
+  return n ? (ssize_t)(n * sizeof *events) : -1;
+}
+
+int close(int fd) {
+  if (fd >= 0 && fd < MAX_FD) {
+    pthread_mutex_lock(&mutex);
+    is_chip[fd] = 0;
+    if (by_fd[fd]) release(by_fd[fd]);
+    by_fd[fd] = 0;
+    pthread_mutex_unlock(&mutex);
+  }
+  return REAL(close)(fd);
+}
+
+char *realpath(const char *path, char *buffer) { /* libgpiod asks sysfs whether /dev/null (1:3) is a GPIO chip */
+  if (!chip[0] || strncmp(path, "/sys/dev/char/1:3/", 18)) return REAL(realpath)(path, buffer);
+  return buffer ? strcpy(buffer, "/sys/bus/gpio") : strdup("/sys/bus/gpio");
+}
+
+/* ---- start ---- */
+static void vanish(int number) {
+  (void)number;
+  gone = 1;
+  for (int fd = 0; fd < MAX_FD; fd++)
+    if (by_fd[fd]) eventfd_write(fd, 1);
+}
+
+static void give_up(const char *what) {
+  fprintf(stderr, "gpioshim: %s: %s\n", what, strerror(errno));
+  _exit(3);
+}
+
+static void connect_wires(const char *path) {
+  struct sockaddr_un a = { .sun_family = AF_UNIX };
+  char text[512] = "L", answer[2];
+  int n = 1;
+  strncpy(a.sun_path, path, sizeof a.sun_path - 1);
+  wires = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
+  if (connect(wires, (struct sockaddr *)&a, sizeof a)) give_up(path);
+  for (unsigned i = 0; i < n_lines; i++) n += snprintf(text + n, sizeof text - n, " %u", i);
+  text[n++] = '\n';
+  if (send(wires, text, n, MSG_NOSIGNAL) != n || recv(wires, answer, 2, MSG_WAITALL) != 2 || *answer != 'K') give_up(path);
+}
+
+static void read_faults(char *list) {
+  unsigned n;
+  for (char *word = strtok(list, ","); word; word = strtok(0, ",")) {
+    if (!strcmp(word, "denied")) denied = 1;
+    else if (!strcmp(word, "no-edges")) no_edges = 1;
+    else if (sscanf(word, "slow:%d", &slow_us) == 1) continue;
+    else if (sscanf(word, "busy:%u", &n) == 1 && n < n_lines) {
+      lines[n].flags = GPIO_V2_LINE_FLAG_USED | GPIO_V2_LINE_FLAG_OUTPUT;
+      strcpy(lines[n].consumer, "another-program");
+    } else {
+      errno = EINVAL;
+      give_up(word);
+    }
+  }
+}
+
+__attribute__((constructor)) static void start(void) {
+  const char *path = getenv("GPIOSHIM_CHIP"), *count = getenv("GPIOSHIM_LINES"), *faults = getenv("GPIOSHIM_FAULTS");
+  if (!path) return;
+  unsetenv("LD_PRELOAD"); /* this program, not its children */
+  snprintf(chip, sizeof chip, "%s", path);
+  if (count) n_lines = atoi(count) < MAX_LINES ? atoi(count) : MAX_LINES;
+  if (faults) read_faults(strdup(faults));
+  wire_clock = getenv("GPIOSHIM_CLOCK") && !strcmp(getenv("GPIOSHIM_CLOCK"), "wires");
+  unlink(chip);
+  if (symlink("/dev/null", chip)) give_up(chip);
+  shared = mmap(0, sizeof *shared, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+  if (shared == MAP_FAILED) give_up("mmap");
+  signal(SIGUSR1, vanish);
+  if (!getenv("GPIOSHIM_WIRES")) return;
+  connect_wires(getenv("GPIOSHIM_WIRES"));
+  int alive[2];
+  if (pipe2(alive, O_CLOEXEC)) give_up("pipe");
+  const pid_t second = fork();
+  if (second < 0) give_up("fork");
+  if (second == 0) {
+    setsid(); /* signals to the program's group are not meant for it */
+    wires = dup2(wires, 100);
+    const int end = dup2(alive[0], 101);
+    close_range(0, 99, 0); /* whoever reads the program's output sees its end, and `alive` ends with the program */
+    carry(end);
+  }
+  REAL(close)(alive[0]); /* alive[1] stays open as long as this program lives */
+  sigset_t all, before;
+  pthread_t thread;
+  sigfillset(&all);
+  pthread_sigmask(SIG_SETMASK, &all, &before); /* signals are for the program's own threads */
+  pthread_create(&thread, 0, listen_to_wires, 0);
+  pthread_sigmask(SIG_SETMASK, &before, 0);
+}

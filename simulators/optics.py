@@ -1,0 +1,144 @@
+"""The integrand of the object's echo, and its exact, slow sum: physical optics on a plane parallel to the stage.
+
+Amplitudes are relative to the direct path: a free path of length R has amplitude d / R, d the board's direct path to
+RX1. Antenna patterns are not modelled beyond one constant, the scene's `object_gain`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.config import Board, Instrument
+from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from shared.units import SPEED_OF_LIGHT_M_S
+from simulators.fresnel import plate_reflection
+from simulators.scene import Plate, Scene
+
+Real = NDArray[np.floating]
+Complex = NDArray[np.complexfloating]
+Reflectivity = Callable[[Plate, float, Real], Complex]
+
+
+@dataclass(frozen=True)
+class Antennas:
+    """TX and the RX of one board at stage offset zero, metres, rig frame; z of the object plane; the image centre."""
+
+    tx_m: Real
+    rx_m: Real
+    plane_z_m: float
+    centre_m: Real
+
+    @property
+    def direct_m(self) -> Real:
+        """TX to each RX, metres, [rx]."""
+        return np.linalg.norm(self.rx_m - self.tx_m, axis=1)
+
+    def legs(self, x_m: Real, y_m: Real, rx: int) -> tuple[Real, Real, Real, Real]:
+        """Geometry of object points (x, y) relative to the stage: r1, r2 (m), local incidence (rad), obliquity.
+
+        Local incidence is half the angle between the directions to TX and RX; obliquity is the mean cosine of both
+        directions to the plane's normal.
+        """
+        z = self.plane_z_m
+        ax, ay, az = x_m - self.tx_m[0], y_m - self.tx_m[1], z - self.tx_m[2]
+        bx, by, bz = x_m - self.rx_m[rx, 0], y_m - self.rx_m[rx, 1], z - self.rx_m[rx, 2]
+        r1, r2 = np.sqrt(ax**2 + ay**2 + az**2), np.sqrt(bx**2 + by**2 + bz**2)
+        theta = 0.5 * np.arccos(np.clip((ax * bx + ay * by + az * bz) / (r1 * r2), -1.0, 1.0))
+        return r1, r2, theta, 0.5 * (az / r1 + bz / r2)
+
+
+def antennas(rig: Instrument, board: Board) -> Antennas:
+    """Antenna positions of the transmitter and one receiving board."""
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    centre = np.array(specular_midpoint_m(rig, rig.by_role("receive_h")))
+    return Antennas(tx, rx, rig.geometry.object_distance_mm / 1e3, centre)
+
+
+def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
+    """What a board sees of a plate: its own polarisation plus its cross-polar leakage of the other.
+
+    H: r_s + leak_h r_p. V: r_p + leak_v r_s. TX is turned 45 degrees: both polarisations leave with the same strength.
+    """
+    leak_h, leak_v = complex(*scene.disturbances.leakage_h), complex(*scene.disturbances.leakage_v)
+
+    def h(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
+        s, p = plate_reflection(plate, frequency_hz, theta)
+        return s + leak_h * p
+
+    def v(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
+        s, p = plate_reflection(plate, frequency_hz, theta)
+        return p + leak_v * s
+
+    return h if board.role == "receive_h" else v
+
+
+def direct_factor(board: Board, scene: Scene) -> complex:
+    """The direct path seen by a board: s and p parts are equal, so it is 1 + leakage."""
+    d = scene.disturbances
+    return 1.0 + complex(*(d.leakage_h if board.role == "receive_h" else d.leakage_v))
+
+
+def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
+    """Constant before the plates' integral: object_gain d / (j lambda), so that an endless mirror gives -gain d / R.
+
+    Kirchhoff's integral (Goodman, Introduction to Fourier Optics, section 3.5) for phase +2 pi f tau:
+    field = (1 / j lambda) integral r(theta) obliquity exp(+j 2 pi f (r1 + r2) / c) / (r1 r2) dA.
+    """
+    return complex(scene.object_gain * ant.direct_m[0] * frequency_hz / SPEED_OF_LIGHT_M_S / 1j)
+
+
+def point_scale(ant: Antennas) -> float:
+    """Constant before a point's 1 / (r1 r2), so that amplitude 1 at the specular midpoint equals the direct path."""
+    r1, r2, _, _ = ant.legs(ant.centre_m[0], ant.centre_m[1], 0)
+    return float(r1 * r2)
+
+
+def field_exact(
+    rig: Instrument, scene: Scene, board: Board, offsets_m: Real, frequencies_hz: Real, rx: int = 0
+) -> Complex:
+    """Object field by direct quadrature, point by point: slow, for tests and small jobs.
+
+    Gauss-Legendre over each plate, with an order high enough for the phase's change across it.
+
+    Parameters
+    ----------
+    rig, scene, board
+        Rig with the scene applied, the scene, and one of the rig's receiving boards.
+    offsets_m
+        Stage offsets [n, 2], metres, rig frame.
+    frequencies_hz
+        [k].
+    rx
+        RX of the board.
+
+    Returns
+    -------
+    complex128 [n, k], amplitude relative to the direct path, phase +2 pi f (r1 + r2) / c.
+    """
+    ant, reflect = antennas(rig, board), board_reflectivity(board, scene)
+    out = np.zeros((len(offsets_m), len(frequencies_hz)), dtype=np.complex128)
+    for plate in scene.plates:
+        cx, cy = ant.centre_m[:2] + np.array(plate.centre_mm) / 1e3
+        sx, sy = np.array(plate.size_mm) / 1e3
+        # The phase changes at most by 2 k per metre; Gauss-Legendre needs about half a point per radian, plus a few.
+        wave = 2 * np.pi * float(np.max(frequencies_hz)) / SPEED_OF_LIGHT_M_S
+        (nx, ax), (ny, ay) = (np.polynomial.legendre.leggauss(int(wave * s * 0.6) + 16) for s in (sx, sy))
+        x, y = np.meshgrid(cx + nx * sx / 2, cy + ny * sy / 2)
+        area = np.outer(ay * sy / 2, ax * sx / 2)
+        for n, (ox, oy) in enumerate(offsets_m):
+            r1, r2, theta, oblique = ant.legs(x - ox, y - oy, rx)
+            common = area * oblique / (r1 * r2)
+            for k, f in enumerate(frequencies_hz):
+                phase = np.exp(2j * np.pi * f / SPEED_OF_LIGHT_M_S * (r1 + r2))
+                out[n, k] += plate_scale(ant, scene, f) * np.sum(common * reflect(plate, f, theta) * phase)
+    for point in scene.points:
+        px, py = ant.centre_m[:2] + np.array(point.position_mm) / 1e3
+        r1, r2, _, _ = ant.legs(px - offsets_m[:, 0], py - offsets_m[:, 1], rx)
+        spread = complex(*point.amplitude) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
+        phase = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(r1 + r2, frequencies_hz))
+        out += spread[:, None] * phase
+    return out

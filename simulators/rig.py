@@ -1,0 +1,348 @@
+"""A whole simulated rig in one command: wires, stage, radars with their cards, and on request the Pi's program.
+
+    python -m simulators.rig --config instrument.toml --scene SCENE.toml --dir DIR --time-scale 30 --with-pi
+
+Writes DIR/instrument.toml, the rig file that reaches these processes, and DIR/truth.json, what the scene truly is; logs
+are in DIR/logs. Prints `ready DIR/instrument.toml` when everything serves, and ends everything on SIGTERM or SIGINT, or
+when one process ends by itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from threading import Event
+from typing import Any, NamedTuple
+
+import tomli_w
+
+from shared.config import Instrument, decode, load_instrument, to_builtins
+from shared.errors import ConfigError, DeviceError, PolysightError
+from simulators._process import announce_ready, die_with_parent, stop_requested
+from simulators.loopback import on_free_subnet
+from simulators.scene import Scene, apply_scene, load_scene
+from simulators.simulate import truth
+from simulators.wires import MAX_SOCKET_PATH
+
+PATIENT_HEARTBEAT_MS = 2000
+READY_LIMIT_S = 60.0
+STOP_LIMIT_S = 5.0
+UNO_TIME_SCALE = 2.0
+_LOOK_S = 0.02
+_NATIVE_OFFSET_HZ = 790e3  # puts the published rig's direct path in the middle of its IF window
+_LOG_LINES = 15
+# Several processes share few cores: one thread each for linear algebra. Two that spin against each other are ten times
+# slower than one.
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+
+
+def under_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
+    """Let the host configure a rig's radars: each is reached at its card's address, receivers get a start offset."""
+    names = [board["name"] for board in table["boards"]]
+    table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}
+    for board in table["boards"]:
+        if board["role"] != "transmit" and not board["start_offset_hz"]:
+            board["start_offset_hz"] = if_offset_hz or _NATIVE_OFFSET_HZ
+
+
+def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = False) -> Instrument:
+    """The rig file of a simulated rig that lives in `folder`: the scene's overrides, addresses of its own, its paths.
+
+    `native` puts its radars under the host's own control, whatever the rig file says.
+
+    Raises
+    ------
+    ConfigError
+        when an override breaks a rule.
+    DeviceError
+        when no loopback subnet is free.
+    """
+    table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
+    if native:
+        under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+    table["stage"]["port"] = str(folder / "ttySTAGE")
+    table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
+    # Its processes share a machine's cores with whatever else runs there, which a real rig's do not.
+    table["stage"]["heartbeat_ms"] = max(PATIENT_HEARTBEAT_MS, table["stage"]["heartbeat_ms"])
+    table["pi"]["host_heartbeat_ms"] = table["stage"]["heartbeat_ms"] // 4
+    return on_free_subnet(decode(table, Instrument, f"{rig.name}, simulated"))
+
+
+class Child:
+    """One process of the rig, with its log."""
+
+    def __init__(self, name: str, command: list[str], logs: Path) -> None:
+        self.name = name
+        self.log = logs / f"{name}.log"
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**_ENVIRONMENT, **os.environ},
+                start_new_session=True,  # Ctrl-C reaches the rig alone, which ends its processes in order
+                preexec_fn=die_with_parent,
+            )
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has said so."""
+        return any(line.startswith("ready") for line in self._lines())
+
+    def check(self) -> None:
+        """Raise DeviceError, with the last lines of its log, when it has ended."""
+        status = self._process.poll()
+        if status is not None:
+            raise DeviceError(
+                f"simulated rig: the {self.name} process ended with status {status}:\n" + self.last_lines(),
+                "see its last lines above",
+                f"the whole log is {self.log}",
+            )
+
+    def last_lines(self) -> str:
+        """The end of its log."""
+        return "\n".join(f"    {line}" for line in self._lines()[-_LOG_LINES:])
+
+    def _lines(self) -> list[str]:
+        return self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        self._process.send_signal(number)
+
+    def end(self) -> None:
+        """SIGTERM, and SIGKILL when that does not help."""
+        if self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(STOP_LIMIT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+
+
+class RigOptions(NamedTuple):
+    """How the simulated rig runs."""
+
+    time_scale: float = 1.0
+    with_pi: bool = False
+    seed: int | None = None
+    pattern: bool = False
+    faults: Path | None = None
+    single_faults: tuple[str, ...] = ()
+    cache: Path | None = None
+    real_pacing: bool = False
+    uno: bool = False
+    native: bool = False
+
+
+class RigProcesses:
+    """The processes of a simulated rig in `folder`, where its rig file lies.
+
+    Raises
+    ------
+    DeviceError
+        when one of them ends, or is not ready in time.
+    """
+
+    def __init__(self, rig: Instrument, scene: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
+        self._folder, self._logs = folder, folder / "logs"
+        self._logs.mkdir(parents=True, exist_ok=True)
+        self._stop = stop
+        self.children: list[Child] = []
+        try:
+            self._start(rig, scene, options)
+        except PolysightError:
+            self.end()
+            raise
+
+    def _start(self, rig: Instrument, scene: Path | None, options: RigOptions) -> None:
+        wires = str(self._folder / "wires.sock")
+        config, scale = str(self._folder / "instrument.toml"), repr(options.time_scale)
+        self._wait([self._module("wires", "wires", "--socket", wires)])
+        common = ["--config", config, "--wires", wires, "--time-scale", scale]
+        started = [self._module("stage", "uno" if options.uno else "stage", *common, "--link", rig.stage.port)]
+        started += [
+            self._module(
+                f"cards-{group.partition(',')[0]}",
+                "cards",
+                *common,
+                "--boards",
+                group,
+                *_card_options(scene, options),
+                *self._report(group),
+            )
+            for group in card_groups(rig)
+        ]
+        self._wait(started)
+        if options.with_pi:
+            self._wait([self._launch("pi", [_pi_program(), "run", "--config", config, "--wires", wires])])
+
+    def _report(self, group: str) -> tuple[str, str]:
+        return "--report", str(self._folder / f"cards-{group.partition(',')[0]}.json")
+
+    def _module(self, name: str, module: str, *arguments: str) -> Child:
+        return self._launch(name, [sys.executable, "-m", f"simulators.{module}", *arguments])
+
+    def _launch(self, name: str, command: list[str]) -> Child:
+        self.children.append(Child(name, command, self._logs))
+        return self.children[-1]
+
+    def _wait(self, started: list[Child]) -> None:
+        deadline = time.monotonic() + READY_LIMIT_S
+        while not self._stop.is_set():
+            self.check()
+            waiting = [child for child in started if not child.ready]
+            if not waiting:
+                return
+            if time.monotonic() > deadline:
+                raise DeviceError(
+                    f"simulated rig: {', '.join(c.name for c in waiting)} not ready after {READY_LIMIT_S:.0f} s:\n"
+                    + waiting[0].last_lines(),
+                    "an overloaded machine, or a fault shown above",
+                    f"the logs are in {self._logs}",
+                )
+            self._stop.wait(_LOOK_S)
+
+    def check(self) -> None:
+        """Raise DeviceError when a process has ended."""
+        for child in self.children:
+            child.check()
+
+    def power_cycle(self) -> None:
+        """Switch every capture card off and on."""
+        for child in self.children:
+            if child.name.startswith("cards-"):
+                child.send_signal(signal.SIGUSR1)
+
+    def end(self) -> None:
+        """End all processes, the last one first."""
+        for child in reversed(self.children):
+            child.end()
+
+
+def card_groups(rig: Instrument) -> list[str]:
+    """Boards that share a process: each recorded board has one to itself, the others go with the first."""
+    groups = [[b.name] for b in rig.recorded] or [[]]
+    groups[0] += [b.name for b in rig.boards if not b.record]
+    return [",".join(g) for g in groups]
+
+
+def _card_options(scene: Path | None, options: RigOptions) -> list[str]:
+    given = ["--scene", str(scene)] if scene is not None else []
+    given += ["--pattern"] if options.pattern else []
+    given += ["--seed", str(options.seed)] if options.seed is not None else []
+    given += ["--faults", str(options.faults)] if options.faults is not None else []
+    given += ["--cache", str(options.cache)] if options.cache is not None else []
+    given += ["--real-pacing"] if options.real_pacing else []
+    return given + [word for fault in options.single_faults for word in ("--fault", fault)]
+
+
+def _pi_program() -> str:
+    program = Path(sys.executable).parent / "polysight-pi"
+    if not program.exists():
+        raise ConfigError(
+            f"{program}: not there", "the Pi half is not installed in this environment", "pip install ./pi_controller"
+        )
+    return str(program)
+
+
+def _write_files(rig: Instrument, scene: Scene | None, folder: Path, options: RigOptions) -> None:
+    table = to_builtins(rig)
+    table["name"] = rig.name if rig.name.endswith("(simulated)") else f"{rig.name} (simulated)"
+    (folder / "instrument.toml").write_bytes(tomli_w.dumps(table).encode())
+    if scene is not None and not options.pattern:
+        facts = truth(rig, scene, scene.seed if options.seed is None else options.seed)
+        (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+
+
+def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
+    """Start a simulated rig, say that it is ready, and keep it until `stop` is set.
+
+    Raises
+    ------
+    PolysightError
+        when a file is wrong, or a process does not start or ends by itself.
+    """
+    folder = folder.resolve()
+    if len(str(folder / "wires.sock").encode()) > MAX_SOCKET_PATH:
+        raise ConfigError(f"--dir {folder}: too long a path", "it holds a Unix socket", "choose a shorter one")
+    if options.uno and options.time_scale > UNO_TIME_SCALE:
+        raise ConfigError(
+            f"--uno with --time-scale {options.time_scale:g}",
+            "the heartbeat clock of the board runs as fast as the rest of it, and the Pi's does not",
+            f"give at most {UNO_TIME_SCALE:g}, or leave out --uno",
+        )
+    scene = None if scene_path is None else load_scene(scene_path)
+    if scene is None and not options.pattern:
+        raise ConfigError("neither --scene nor --pattern", "the radars need something to see", "give one of them")
+    rig = derive(load_instrument(config), scene, folder, options.native)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_files(rig, scene, folder, options)
+    power_cycle = Event()
+    signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
+    processes = RigProcesses(rig, scene_path, folder, options, stop)
+    try:
+        if not stop.is_set():
+            announce_ready(str(folder / "instrument.toml"))
+        while not stop.wait(0.2):
+            processes.check()
+            if power_cycle.is_set():
+                power_cycle.clear()
+                processes.power_cycle()
+    finally:
+        processes.end()
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a simulated rig until SIGTERM or SIGINT."""
+    parser = argparse.ArgumentParser(prog="python -m simulators.rig", description="A whole simulated rig.")
+    parser.add_argument("--config", type=Path, required=True, help="rig file to begin from")
+    parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")
+    parser.add_argument("--dir", type=Path, required=True, help="folder of this rig: its rig file, logs, serial port")
+    parser.add_argument("--time-scale", type=float, default=1.0, help="wire time over wall time")
+    parser.add_argument("--with-pi", action="store_true", help="run the Pi's program too")
+    parser.add_argument("--seed", type=int, help="default: the scene's")
+    parser.add_argument("--pattern", action="store_true", help="a counting pattern instead of the scene's signals")
+    parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table for the cards")
+    parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")
+    parser.add_argument("--cache", type=Path, help="folder where the scene's object fields are kept between runs")
+    parser.add_argument("--real-pacing", action="store_true", help="each packet by itself when due, as from a card")
+    parser.add_argument(
+        "--uno",
+        action="store_true",
+        help=f"the stage is the sketch's machine code on an emulated board; --time-scale at most {UNO_TIME_SCALE:g}",
+    )
+    parser.add_argument("--native", action="store_true", help="the host configures and arms the radars (simulated USB)")
+    args = parser.parse_args(argv)
+    stop = stop_requested()
+    die_with_parent()
+    options = RigOptions(
+        args.time_scale,
+        args.with_pi,
+        args.seed,
+        args.pattern,
+        args.faults,
+        tuple(args.fault),
+        args.cache,
+        args.real_pacing,
+        args.uno,
+        args.native,
+    )
+    try:
+        run(args.config, args.scene, args.dir, options, stop)
+    except PolysightError as e:
+        sys.stderr.write(f"error: {e}\n")
+        return e.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

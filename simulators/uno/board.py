@@ -1,0 +1,150 @@
+"""The emulated board under the command of a Python program: time goes on only when told."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+from shared.errors import DeviceError
+
+HZ = 16_000_000
+STEP_VECTOR, TRIGGER_END_VECTOR, MILLIS_VECTOR, RECEIVE_VECTOR, SEND_VECTOR = 11, 12, 16, 18, 19
+
+
+class PinEdge(NamedTuple):
+    """An edge of a watched pin, at an exact cycle of the 16 MHz clock."""
+
+    cycle: int
+    pin: int  # Arduino number; A0 is 14
+    value: int
+    x: int  # motor steps, counted at the pins from where the stage stood when it was switched on
+    left: int
+    right: int
+    step_cycle: int  # of the last rising PUL edge
+
+
+class Cost(NamedTuple):
+    """Worst cases since the last question, in cycles."""
+
+    interrupts: dict[int, int]  # by vector number: from entry to the end of reti
+    step_pulse: int  # shortest
+    direction_setup: int  # shortest time from DIR to PUL
+    direction_hold: int  # ... and from PUL to DIR
+
+
+class EmulatedUno:
+    """A board with its motors and switches, just switched on.
+
+    Parameters
+    ----------
+    program, image
+        From :func:`simulators.uno.emulator` and :func:`simulators.uno.firmware`.
+    start
+        Steps the stage stands clear of its switches.
+    watch
+        Pins whose edges are collected.
+    pty
+        Name to give a pseudo terminal with the serial line; None: :meth:`feed` and `received`.
+    """
+
+    def __init__(
+        self,
+        program: Path,
+        image: Path,
+        start: tuple[int, int] = (2000, 1500),
+        watch: tuple[int, ...] = (2,),
+        pty: Path | None = None,
+    ) -> None:
+        self.edges: list[PinEdge] = []
+        self.received = bytearray()
+        self.troubles: list[str] = []  # resets, lost bytes, crashes
+        self.cycle = 0
+        self.motors = (start[0], start[1], start[1])  # x, left, right
+        self.sent = 0  # bytes to the pseudo terminal
+        self._counted: dict[int, int] = {}
+        self._cost_pins = (0, 0, 0)
+        command = [str(program), "--parent", str(os.getpid()), "--start", f"{start[0]},{start[1]}"]
+        command += ["--watch", ",".join(map(str, watch)), *(["--pty", str(pty)] if pty else []), str(image)]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._collect()
+
+    def _collect(self) -> None:
+        output = self._process.stdout
+        if output is None:
+            raise DeviceError("the UNO emulator has no output", "a bug", "report it")
+        for line in output:
+            tag, *rest = line.split()
+            if tag == "E":
+                self.edges.append(PinEdge(*map(int, rest)))
+            elif tag == "T":
+                self.received.append(int(rest[1], 16))
+            elif tag == "R":
+                self.cycle, *motors, self.sent = map(int, rest)
+                self.motors = (motors[0], motors[1], motors[2])
+                return
+            elif tag == "C":
+                self._counted[int(rest[0])] = int(rest[2])
+            elif tag == "W":
+                pulse, setup, hold = map(int, rest)
+                self._cost_pins = (pulse, setup, hold)
+            else:
+                self.troubles.append(" ".join(rest[1:]))
+        raise DeviceError("the UNO emulator ended", "it crashed; its last words are on standard error", "report it")
+
+    def _do(self, line: str) -> None:
+        if self._process.stdin is None:
+            raise DeviceError("the UNO emulator has no input", "a bug", "report it")
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        self._collect()
+
+    def feed(self, data: bytes) -> None:
+        """Put bytes on the serial line; they arrive as time goes on."""
+        self._do(f"feed {data.hex()}")
+
+    def run(self, cycles: int) -> None:
+        """Let time go on."""
+        self._do(f"run {max(1, cycles)}")
+
+    def run_ms(self, ms: float) -> None:
+        """Let time go on."""
+        self.run(round(ms * HZ / 1000))
+
+    def settle(self, pty_bytes: int = 0) -> None:
+        """Until nothing is on the serial line; `pty_bytes`: how many were written to the pseudo terminal in all."""
+        self._do(f"settle {pty_bytes}")
+
+    def rest(self, limit_s: float = 600.0) -> None:
+        """Until no motor has stepped for 50 ms."""
+        self._do(f"rest {round(limit_s * HZ)}")
+
+    def press(self, mask: int) -> None:
+        """Press switches: 1 x, 2 y, 4 emergency stop."""
+        self._do(f"inputs {mask}")
+
+    def slip(self, dx: int, dy: int) -> None:
+        """Lose steps."""
+        self._do(f"slip {dx} {dy}")
+
+    def reset(self) -> None:
+        """The reset button."""
+        self._do("reset")
+
+    def watch(self, *pins: int) -> None:
+        """Edges of these pins are collected from now on."""
+        self._do("watch " + ",".join(map(str, pins)))
+
+    def cost(self) -> Cost:
+        """Worst cases since the last question."""
+        self._counted = {}
+        self._do("cost")
+        return Cost(self._counted, *self._cost_pins)
+
+    def close(self) -> None:
+        """End it."""
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()
+        self._process.wait(10)

@@ -1,0 +1,111 @@
+"""The published method, as the benchmarks run it, really synchronises and images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from benchmarks.data import RIG
+from benchmarks.published.image import SETTINGS, form_image
+from benchmarks.published.synchronise import Synchroniser
+from host.imaging import ImageGrid, backproject, image_grid
+from host.imaging.grid import Antennas
+from shared.config import Instrument, load_instrument
+from shared.raster import mean_burst_travel_mm, plan_raster
+from simulators.radar import SimulatedRig, reference_cube
+from simulators.scene import Scene, apply_scene, decode_scene
+from simulators.simulate import row_offsets_mm
+
+STEP_MM = 5.0
+SMALL = {
+    "name": "three points",
+    "grid": {"columns": 45, "rows": 37, "step_x_mm": STEP_MM, "step_y_mm": STEP_MM},
+    "burst": {"pulses": 2},
+    "image": {"columns": 24, "rows": 24, "pixel_mm": STEP_MM},
+    "points": [
+        {"position_mm": [0.0, 0.0], "amplitude": [0.6, 0.0]},
+        {"position_mm": [40.0, 10.0], "amplitude": [0.4, 0.0]},
+        {"position_mm": [-30.0, 35.0], "amplitude": [0.0, 0.4]},
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def world() -> tuple[Instrument, Scene]:
+    scene = decode_scene(SMALL, "test")
+    return apply_scene(load_instrument(RIG), scene), scene
+
+
+@pytest.fixture(scope="module")
+def cube(world: tuple[Instrument, Scene]) -> NDArray[np.complex64]:
+    """Object alone, perfectly synchronised: [rx, row, column, sample]."""
+    return reference_cube(*world)["RH"]
+
+
+@pytest.fixture(scope="module")
+def truth(world: tuple[Instrument, Scene], cube: NDArray[np.complex64]) -> NDArray[np.complex128]:
+    """Matched filter of that object at its true positions, in double precision, from every twelfth sample."""
+    rig, _ = world
+    antennas, grid, chirp = Antennas.of(rig, rig.by_name("RH")), image_grid(rig), rig.chirp
+    chosen = np.arange(*chirp.linear_samples, 12)
+    frequencies = chirp.first_sample_hz + chirp.hz_per_sample * chosen
+    travel = mean_burst_travel_mm(rig.burst, rig.stage)
+    shift = np.array(
+        [
+            ((x - (cube.shape[2] - 1) / 2) * STEP_MM + row.direction * travel, row.y_mm, 0.0)
+            for row in plan_raster(rig.grid)
+            for x in range(cube.shape[2])
+        ]
+    )
+    shift /= 1e3
+    image = sum(
+        backproject(
+            cube[rx].reshape(len(shift), -1)[:, chosen],
+            frequencies,
+            antennas.tx_m + shift,
+            place + shift,
+            grid.voxels_m,
+            np.full(len(shift), antennas.direct_m[rx]),
+        )
+        for rx, place in enumerate(antennas.rx_m)
+    )
+    return np.asarray(image).reshape(grid.shape)
+
+
+def correlation(a: NDArray[np.complexfloating], b: NDArray[np.complexfloating]) -> float:
+    return float(abs(np.vdot(a, b)) / np.linalg.norm(a) / np.linalg.norm(b))
+
+
+def test_imager_makes_the_matched_filters_image(
+    world: tuple[Instrument, Scene], cube: NDArray[np.complex64], truth: NDArray[np.complex128]
+) -> None:
+    rig, _ = world
+    grid = image_grid(rig)
+    found = [correlation(form_image(cube, rig, rig.by_name("RH"), grid, n), truth) for n in SETTINGS]
+    assert found[0] > 0.98
+    assert found == sorted(found), "finer range bins must not make it worse"
+
+
+def test_the_tuned_imager_makes_the_same_image(world: tuple[Instrument, Scene], cube: NDArray[np.complex64]) -> None:
+    rig, _ = world
+    grid: ImageGrid = image_grid(rig)
+    plain, tuned = (form_image(cube, rig, rig.by_name("RH"), grid, tuned=t) for t in (False, True))
+    np.testing.assert_allclose(tuned, plain, atol=1e-5 * np.abs(plain).max())
+
+
+@pytest.mark.parametrize("tuned", [False, True])
+def test_synchroniser_makes_a_disturbed_scan_like_the_ideal_one(
+    world: tuple[Instrument, Scene], truth: NDArray[np.complex128], tuned: bool
+) -> None:
+    """Fully disturbed chirps, two a position, through both of its stages into its imager."""
+    rig, scene = world
+    board = rig.by_name("RH")
+    radar, method = SimulatedRig(rig, scene), Synchroniser(rig, board, tuned)
+    plan = plan_raster(rig.grid)
+    synced = np.empty((4, plan.rows, plan.columns, rig.chirp.samples), np.complex64)
+    for row in plan:
+        x, y = row_offsets_mm(radar, row)
+        payload = radar.chirps("RH", x, y, row.index * len(x)).view(np.uint8).ravel()
+        synced[:, row.index, [row.column(i) for i in range(row.points)]] = method.row(payload, row.points)
+    assert correlation(form_image(synced, rig, board, image_grid(rig)), truth) > 0.9

@@ -1,0 +1,44 @@
+"""Every benchmark of the processing runs on a tiny grid, and writes its figures with the machine's name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import accuracy, image, sync, table, whole
+from benchmarks.__main__ import main
+from benchmarks.measure import THREADS
+
+MODULES = {"sync": sync, "image": image, "whole": whole, "accuracy": accuracy}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODULES)
+def test_quick_trial(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in THREADS:  # main sets them; here they are put back
+        monkeypatch.setenv(variable, "1")
+    assert main(["--out", str(tmp_path), name, "--quick", "--folder", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / f"{name}.json").read_text())
+    printed = capsys.readouterr().out
+    assert found["simulated"]
+    assert found["machine"]["cores"]
+    assert found["lines"]
+    for line in found["lines"]:
+        assert np.isfinite(line["value"])
+        assert line["quantity"] in printed
+    assert "not a measurement" in printed
+    assert not list(tmp_path.glob("polysight-bench-*")), "its data is removed"
+
+
+@pytest.mark.parametrize(
+    ("value", "higher", "verdict"),
+    [(30.0, True, "aim"), (20.0, True, "holds"), (5.0, True, "DOES NOT HOLD"), (5.0, False, "aim")],
+)
+def test_verdict(value: float, higher: bool, verdict: str) -> None:
+    limits = (10.0, 25.0) if higher else (25.0, 10.0)
+    assert table.Line("x", "", "", value, *limits, higher_is_better=higher).verdict == verdict

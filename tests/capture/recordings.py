@@ -1,0 +1,60 @@
+"""Recordings made by formula: rows of every layout, and packet captures."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+CARD, OTHER = b"\xc0\xa8\x21\xb4", b"\xc0\xa8\x21\xb5"
+
+
+def row(lanes: int, q_first: bool, chirps: int = 32, samples: int = 256, dead: int | None = None) -> np.ndarray:
+    """Two tones a chirp at positive frequencies, noise, int16 words."""
+    rng = np.random.default_rng(5)
+    t = np.arange(samples)
+    x = np.zeros((4, chirps, samples), dtype=complex)
+    for c in range(chirps):
+        f = rng.uniform(0.05, 0.4)
+        tones = 300 * np.exp(2j * np.pi * f * t) + 200 * np.exp(2j * np.pi * (f + 0.014) * t + 1j)
+        for r in range(4):
+            noise = rng.normal(scale=20, size=(2, samples))
+            x[r, c] = tones * np.exp(1j * r) + noise[0] + 1j * noise[1]
+    if dead is not None:
+        x[dead] = 0
+    parts = np.stack([x.imag, x.real] if q_first else [x.real, x.imag])  # [part, rx, chirp, sample]
+    if lanes == 4:
+        words = parts.transpose(2, 3, 0, 1)
+    else:
+        words = parts.reshape(2, 4, chirps, samples // 2, 2).transpose(2, 1, 3, 0, 4)
+    return np.round(words).astype("<i2").reshape(-1)
+
+
+def real_row(lanes: int, chirps: int = 32, samples: int = 256) -> np.ndarray:
+    """Real samples: with 4 lanes every RX a sample, with 2 chirp after chirp of each RX."""
+    rng = np.random.default_rng(6)
+    t = np.arange(samples)
+    x = np.zeros((4, chirps, samples))
+    for c in range(chirps):
+        f = rng.uniform(0.1, 0.3)
+        for r in range(4):
+            x[r, c] = 900 * np.cos(2 * np.pi * f * t + 1.1 * r) + rng.normal(scale=5, size=samples)
+    return np.round(x.transpose(1, 2, 0) if lanes == 4 else x.transpose(1, 0, 2)).astype("<i2").reshape(-1)
+
+
+def udp_frame(source_port: int, payload: bytes, card: bytes = CARD) -> bytes:
+    udp = struct.pack(">HHHH", source_port, 4098, 8 + len(payload), 0) + payload
+    ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0x4000, 64, 17, 0, card, b"\xc0\xa8!\x1e")
+    return bytes(12) + b"\x08\x00" + ip + udp
+
+
+def write_pcap(
+    path: Path, payloads: list[bytes], order: str = "<", magic: int = 0xA1B2C3D4, cards: tuple[bytes, ...] = (CARD,)
+) -> None:
+    """Packets, from the cards in turn."""
+    raw = struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, 1)
+    for k, p in enumerate(payloads):
+        frame = udp_frame(1024, p, cards[k % len(cards)])
+        raw += struct.pack(order + "IIII", 100 + k, 5, len(frame), len(frame)) + frame
+    path.write_bytes(raw)

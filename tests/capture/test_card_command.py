@@ -1,0 +1,217 @@
+"""`polysight card` as a user runs it, against simulated cards: which hop is silent, and what is written."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from shared.config import to_builtins
+from simulators.card_faults import Faults
+from simulators.card_sender import bound_udp
+
+POLYSIGHT = Path(sys.executable).parent / "polysight"
+LIMIT_S = 60.0
+NEW_MAC = "12:34:56:78:90:13"
+
+
+@pytest.fixture
+def card(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Runs `polysight card ...` beside the rig file."""
+
+    def run(*words: str, typed: str = "") -> subprocess.CompletedProcess[str]:
+        command = [str(POLYSIGHT), "card", *words]
+        return subprocess.run(
+            command, input=typed, capture_output=True, text=True, cwd=tmp_path, timeout=LIMIT_S, check=False
+        )
+
+    return run
+
+
+def verdicts(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, dict[str, str]]]:
+    """Hops by board and name."""
+    return {s["name"]: {hop["hop"]: hop for hop in s["hops"]} for s in json.loads(done.stdout)}
+
+
+def test_every_hop_of_every_card(cards, card):
+    cards("LS", "RH", "RV")
+    done = card("--json")
+    assert done.returncode == 0, done.stderr
+    surveys = json.loads(done.stdout)
+    assert [(s["name"], s["ok"], s["fpga_version"], s["silent_hop"]) for s in surveys] == [
+        (name, True, "2.8", "") for name in ("LS", "RH", "RV")
+    ]
+    for name, hops in verdicts(done).items():
+        for hop in ("host", "route", "link", "card"):
+            assert hops[hop]["verdict"] == "ok"
+        received = "not checked" if name == "LS" else "ok"
+        assert hops["buffer"]["verdict"] in (received, "warning")
+        assert hops["radar"]["verdict"] == "not checked"
+        receiver = hops["receiver"]
+        if name == "LS":
+            assert receiver["verdict"] == "not checked"
+        elif receiver["verdict"] == "ok":
+            assert "real-time priority" in receiver["found"]
+        else:  # a right is missing: which, and what to do
+            assert (receiver["verdict"], receiver["why"] != "") == ("warning", True)
+            assert "limits.d" in receiver["remedy"]
+    text = card().stdout
+    for part in ("RH (receive_h)", "not recorded", "answers, FPGA 2.8", "bytes granted", "--listen", "core"):
+        assert part in text
+
+
+def test_a_mute_card_is_named_and_its_neighbour_is_sound(cards, card):
+    made = cards("RH", "RV", RV=Faults(mute=True))
+    done = card("--json")
+    assert done.returncode == 1
+    hops = verdicts(done)
+    assert hops["RH"]["card"]["verdict"] == "ok"
+    assert hops["RV"]["card"]["verdict"] == "error"
+    assert "did not answer ALIVE" in hops["RV"]["card"]["found"]
+    assert hops["RV"]["card"]["remedy"]
+    assert hops["RV"]["receiver"]["verdict"] == "not checked"
+    assert [s["silent_hop"] for s in json.loads(done.stdout)] == ["card", "", "card"]  # nobody plays LS
+    assert made.endpoints["RV"].counts["requests"] > 0
+    text = card().stdout
+    assert "error       card" in text
+    assert "not checked receiver, buffer, radar" in text
+
+
+def test_a_port_in_use_and_a_radar_that_does_not_stream(cards, card, rig, tmp_path):
+    recording = tmp_path / "played.bin"
+    np.arange(200_000, dtype="<u4").tofile(recording)
+    cards("RH", streams=recording)
+    cards("LS", "RV")
+    done = card("--listen", "1", "--json")
+    assert done.returncode == 1
+    hops = verdicts(done)
+    assert hops["RH"]["radar"]["verdict"] == "ok", hops["RH"]["radar"]
+    assert int(hops["RH"]["radar"]["found"].split()[0]) > 100
+    assert hops["RV"]["radar"]["verdict"] == "error"
+    assert "not streaming" in hops["RV"]["radar"]["why"]
+    board = rig.by_name("RV")
+    with bound_udp(board.host_address, board.data_port):
+        hop = verdicts(card("--json"))["RV"]["receiver"]
+    assert (hop["verdict"], "is in use" in hop["found"], "ss -ulnp" in hop["remedy"]) == ("error", True, True)
+
+
+def test_a_buffer_below_two_bursts_is_an_error_with_what_to_do(cards, card, rig, tmp_path):
+    cards("LS", "RH", "RV")
+    table = to_builtins(rig)
+    table["card"]["receive_buffer_bytes"] = 8192
+    (tmp_path / "instrument.toml").write_text(tomli_w.dumps(table))
+    done = card("--json")
+    assert done.returncode == 1
+    hop = verdicts(done)["RH"]["buffer"]
+    assert (hop["verdict"], "less than two bursts" in hop["found"]) == ("error", True)
+    assert "sysctl -w net.core.rmem_max=" in hop["remedy"]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["program", "RH", "--mac", "01:00:00:00:00:01", "--yes"], "not the MAC address of one machine"),
+        (["program", "RH", "--mac", "12:34", "--yes"], "MAC address"),
+        (["program", "RX", "--mac", NEW_MAC, "--yes"], "no board 'RX'"),
+        (["program", "RH", "--mac", NEW_MAC, "--at", "127.0.0.1:x", "--yes"], "ADDRESS:PORT"),
+        (["program", "RH", "--mac", NEW_MAC], "confirmed with ''"),
+        (["reset", "RX"], "no board 'RX'"),
+    ],
+)
+def test_what_is_refused_writes_nothing(cards, card, words, says):
+    made = cards("RH")
+    before = made.endpoints["RH"].card.network
+    done = card(*words)
+    assert done.returncode == 2, done
+    assert says in done.stderr
+    assert "\n  do: " in done.stderr
+    made.power_cycle("RH")
+    assert made.endpoints["RH"].card.network == before
+
+
+def test_a_wrong_confirmation_writes_nothing(cards, card, rig):
+    made = cards("RH")
+    for typed in ("yes\n", rig.by_name("RV").card_address + "\n"):
+        done = card("program", "RH", "--mac", NEW_MAC, typed=typed)
+        assert done.returncode == 2
+        assert "EEPROM not written" in done.stderr
+    made.power_cycle("RH")
+    assert made.endpoints["RH"].card.network == made.network_of(rig.by_name("RH"))
+
+
+def programmed(made, name: str, folder: Path, typed: str, *words: str) -> str:
+    """What `polysight card program` says while the card `name` is switched off and on once it asks for that."""
+    told = folder / "told.txt"
+    with told.open("w") as out:
+        command = [str(POLYSIGHT), "card", "program", *words, "--mac", NEW_MAC, "--wait", str(LIMIT_S)]
+        done = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, text=True, cwd=folder
+        )
+        assert done.stdin is not None
+        with done.stdin:
+            done.stdin.write(typed + "\n")
+        deadline = time.monotonic() + LIMIT_S
+        while "looking for it" not in told.read_text():
+            assert done.poll() is None, told.read_text()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        made.power_cycle(name)
+        assert done.wait(LIMIT_S) == 0, told.read_text()
+    return told.read_text()
+
+
+def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
+    """From the address all cards are sold with to the board's own, typed, and seen there after a power cycle."""
+    old, board = rig.by_name("LS"), rig.by_name("RV")
+    made = cards(more=(old,))
+    at = f"{old.card_address}:{old.command_port}"
+    text = programmed(made, "LS", tmp_path, board.card_address, "RV", "--at", at)
+    for part in ("cannot be read back", NEW_MAC, "switch the card off and on", "FPGA 2.8", f"at {board.card_address}"):
+        assert part in text
+    assert made.endpoints["LS"].card.network == made.network_of(board)._replace(
+        mac=bytes.fromhex(NEW_MAC.replace(":", ""))
+    )
+
+
+def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp_path):
+    made = cards("RH", RH=Faults(boot_s=4.0))
+    done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "1")
+    assert done.returncode == 5
+    assert "written, but the card was not switched off" in done.stderr
+    done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
+    assert (done.returncode, "`polysight card` tells" in done.stdout) == (0, True)
+    assert "it answers at" in programmed(made, "RH", tmp_path, rig.by_name("RH").card_address, "RH")
+    assert made.endpoints["RH"].card.network.mac.hex(":") == NEW_MAC
+
+
+def test_a_mute_card_is_not_programmed(cards, card):
+    cards("RH", RH=Faults(mute=True))
+    done = card("program", "RH", "--mac", NEW_MAC, "--yes")
+    assert done.returncode == 5
+    assert "did not answer" in done.stderr
+    assert "written" not in done.stdout
+
+
+def test_an_eeprom_failure_is_told(cards, card):
+    cards("RH", RH=Faults(command_status=((0x04, 2),)))
+    done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
+    assert done.returncode == 5
+    assert "EEPROM failure" in done.stderr
+
+
+def test_reset(cards, card):
+    made = cards("RH")
+    made.endpoints["RH"].card._packetiser.sequence = 77
+    done = card("reset", "RH", "--radar")
+    assert (done.returncode, "armed again" in done.stdout) == (0, True)
+    assert made.endpoints["RH"].card._packetiser.sequence == 77
+    done = card("reset", "RH")
+    assert (done.returncode, "configures it anew" in done.stdout) == (0, True), done
+    assert made.endpoints["RH"].card._packetiser.sequence == 1

@@ -1,0 +1,149 @@
+"""A silent card's error names the hop: no route, no link, no device, a mute card, a radar that does not stream."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from host.capture.dca1000 import Status
+from host.capture.hops import Hop, neighbour_answers, route_interface, silent_card, silent_hop, silent_radar
+from host.capture.receiver_words import RowCapture
+from shared.config import Board
+
+CARD = "192.168.33.180"
+BOARD = Board("RH", "receive_h", CARD, "192.168.33.30", 4096, 4098, ())
+ROUTES = "Iface Destination Gateway Flags RefCnt Use Metric Mask MTU Window IRTT\n"
+LOCAL = "eth1 0021A8C0 00000000 0001 0 0 0 00FFFFFF 0 0 0\n"
+GATEWAY = "eth0 00000000 0102A8C0 0003 0 0 100 00000000 0 0 0\n"
+
+
+def kernel(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str | None = "0x2") -> Path:
+    """A machine's /proc and /sys."""
+    (root / "proc/net").mkdir(parents=True)
+    (root / "proc/net/route").write_text(ROUTES + routes)
+    neighbours = f"{CARD} 0x1 {arp} 12:34:56:78:90:12 * eth1\n" if arp else ""
+    (root / "proc/net/arp").write_text("IP address HW type Flags HW address Mask Device\n" + neighbours)
+    link = root / "sys/class/net/eth1"
+    link.mkdir(parents=True)
+    (link / "operstate").write_text("down\n" if carrier is None else "up\n")
+    if carrier is not None:
+        (link / "carrier").write_text(carrier + "\n")
+    return root
+
+
+@pytest.mark.parametrize(
+    ("given", "hop", "says"),
+    [
+        ({"routes": ""}, Hop.ROUTE, "no route"),
+        ({"routes": GATEWAY}, Hop.ROUTE, "no route"),
+        ({"routes": GATEWAY + LOCAL}, Hop.CARD, "mute"),
+        ({"carrier": "0", "arp": "0x0"}, Hop.LINK, "no link"),
+        ({"carrier": None}, Hop.LINK, "no link"),
+        ({"arp": "0x0"}, Hop.NEIGHBOUR, f"no device has the address {CARD}"),
+        ({}, Hop.CARD, "mute"),
+        ({"arp": None}, Hop.UNKNOWN, "the card is off"),
+    ],
+)
+def test_every_hop_reads_differently(tmp_path, given, hop, says):
+    root = kernel(tmp_path, **given)
+    assert silent_hop(CARD, root) is hop
+    error = silent_card(BOARD, "it did not answer", root)
+    assert (error.what, says in error.why) == ("it did not answer", True)
+    assert error.remedy
+
+
+def test_what_the_kernel_does_not_tell_is_not_guessed(tmp_path):
+    assert silent_hop(CARD, tmp_path) is Hop.UNKNOWN
+    assert route_interface(CARD, tmp_path) is None
+    assert neighbour_answers(CARD, tmp_path) is None
+    assert silent_hop("127.0.0.5", kernel(tmp_path, routes="")) is Hop.UNKNOWN
+
+
+def row(**given) -> RowCapture:
+    fields = dict.fromkeys((f.name for f in msgspec.structs.fields(RowCapture)), 0)
+    return RowCapture(**(fields | {"missing": [(0, 9)], "located": False, "reason": "no packet came"} | given))
+
+
+@pytest.mark.parametrize(
+    ("got", "says"),
+    [
+        (None, "the radar is not streaming"),
+        (row(), "the radar is not streaming"),
+        (row(strangers=7), "7 packets came from another address"),
+        (row(card_status=int(Status.NO_LVDS_DATA)), "the radar sends nothing over LVDS"),
+        (row(card_status=int(Status.NO_HEADER)), "without the header"),
+    ],
+)
+def test_a_radar_that_does_not_stream(got, says):
+    error = silent_radar(BOARD, got)
+    assert says in error.why
+    assert "RH" in error.what
+
+
+SCRIPT = """
+set -e
+mount -t sysfs sysfs /sys
+try() { "$PYTHON" - "$1" <<'END'
+import sys
+from pathlib import Path
+import msgspec
+from host.capture.survey import survey_cards
+from shared.config import load_instrument
+rig = load_instrument(Path("instrument.toml"))
+limits = msgspec.structs.replace(rig.limits, command_timeout_s=0.15)
+survey = survey_cards(msgspec.structs.replace(rig, limits=limits))[0]
+hop = next(hop for hop in survey.hops if hop.verdict == "error")
+print(sys.argv[1], "|", hop.hop, "|", hop.found, "|", hop.why, flush=True)
+END
+}
+ip link set lo up
+try no-address
+ip address add 192.168.33.30/32 dev lo
+try no-route
+ip link add c0 type veth peer name c1
+ip link set c0 up
+ip address add 192.168.33.30/24 dev c0
+try no-link
+ip link set c1 up
+try no-device
+unshare -n sleep 20 & other=$!
+until [ "$(readlink /proc/$other/ns/net)" != "$(readlink /proc/self/ns/net)" ]; do :; done
+ip link set c1 netns $other
+nsenter -t $other -n sh -c 'ip link set c1 up; ip address add 192.168.33.180/24 dev c1'
+try mute
+kill $other
+"""
+
+
+def test_real_interfaces_tell_the_hops_apart():
+    """A network of its own, made of two virtual ethernet ports: pull the plug, remove the card, mute it."""
+    tools = [shutil.which(name) for name in ("unshare", "ip", "nsenter", "mount")]
+    make = ["unshare", "-rnm", "sh", "-c", "mount -t sysfs s /sys && ip link add c0 type veth peer name c1"]
+    if None in tools or subprocess.run(make, capture_output=True, check=False).returncode:
+        pytest.skip("no private network namespace with virtual ethernet on this machine")
+    done = subprocess.run(
+        ["unshare", "-rnm", "bash", "-c", SCRIPT],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=os.environ | {"PYTHON": sys.executable},
+        cwd=Path(__file__).resolve().parents[2],
+    )
+    assert done.returncode == 0, done.stderr
+    said = {line.split(" | ")[0]: line for line in done.stdout.splitlines()}
+    assert "| host | LS commands: 192.168.33.30 is not an address of this machine" in said["no-address"]
+    for name, hop, why in (
+        ("no-route", "route", "| no route"),
+        ("no-link", "link", "| no link: network interface c0"),
+        ("no-device", "card", "no device has the address 192.168.33.180"),
+        ("mute", "card", "the card is mute"),
+    ):
+        assert f"| {hop} |" in said[name]
+        assert why in said[name]

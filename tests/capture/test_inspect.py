@@ -1,0 +1,243 @@
+"""Unknown recordings are recognised; the real packet capture is read through the receiver's placement."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import real_row, row, write_pcap
+
+from host.capture import dca1000
+from host.capture.dca1000 import Status
+from host.capture.inspect import Known, Report, inspect_bin
+from host.capture.inspect_pcap import inspect_pcap
+from host.capture.inspect_text import main_text
+from host.capture.pcap import read_pcap
+from host.capture.plot import plot_profile
+from host.capture.shape import Shape
+from shared.config import load_instrument
+from shared.errors import DataError
+
+RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
+REAL = Path(__file__).resolve().parents[3] / "shared/data/dca1000-real"
+needs_real = pytest.mark.skipif(
+    not REAL.is_dir(), reason="the packet capture of a real card is not beside this repository (not ours to publish)"
+)
+
+
+def inspect_shape(path: Path, shape: Shape, q_first: bool | None = False) -> Report:
+    return inspect_bin(path, Known.of_shape(shape, q_first))
+
+
+@pytest.mark.parametrize("lanes", [4, 2])
+@pytest.mark.parametrize("q_first", [False, True])
+def test_shape_and_order_are_guessed(tmp_path, lanes, q_first):
+    path = tmp_path / "x.bin"
+    row(lanes, q_first).tofile(path)
+    r = inspect_bin(path)
+    assert (r.lanes, r.samples, r.chirps, r.q_first) == (lanes, 256, 32, q_first)
+    assert r.peak_bin < 128
+    assert r.remarks == []
+    assert "guessed" in main_text(r)
+
+
+def test_faults_are_told(tmp_path):
+    path = tmp_path / "x.bin"
+    words = row(4, False, dead=2)
+    words[8] = 32767
+    words.tofile(path)
+    with path.open("ab") as f:
+        f.write(b"12345")
+    text = main_text(inspect_bin(path))
+    for part in ("RX 2 hold no signal", "1 values are at full scale", "5 bytes after the last whole chirp"):
+        assert part in text
+    np.zeros(4096, dtype=np.uint8).tofile(path)
+    assert "every sample is zero" in main_text(inspect_bin(path, Known(4, samples=256, q_first=False)))
+    (row(4, False).view("<u2") ^ 0x8000).tofile(path)
+    assert "offset binary" in main_text(inspect_bin(path, Known(4, samples=256)))
+
+
+@pytest.mark.parametrize("lanes", [4, 2])
+@pytest.mark.parametrize("samples", [128, 256, 512])
+def test_real_samples_are_recognised(tmp_path, lanes, samples):
+    path = tmp_path / "x.bin"
+    real_row(lanes, samples=samples).tofile(path)
+    r = inspect_bin(path)
+    assert (r.lanes, r.is_complex, r.samples, r.chirps) == (lanes, False, samples, 32)
+    assert r.profile_db.shape == (samples // 2,)
+    assert r.remarks == []
+    assert "-lane, real" in main_text(r)
+
+
+@pytest.mark.parametrize(
+    "given", [Shape(2, True, 256), Shape(4, True, 512), Shape(4, False, 256), Shape(2, False, 256)]
+)
+def test_a_layout_that_does_not_fit_is_told(tmp_path, given):
+    path = tmp_path / "x.bin"
+    row(4, False).tofile(path)
+    assert inspect_shape(path, Shape(4, True, 256)).remarks == []
+    remarks = inspect_shape(path, given).remarks
+    assert any("the data look like 4-lane complex, 256 samples" in text for text in remarks)
+
+
+def test_wrong_order_of_i_and_q_is_told(tmp_path):
+    path = tmp_path / "x.bin"
+    row(4, True).tofile(path)
+    assert any(
+        "I and Q seem to be in the other order" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks
+    )
+    assert inspect_shape(path, Shape(4, True, 256), q_first=True).remarks == []
+    assert inspect_shape(path, Shape(4, True, 256), q_first=None).q_first
+
+
+def test_offset_binary_and_constant_offset_are_told(tmp_path):
+    path = tmp_path / "x.bin"
+    (row(4, False).view("<u2") ^ 0x8000).tofile(path)
+    r = inspect_bin(path)
+    assert any("offset binary" in text for text in r.remarks)
+    assert (r.lanes, r.is_complex, r.samples, r.clipped) == (4, True, 256, 0)
+    (row(4, False) + np.int16(4000)).tofile(path)
+    assert any("constant offset of 56" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks)
+
+
+def altered(words: np.ndarray, fault: str) -> np.ndarray:
+    """A recording with a fault of the radar, the card or the program that wrote it."""
+    if fault == "offset binary":
+        return (words.view("<u2") ^ 0x8000).view("<i2")
+    if fault == "constant offset":
+        return words + np.int16(4000)
+    gain = 0.9 * 32767 / words.std()
+    return np.clip(words * gain, -32768, 32767).astype("<i2")
+
+
+@pytest.mark.parametrize("lanes", [4, 2])
+@pytest.mark.parametrize("is_complex", [True, False])
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("offset binary", "offset binary"),
+        ("constant offset", "constant offset of"),
+        ("clipping", "values are at full scale: the receiver clips"),
+    ],
+)
+def test_a_fault_is_told_and_the_layout_is_still_recognised(tmp_path, lanes, is_complex, fault, says):
+    """Nothing is given: the layout is guessed from data with the fault in it, and the fault is the only remark."""
+    sound = row(lanes, False) if is_complex else real_row(lanes)
+    path = tmp_path / "x.bin"
+    sound.tofile(path)
+    peak = inspect_bin(path).peak_bin
+    altered(sound, fault).tofile(path)
+    r = inspect_bin(path)
+    assert (r.lanes, r.is_complex, r.samples, r.peak_bin) == (lanes, is_complex, 256, peak)
+    assert len(r.remarks) == 1
+    assert says in r.remarks[0]
+    assert (r.clipped > 0) is (fault == "clipping")
+
+
+@pytest.mark.parametrize("lanes", [4, 2])
+@pytest.mark.parametrize("dead", [0, 3])
+def test_a_missing_antenna_is_told_in_either_layout(tmp_path, lanes, dead):
+    path = tmp_path / "x.bin"
+    row(lanes, False, dead=dead).tofile(path)
+    r = inspect_bin(path)
+    assert (r.lanes, r.samples) == (lanes, 256)
+    assert r.remarks == [f"RX {dead} hold no signal: antennas off, or another lane layout"]
+
+
+def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
+    """A program that writes packets as they come leaves ten bytes of counters before every 1456 of payload."""
+    data = row(4, False).tobytes()
+    starts = range(0, len(data), 1456)
+    packets = [dca1000.encode_packet(9 + k, 70_000 + a, data[a : a + 1456]) for k, a in enumerate(starts)]
+    path = tmp_path / "x.bin"
+    path.write_bytes(b"".join(packets))
+    r = inspect_bin(path)
+    assert (r.lanes, r.samples, r.chirps, r.bytes) == (4, 256, 32, len(data))
+    assert len(r.remarks) == 1
+    assert "whole packets, not payload" in r.remarks[0]
+    path.write_bytes(data)
+    assert inspect_bin(path).remarks == []
+
+
+def test_shape_of_the_rig_file():
+    rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+    assert Shape.of_instrument(rig) == Shape(4, True, 256)
+    assert Shape.of_instrument(rig).chirp_bytes == rig.frame_bytes
+
+
+@pytest.mark.parametrize("kind", ["complex", "real"])
+def test_plot(tmp_path, kind):
+    path, png = tmp_path / "x.bin", tmp_path / "x.png"
+    (row(4, False) if kind == "complex" else real_row(4)).tofile(path)
+    plot_profile(inspect_bin(path), png)
+    assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    with pytest.raises(DataError, match="cannot be written"):
+        plot_profile(inspect_bin(path), tmp_path / "absent" / "x.png")
+
+
+def test_too_small_or_absent(tmp_path):
+    (tmp_path / "x.bin").write_bytes(b"")
+    with pytest.raises(DataError, match="not even one chirp"):
+        inspect_bin(tmp_path / "x.bin")
+    with pytest.raises(DataError, match="cannot be read"):
+        inspect_bin(tmp_path / "absent.bin")
+
+
+@pytest.mark.parametrize(("order", "magic", "tick"), [("<", 0xA1B2C3D4, 1000), (">", 0xA1B23C4D, 1)])
+def test_pcap_forms(tmp_path, order, magic, tick):
+    write_pcap(tmp_path / "x.pcap", [b"hello", b"x" * 100], order, magic)
+    found = list(read_pcap(tmp_path / "x.pcap"))
+    assert [d.payload for d in found] == [b"hello", b"x" * 100]
+    assert found[0].t_ns == 100 * 10**9 + 5 * tick
+    assert found[0].source == ("192.168.33.180", 1024)
+
+
+def test_pcap_with_loss_is_placed_and_told(tmp_path):
+    data = row(4, False).tobytes()
+    count, sequence = 2**48 - 30_000, 2**32 - 3
+    starts = range(0, len(data), 1456)
+    packets = [dca1000.encode_packet(sequence + k, count + a, data[a : a + 1456]) for k, a in enumerate(starts)]
+    write_pcap(tmp_path / "x.pcap", [*packets[:5], *packets[6:], packets[4]])
+    r = inspect_pcap(tmp_path / "x.pcap")
+    assert r.card is not None
+    assert r.card.record is not None
+    assert r.card.record.missing == [(5 * 1456, 6 * 1456)]
+    assert r.card.record.counts.duplicates == 1
+    assert (r.lanes, r.samples, r.chirps) == (4, 256, 32)
+    assert "1456 bytes are missing" in main_text(r)
+
+
+@pytest.mark.parametrize("size", [0, 3, 10, 30, 60])
+def test_truncated_pcap_is_refused(tmp_path, size):
+    write_pcap(tmp_path / "x.pcap", [b"hello"])
+    path = tmp_path / "y.pcap"
+    path.write_bytes((tmp_path / "x.pcap").read_bytes()[:size])
+    with pytest.raises(DataError):
+        list(read_pcap(path))
+
+
+@needs_real
+def test_real_record():
+    r = inspect_pcap(REAL / "test_one_frame.pcap")
+    assert (r.lanes, r.chirps * r.rx, r.samples, r.q_first) == (2, 16, 256, True)
+    assert (r.peak_bin, round(r.peak_db)) == (59, 47)
+    assert r.card is not None
+    assert r.card.record is not None
+    assert r.card.record.complete
+    assert r.card.record.counts.placed == 12
+    assert r.card.tail_bytes == 16384 - 11 * 1456
+    assert r.card.tail_after_s == pytest.approx(2.0, abs=0.001)
+    assert r.card.status == Status.RECORD_COMPLETED
+    assert ("RECORD_START", 0) in r.card.replies
+
+
+@needs_real
+def test_real_commands():
+    r = inspect_pcap(REAL / "test_cmd.pcap")
+    assert r.card is not None
+    assert r.card.version == "2.8"
+    names = [name for name, _ in r.card.replies]
+    assert len(names) == 10
+    assert {"RESET_FPGA", "RECORD_START", "RECORD_STOP", "CONFIGURE_PACKET", "ALIVE", "VERSION"} <= set(names)
+    assert "2.8" in main_text(r)

@@ -1,0 +1,69 @@
+"""`polysight inspect` as a user runs it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from recordings import CARD, OTHER, row, write_pcap
+
+from host.capture import dca1000
+
+RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
+
+
+@pytest.fixture
+def polysight(tmp_path):
+    def run(*words: object) -> subprocess.CompletedProcess[str]:
+        command = [Path(sys.executable).parent / "polysight", "inspect", *map(str, words)]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
+
+    return run
+
+
+def test_the_command_draws_and_says_what_the_rig_file_makes_of_it(polysight, tmp_path):
+    row(4, False).tofile(tmp_path / "right.bin")
+    row(2, False).tofile(tmp_path / "wrong.bin")
+    done = polysight("right.bin", "--config", RIG, "--plot", "right.png")
+    assert (done.returncode, "guessed" in done.stdout, "note" in done.stdout) == (0, False, False), done
+    assert (tmp_path / "right.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    done = polysight("wrong.bin", "--config", RIG)
+    assert "the data look like 2-lane complex, 256 samples x 4 RX, not 4-lane complex" in done.stdout
+    done = polysight("wrong.bin", "--json")
+    found = json.loads(done.stdout)
+    assert (found["lanes"], found["guessed"]) == (2, ["lanes", "complex or real", "samples", "I/Q order"])
+    assert polysight("right.bin", "--plot", "absent/x.png").returncode == 3
+
+
+def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
+    data = row(4, False).tobytes()
+    starts = range(0, len(data), 1456)
+    packets = [dca1000.encode_packet(1 + k, a, data[a : a + 1456]) for k, a in enumerate(starts)]
+    both = [packet for packet in packets for _ in range(2)]
+    write_pcap(tmp_path / "both", both, cards=(CARD, OTHER))  # known by its first bytes, not by its name
+    done = polysight("both")
+    assert done.returncode == 3
+    assert "192.168.33.180 and 192.168.33.181" in done.stderr
+    done = polysight("both", "--card", "192.168.33.181", "--config", RIG, "--plot", "both.png")
+    assert done.returncode == 0, done.stderr
+    assert "32 chirps x 4 RX x 256 samples" in done.stdout
+    assert (tmp_path / "both.png").exists()
+    assert "nothing from a DCA1000 at 192.168.33.7" in polysight("both", "--card", "192.168.33.7").stderr
+
+
+def test_a_row_of_a_scan_brings_its_own_rig_file_and_says_that_it_is_simulated(polysight, tmp_path):
+    (tmp_path / "scene.toml").write_text(
+        'name = "nothing"\n[grid]\ncolumns = 8\nrows = 2\nstep_x_mm = 10.0\nstep_y_mm = 10.0\n[burst]\npulses = 2\n'
+    )
+    simulate = [sys.executable, "-m", "simulators", "simulate", tmp_path / "scene.toml", "--config", RIG]
+    subprocess.run([*simulate, "--out", tmp_path / "scan"], check=True, capture_output=True)
+    done = polysight("scan/raw/RV/0001.bin")
+    assert done.returncode == 0, done.stderr
+    assert "of a simulated scan" in done.stdout
+    assert "16 chirps x 4 RX x 256 samples, 4-lane, I first\n" in done.stdout
+    (tmp_path / "scan" / "manifest.jsonl").write_bytes(b"damaged\n")
+    done = polysight("scan/raw/RV/0001.bin")
+    assert (done.returncode, "guessed" in done.stdout) == (0, True)

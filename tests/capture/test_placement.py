@@ -1,0 +1,374 @@
+"""Placement of packets by byte count: data is original or masked, and the mask equals what was lost."""
+
+from __future__ import annotations
+
+import random
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from host.capture.dca1000 import encode_packet
+from host.capture.placed import Counters, Losses, Placed
+from host.capture.placement import Placement
+
+FULL = 1456
+SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
+COUNT, SEQUENCE = 1 << 48, 1 << 32
+near_wrap = st.one_of(st.just(0), st.integers(0, COUNT - 1), st.integers(COUNT - 40_000, COUNT - 1))
+near_sequence_wrap = st.one_of(st.integers(0, SEQUENCE - 1), st.integers(SEQUENCE - 30, SEQUENCE - 1))
+
+
+@dataclass
+class Record:
+    data: bytes
+    packets: list[bytes]
+
+    @staticmethod
+    def make(size: int, count: int, sequence: int, seed: int = 0) -> Record:
+        # no zero bytes, so that a wrongly zeroed byte shows
+        data = np.random.default_rng(seed).integers(1, 256, size, dtype=np.uint8).tobytes()
+        starts = range(0, size, FULL)
+        return Record(data, [encode_packet(sequence + k, count + a, data[a : a + FULL]) for k, a in enumerate(starts)])
+
+    def bytes_of(self, k: int) -> tuple[int, int]:
+        return k * FULL, min((k + 1) * FULL, len(self.data))
+
+
+def place(
+    size: int, packets: list[bytes], start: Counters | None = None, frame: int = 1, batch: int = 7
+) -> tuple[Placed, np.ndarray]:
+    out = np.zeros(size, dtype=np.uint8)
+    placement = Placement(out, frame, start)
+    for i in range(0, len(packets), batch):
+        some = packets[i : i + batch]
+        block = np.zeros((len(some), max(map(len, some))), dtype=np.uint8)
+        for k, p in enumerate(some):
+            block[k, : len(p)] = np.frombuffer(p, dtype=np.uint8)
+        placement.place(block, np.array([len(p) for p in some]))
+    return placement.finish(), out
+
+
+def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
+    mask = np.zeros(size, dtype=bool)
+    for a, b in gaps:
+        mask[a:b] = True
+    return mask
+
+
+def is_original_or_masked(record: Record, placed: Placed, out: np.ndarray) -> bool:
+    kept = ~mask_of(out.size, placed.missing)
+    return bool((out[kept] == np.frombuffer(record.data, dtype=np.uint8)[kept]).all())
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=SLOW)
+@given(
+    frame=st.sampled_from([128, 512, 4096, 65536]),
+    frames=st.integers(1, 12),
+    count=near_wrap,
+    sequence=near_sequence_wrap,
+    batch=st.integers(1, 40),
+    chance=st.randoms(use_true_random=False),
+    rate=st.sampled_from([0.0, 0.02, 0.05, 0.3]),
+)
+def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, chance: random.Random, rate):
+    """Start known. Unmasked bytes are original; where the record's place is certain, the mask is exactly the loss."""
+    record = Record.make(frame * frames, count, sequence)
+    sent = [(k, p) for k, p in enumerate(record.packets) if chance.random() >= rate]
+    sent += [kp for kp in sent if chance.random() < rate]
+    order = sorted(sent, key=lambda kp: kp[0] + (chance.randint(-3, 3) if chance.random() < rate else 0))
+    placed, out = place(len(record.data), [p for _, p in order], Counters(count, sequence), frame, batch)
+    assert is_original_or_masked(record, placed, out)
+    got = {k for k, _ in sent}
+    lost = mask_of(out.size, [record.bytes_of(k) for k in range(len(record.packets)) if k not in got])
+    assert placed.received == (~lost).sum()
+    assert placed.counts.placed == len(got)
+    assert placed.counts.duplicates == len(sent) - len(got)
+    assert placed.counts.outside == placed.counts.disagreeing == placed.counts.malformed == 0
+    mask = mask_of(out.size, placed.missing)
+    assert (mask | ~lost).all()
+    last = len(record.packets) - 1
+    if last in got or (len(record.data) - max((record.bytes_of(k)[1] for k in got), default=0)) < frame:
+        assert placed.located
+    if placed.located:
+        assert (mask == lost).all()
+        assert not out[mask].any()
+    else:
+        assert mask.all()
+    if placed.located and placed.next_start is not None:
+        assert placed.next_start.byte_count == (count + len(record.data)) % COUNT
+        assert placed.next_start.sequence == (sequence + len(record.packets)) % SEQUENCE
+
+
+@dataclass
+class Oracle:
+    """What should become of packets of a record whose start is known, byte by byte."""
+
+    size: int
+    placed: int = 0
+    duplicates: int = 0
+    late: int = 0
+    extent: int = 0
+
+    def __post_init__(self) -> None:
+        self.there = np.zeros(self.size, dtype=bool)
+
+    def take(self, start: int, stop: int) -> None:
+        if self.there[start:stop].all():
+            self.duplicates += 1
+            return
+        self.placed += 1
+        self.late += start < self.extent
+        self.there[start:stop] = True
+        self.extent = max(self.extent, stop)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=SLOW)
+@given(
+    frame=st.integers(32, 16384).map(lambda words: 4 * words),
+    packets=st.integers(8, 120),
+    count=near_wrap,
+    sequence=near_sequence_wrap,
+    batch=st.integers(1, 64),
+    chance=st.randoms(use_true_random=False),
+    loss=st.floats(0, 0.05),
+    double=st.floats(0, 0.05),
+    shuffle=st.floats(0, 0.05),
+    lateness=st.integers(1, 60),
+    cut=st.floats(0, 0.05),
+    strange=st.floats(0, 0.05),
+)
+def test_every_disorder_at_once(
+    frame, packets, count, sequence, batch, chance: random.Random, loss, double, shuffle, lateness, cut, strange
+):
+    """Loss, duplicates, reordering, late and truncated packets, leftovers and nonsense, each up to 5 %."""
+    size = max(1, packets * FULL // frame) * frame
+    record = Record.make(size, count, sequence)
+    sent: list[tuple[float, int, bytes]] = []  # when, its place, what
+    for k, packet in enumerate(record.packets):
+        if chance.random() < loss:
+            continue
+        for copy in range(1 + (chance.random() < double)):
+            short = chance.random() < cut and len(packet) > 20
+            moved = chance.uniform(0, lateness) if chance.random() < shuffle else 0
+            sent.append((k + moved + copy / 2, k, packet[: chance.randint(11, len(packet))] if short else packet))
+    sent.sort(key=lambda s: s[0])
+    arriving = [(k, packet) for _, k, packet in sent]
+    leftovers = malformed = 0
+    for at in range(len(arriving), 1, -1):
+        if chance.random() < strange:
+            back = chance.randint(1, 5)
+            arriving.insert(at, (-1, encode_packet(sequence - back, count - back * FULL, bytes([0xEE]) * FULL)))
+            leftovers += 1
+        if chance.random() < strange:
+            arriving.insert(at, (-2, chance.choice([b"", b"0123456789", bytes(1467), bytes(1536)])))
+            malformed += 1
+    oracle = Oracle(size)
+    for k, packet in arriving:
+        if k >= 0:
+            oracle.take(k * FULL, k * FULL + len(packet) - 10)
+    placed, out = place(size, [p for _, p in arriving], Counters(count, sequence), frame, batch)
+    c = placed.counts
+    assert is_original_or_masked(record, placed, out)
+    assert c.placed + c.duplicates + c.leftover + c.outside + c.disagreeing + c.malformed == len(arriving)
+    assert c.malformed == malformed
+    if arriving and (arriving[0][0] == 0 or len(arriving[0][1]) == 10 + FULL) and not c.disagreeing:
+        assert (c.placed, c.duplicates, c.late) == (oracle.placed, oracle.duplicates, oracle.late)
+        assert (c.leftover, c.outside) == (leftovers, 0)
+        assert placed.received == oracle.there.sum()
+        lost = placed.losses
+        assert lost.head_bytes + lost.gap_bytes + lost.tail_bytes == size - placed.received
+        assert lost.tail_bytes == size - oracle.extent
+        if placed.located:
+            assert (mask_of(size, placed.missing) == ~oracle.there).all()
+            assert not out[~oracle.there].any()
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
+@given(
+    frames=st.integers(1, 8),
+    frame=st.sampled_from([128, 4096, 65536]),
+    records=st.integers(2, 5),
+    count=near_wrap,
+    sequence=near_sequence_wrap,
+    skip=st.integers(0, 3),
+    chance=st.randoms(use_true_random=False),
+)
+def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, sequence, skip, chance: random.Random):
+    """Each record ends with a short packet: sequence and byte count drift apart, and every record is found."""
+    start = None
+    for n in range(records):
+        record = Record.make(frames * frame, count, sequence, seed=n)
+        head = chance.randint(0, skip) if n and len(record.packets) > 2 * skip + 2 else 0
+        placed, out = place(len(record.data), record.packets[head:], start, frame)
+        assert placed.located
+        assert placed.missing == ([(0, head * FULL)] if head else [])
+        assert placed.losses.head_bytes == head * FULL
+        assert is_original_or_masked(record, placed, out)
+        count, sequence, start = count + len(record.data), sequence + len(record.packets), placed.next_start
+
+
+def test_bytes_the_card_dropped_itself_mask_the_whole_record():
+    """Status bits 7 and 9: the counters have no gap, so no byte's place is certain, even when the count is right."""
+    record = Record.make(5 * 4096, 0, 1)
+    placement = Placement(np.zeros(5 * 4096, dtype=np.uint8), 4096, Counters(0, 1))
+    for packet in record.packets:
+        placement.place_packet(packet)
+    placed = placement.finish("DDR_FULL")
+    assert not placed.complete
+    assert placed.missing == [(0, 5 * 4096)]
+    assert "dropped data before numbering it (DDR_FULL)" in placed.reason
+    assert placed.counts.placed == len(record.packets)
+
+
+def test_losses_are_told_by_kind():
+    record = Record.make(30 * FULL, 0, 1)
+    kept = [p for k, p in enumerate(record.packets) if k not in (0, 1, 7, 12, 13, 29)]
+    placed, _ = place(30 * FULL, [kept[1], kept[0], *kept[2:]], Counters(0, 1), 65536)
+    assert placed.losses == Losses(head_bytes=2 * FULL, gaps=2, gap_bytes=3 * FULL, tail_bytes=FULL)
+    assert (placed.counts.late, placed.counts.late_by_bytes) == (1, 2 * FULL)
+
+
+def test_placing_allocates_nothing_that_stays():
+    """Nothing is kept for a packet: a thousand batches leave as many blocks of memory as ten."""
+    size, batch = 256 * FULL, 256
+    record = Record.make(size, 0, 1)
+    block = np.frombuffer(b"".join(record.packets), dtype=np.uint8).reshape(batch, 10 + FULL).copy()
+    lengths = np.full(batch, 10 + FULL, dtype=np.uint32)
+    out = np.zeros(size * 1000, dtype=np.uint8)
+    placement = Placement(out, 4096, Counters(0, 1))
+    kept = []
+    for n in range(1000):
+        k = np.arange(n * batch, (n + 1) * batch)
+        block[:, 0:4] = (k + 1).astype("<u4")[:, None].view(np.uint8)
+        block[:, 4:10] = (k * FULL).astype("<u8")[:, None].view(np.uint8)[:, :6]
+        placement.place(block, lengths)
+        if n in (9, 999):
+            kept.append(sys.getallocatedblocks())
+    assert placement.complete
+    assert kept[1] - kept[0] < 200
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=SLOW)
+@given(
+    frame=st.integers(32, 16384).map(lambda words: 4 * words),
+    packets=st.integers(1, 60),
+    count=near_wrap,
+    sequence=near_sequence_wrap,
+    chance=st.randoms(use_true_random=False),
+    loss=st.one_of(st.floats(0, 0.05), st.just(0.3)),
+    double=st.floats(0, 0.05),
+    lateness=st.sampled_from([0, 1, 5, 100]),
+)
+def test_unknown_start_is_original_or_masked(
+    frame, packets, count, sequence, chance: random.Random, loss, double, lateness
+):
+    """Nothing is known of the counters before: frames of 128 bytes to 64 KiB, lost, doubled, in any order."""
+    size = max(1, packets * FULL // frame) * frame
+    record = Record.make(size, count, sequence)
+    kept = [kp for kp in enumerate(record.packets) if chance.random() >= loss]
+    sent = kept + [kp for kp in kept if chance.random() < double]
+    sent.sort(key=lambda kp: kp[0] + chance.uniform(0, lateness))
+    placed, out = place(size, [packet for _, packet in sent], None, frame)
+    assert is_original_or_masked(record, placed, out)
+    assert placed.counts.duplicates == len(sent) - len(kept)
+    if len(kept) == len(record.packets):
+        assert placed.complete
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=SLOW)
+@given(
+    head=st.integers(0, 5),
+    tail=st.sampled_from([1, 1000, 1455]),
+    count=near_wrap,
+    sequence=near_sequence_wrap,
+    known=st.booleans(),
+)
+def test_lost_head_is_found_from_the_start_or_from_the_end(head, tail, count, sequence, known):
+    record = Record.make(20 * FULL + tail, count, sequence)
+    start = Counters(count, sequence) if known else None
+    placed, out = place(len(record.data), record.packets[head:], start, 4096)
+    assert placed.located
+    assert placed.missing == ([(0, head * FULL)] if head else [])
+    assert is_original_or_masked(record, placed, out)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=SLOW)
+@given(
+    cut=st.integers(0, FULL - 1),
+    which=st.integers(0, 20),
+    count=near_wrap,
+    known=st.booleans(),
+)
+def test_truncated_packet(cut, which, count, known):
+    """A packet cut short on its way: what it lost is masked, or everything when the end is no longer sure."""
+    record = Record.make(20 * FULL + 700, count, 77)
+    packets = list(record.packets)
+    packets[which] = packets[which][: max(0, len(packets[which]) - cut)]
+    placed, out = place(len(record.data), packets, Counters(count, 77) if known else None, 4096)
+    assert is_original_or_masked(record, placed, out)
+    if which < 20 and placed.located:
+        _, b = record.bytes_of(which)
+        assert placed.missing == ([(b - min(cut, FULL), b)] if cut else [])
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
+@given(missed=st.integers(1, 5), count=near_wrap, known=st.booleans(), at=st.integers(0, 14))
+def test_missed_frames_are_never_placed_as_if_nothing_was_missing(missed, count, known, at):
+    whole = Record.make(20 * 4096, count, 9)
+    data = whole.data[: at * 4096] + whole.data[(at + missed) * 4096 :]
+    packets = [encode_packet(9 + k, count + a, data[a : a + FULL]) for k, a in enumerate(range(0, len(data), FULL))]
+    placed, _ = place(len(whole.data), packets, Counters(count, 9) if known else None, 4096)
+    assert not placed.located
+    assert placed.missing == [(0, len(whole.data))]
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
+@given(flip=st.integers(0, 79), which=st.integers(1, 20), count=near_wrap)
+def test_corrupted_header_damages_nothing(flip, which, count):
+    """One flipped bit anywhere in one packet's counters: its bytes are masked, nobody else's are touched."""
+    record = Record.make(21 * FULL + 100, count, 500)
+    packets = list(record.packets)
+    bad = bytearray(packets[which])
+    bad[flip // 8] ^= 1 << flip % 8
+    packets[which] = bytes(bad)
+    placed, out = place(len(record.data), packets, Counters(count, 500), 4096)
+    assert placed.counts.disagreeing == 1
+    assert placed.missing == [record.bytes_of(which)]
+    assert is_original_or_masked(record, placed, out)
+
+
+def test_fresh_counters_need_no_history():
+    record = Record.make(10 * FULL, 0, 1)
+    placed, _ = place(len(record.data), [record.packets[k] for k in (2, 0, 1, 3, 4, 5, 6, 7, 8, 9)], None, 4096)
+    assert placed.complete
+    assert placed.counts.late == 2
+
+
+def test_second_record_continues_and_the_stale_first_is_outside():
+    first, second = Record.make(5000, 0, 1), Record.make(5000, 5000, 5, seed=1)
+    placed, _ = place(5000, first.packets)
+    assert placed.next_start == Counters(5000, 5)
+    placed, out = place(5000, [second.packets[0], first.packets[-1], *second.packets[1:]], placed.next_start, 1000)
+    assert placed.complete
+    assert (placed.counts.leftover, placed.counts.outside) == (1, 0)
+    assert out.tobytes() == second.data
+
+
+def test_more_than_expected_is_not_a_row():
+    record = Record.make(6 * 4096, 0, 1)
+    placed, _ = place(5 * 4096, record.packets, Counters(0, 1), 4096)
+    assert not placed.located
+    assert "more" in placed.reason
+    assert placed.counts.outside > 0
+
+
+def test_nothing_and_nonsense():
+    placed, out = place(5000, [], Counters(0, 1))
+    assert placed.missing == [(0, 5000)]
+    assert placed.next_start is None
+    placed, out = place(5000, [b"", b"short", b"0123456789"], Counters(0, 1))
+    assert placed.counts.malformed == 3
+    assert not out.any()

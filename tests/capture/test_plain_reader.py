@@ -1,0 +1,170 @@
+"""What the project writes is read back without the project: numpy.fromfile, json and msgpack, nothing else."""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+import struct
+import time
+import zlib
+from pathlib import Path
+
+import msgpack
+import numpy as np
+
+from host.capture.dca1000 import encode_packet
+from host.capture.receiver import ReceiverProcess
+from host.capture.segment import write_index
+from host.store.events import EventWriter
+from host.store.manifest import ManifestWriter
+from pi_controller.journal import Journal
+from shared.config import Board, load_instrument
+from shared.messages import Capture, RunStopped, pack
+from simulators.scene import load_scene
+from simulators.simulate import simulate
+
+FRAMES, SAMPLES = 96, 256
+
+
+def read_row(path: Path) -> tuple[dict, np.ndarray, np.ndarray]:
+    """Index, arrivals and samples of a row, by the words of docs/spec alone: complex [rx, frame, sample]."""
+    words = np.fromfile(path, dtype="<i2").reshape(-1, SAMPLES, 2, 4)
+    samples = (words[:, :, 0, :] + 1j * words[:, :, 1, :]).transpose(2, 0, 1)
+    with path.with_suffix(".idx").open("rb") as f:
+        index = json.loads(f.readline())
+        arrivals = np.fromfile(f, dtype="<i8").reshape(-1, 2)
+    return index, arrivals, samples
+
+
+def test_segments(tmp_path):
+    rng = np.random.default_rng(3)
+    counts = rng.integers(-900, 900, (2, 4, FRAMES, SAMPLES))
+    truth = counts[0] + 1j * counts[1]
+    sent = counts.transpose(2, 3, 0, 1).astype("<i2").tobytes()
+    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
+    board = Board("RH", "receive_h", f"{subnet}.181", f"{subnet}.30", 4200, 4201, ())
+    gone, path = (20 * 1456, 21 * 1456), tmp_path / "0000.bin"
+    with ReceiverProcess(board, 1 << 20) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as card:
+        card.bind((board.card_address, 1024))
+        receiver.begin_row(0, 1, len(sent), 4096, path)
+        for k, a in enumerate(range(0, len(sent), 1456)):
+            if a != gone[0]:
+                card.sendto(encode_packet(1 + k, a, sent[a : a + 1456]), (board.host_address, board.data_port))
+        deadline = time.monotonic() + 60
+        while receiver.report().received < len(sent) - 1456 and time.monotonic() < deadline:
+            time.sleep(0.005)
+        row = receiver.end_row()
+    index, arrivals, samples = read_row(path)
+    assert index["missing"] == [list(gone)]
+    assert (index["expected"], index["received"], index["gaps"]) == (len(sent), len(sent) - 1456, 1)
+    assert arrivals[-1].tolist() == [row.last_arrival_ns, len(sent)]
+    assert zlib.crc32(path.read_bytes()) == row.crc32
+    whole = np.ones(FRAMES, dtype=bool)
+    whole[gone[0] // 4096 : (gone[1] - 1) // 4096 + 1] = False
+    assert whole.sum() == FRAMES - (1 if gone[0] // 4096 == (gone[1] - 1) // 4096 else 2)
+    np.testing.assert_array_equal(samples[:, whole], truth[:, whole])
+
+
+def test_events(tmp_path):
+    fields = ("row_index", "take", "point", "column", "edge_ns", "first_pulse_ns", "last_pulse_ns", "pulses")
+    rest = {"scan_id": "s", "t_mono_ns": 5, "width_max_ns": 3, "jitter_ns": 7}
+    sent = [{"seq": k + 1} | rest | {name: k * 10**9 + n for n, name in enumerate(fields)} for k in range(5)]
+    path = tmp_path / "events.msgpack"
+    writer = EventWriter(path)
+    for event in sent:
+        writer.append(Capture(**event))
+    writer.sync()
+    writer.close()
+    with path.open("rb") as f:
+        found = list(msgpack.Unpacker(f))
+    for event in found:
+        assert event.pop("crc") == zlib.crc32(msgpack.packb(event))
+    assert [event.pop("version") for event in found] == ["1.0"] * 5
+    assert found == [{"type": "Capture"} | event for event in sent]
+
+
+def test_manifest(tmp_path):
+    facts = [
+        {"fact": "scan_started", "scan_id": "s"},
+        {"fact": "row_committed", "row": 3, "boards": {"RH": {"n": 1.5}}},
+    ]
+    with ManifestWriter(tmp_path / "manifest.jsonl", create=True) as writer:
+        for fact in facts:
+            writer.append(fact)
+    found = [json.loads(line) for line in (tmp_path / "manifest.jsonl").read_text("ascii").splitlines()]
+    for fact in found:
+        crc = fact.pop("crc")
+        assert crc == f"{zlib.crc32(json.dumps(fact, sort_keys=True, separators=(',', ':')).encode()):08x}"
+    assert found == facts
+
+
+def test_index(tmp_path):
+    arrivals = np.array([[5, 100], [7, 250]], dtype=np.int64)
+    crc = write_index(tmp_path / "0000.idx", {"missing": [[250, 300]], "located": True}, arrivals)
+    raw = (tmp_path / "0000.idx").read_bytes()
+    assert zlib.crc32(raw) == crc
+    head, _, tail = raw.partition(b"\n")
+    assert json.loads(head) == {"arrivals": 2, "located": True, "missing": [[250, 300]]}
+    np.testing.assert_array_equal(np.frombuffer(tail, "<i8").reshape(-1, 2), arrivals)
+
+
+def test_whole_scan(tmp_path):
+    """A simulated scan folder, from its first file to its last, by the words of docs/spec alone."""
+    repo = Path(__file__).resolve().parents[2]
+    (tmp_path / "scene.toml").write_text(SCENE)
+    folder = simulate(load_instrument(repo / "instrument.toml"), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
+    facts = [json.loads(line) for line in (folder / "manifest.jsonl").read_text("ascii").splitlines()]
+    for fact in facts:
+        crc = fact.pop("crc")
+        assert crc == f"{zlib.crc32(json.dumps(fact, sort_keys=True, separators=(',', ':')).encode()):08x}"
+    plan = facts[0]["plan"]
+    rows = {fact["row"]: fact for fact in facts if fact["fact"] == "row_committed"}
+    assert sorted(rows) == list(range(plan["rows"]))
+    for fact in rows.values():
+        for board in fact["boards"].values():
+            index, _, samples = read_row(folder / board["file"])
+            assert zlib.crc32((folder / board["file"]).read_bytes()) == int(board["crc32"], 16)
+            assert index["missing"] == []
+            assert samples.shape == (4, fact["pulses"], SAMPLES)
+            assert np.abs(samples).mean() > 100
+    with (folder / "events.msgpack").open("rb") as f:
+        events = list(msgpack.Unpacker(f))
+    for event in events:
+        assert event.pop("crc") == zlib.crc32(msgpack.packb(event))
+    assert [event["seq"] for event in events] == list(range(1, len(events) + 1))
+    points = [event["column"] for event in events if event["type"] == "Capture" and event["row_index"] == 1]
+    assert points == list(reversed(range(plan["columns"])))
+
+
+SCENE = """name = "a metal plate"
+[grid]
+columns = 3
+rows = 2
+[burst]
+pulses = 2
+[[plates]]
+name = "copper"
+centre_mm = [0.0, 0.0]
+size_mm = [60.0, 60.0]
+metal = true
+"""
+
+
+def test_journal(tmp_path):
+    """Magic, then `<length, seq, crc32(seq + payload)>`, little-endian, and the event: with struct and zlib alone."""
+    journal = Journal(tmp_path / "s.journal")
+    sent = [{"scan_id": "s", "seq": k, "t_mono_ns": k, "exit_status": "abort", "reason": "x" * k} for k in (1, 2, 3)]
+    for event in sent:
+        journal.append(pack(RunStopped(**event)))
+    journal.close()
+    raw = (tmp_path / "s.journal").read_bytes()
+    assert raw[:8] == b"PSJRNL1\n"
+    at, found = 8, []
+    while at < len(raw):
+        length, seq, crc = struct.unpack_from("<III", raw, at)
+        payload = raw[at + 12 : at + 12 + length]
+        assert crc == zlib.crc32(struct.pack("<I", seq) + payload)
+        found.append(msgpack.unpackb(payload))
+        at += 12 + length
+    assert found == [{"type": "RunStopped", "version": "1.0", **event} for event in sent]

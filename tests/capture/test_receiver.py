@@ -1,0 +1,298 @@
+"""The receiving process over real sockets: bit-exact rows, masked losses, clear errors, a clean end."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+import zlib
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.capture.dca1000 import Status, encode_packet
+from host.capture.end_of_record import Ending, record_ending
+from host.capture.receiver import ReceiverProcess
+from host.capture.receiver_words import Progress
+from host.capture.segment import read_index
+from host.capture.udp import (
+    BatchReceiver,
+    bind_udp,
+    enlarge_receive_buffer,
+    kernel_drops,
+)
+from shared.config import Board
+from shared.errors import DeviceError
+
+FULL = 1456
+
+
+@pytest.fixture
+def board() -> Board:
+    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
+    return Board("RH", "receive_h", f"{subnet}.181", f"{subnet}.30", 4200, 4201, ())
+
+
+@pytest.fixture
+def card(board):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        s.bind((board.card_address, 1024))
+        yield s
+
+
+def packets(data: bytes, sequence: int, count: int) -> list[bytes]:
+    starts = range(0, len(data), FULL)
+    return [encode_packet(sequence + k, count + a, data[a : a + FULL]) for k, a in enumerate(starts)]
+
+
+def noise(size: int, seed: int) -> bytes:
+    return np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8).tobytes()
+
+
+def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
+    """Paced by the loopback's own back-pressure: a burst a millisecond, far inside the receive buffer."""
+    for k, packet in enumerate(some):
+        if k % 200 == 199:
+            time.sleep(0.001)
+        card.sendto(packet, (board.host_address, board.data_port))
+
+
+def wait_until(condition, limit_s: float = 60.0) -> None:
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
+    size = 300 * 4096
+    first, second, third = (noise(size, s) for s in (1, 2, 3))
+    count, sequence = 2**48 - 1_000_000, 2**32 - 100
+    n = -(-size // FULL)
+    with ReceiverProcess(board, 4 << 20) as receiver:
+        assert receiver.granted_bytes >= 1 << 20
+        for k, data in enumerate((first, second, third)):
+            path = tmp_path / f"{k}.part"
+            assert receiver.begin_row(k, 1, size, 4096, path) == 0
+            some = packets(data, sequence + k * n, count + k * size)
+            if k == 1:
+                some = [*some[2:50], some[51], some[50], some[51], *some[52:]]  # head lost, reordered, duplicate
+                send(card, board, [*some, b"tiny"])
+                wait_until(lambda: receiver.report().received == size - 2 * FULL)
+            else:
+                send(card, board, some)
+                wait_until(lambda: receiver.poll().complete)
+            row = receiver.end_row()
+            assert (row.row, row.take, row.expected, row.located) == (k, 1, size, True)
+            assert row.crc32 == zlib.crc32(path.read_bytes())
+            assert row.kernel_drops == 0
+            facts, arrivals = read_index(path.with_suffix(".idx"))
+            assert row.index_crc32 == zlib.crc32(path.with_suffix(".idx").read_bytes())
+            assert (np.diff(arrivals, axis=0) >= 0).all()
+            assert (int(arrivals[0, 0]), int(arrivals[-1, 0])) == (row.first_arrival_ns, row.last_arrival_ns)
+            if k == 1:
+                assert row.missing == [(0, 2 * FULL)]
+                assert facts["missing"] == [[0, 2 * FULL]]
+                assert (row.late, row.duplicates, row.malformed) == (1, 1, 1)
+                assert path.read_bytes() == bytes(2 * FULL) + data[2 * FULL :]
+            else:
+                assert row.complete
+                assert (row.late, row.duplicates, row.packets, row.short) == (0, 0, n, 1)
+                assert path.read_bytes() == data
+
+
+@pytest.mark.parametrize("source_port", [1024, 4098, 0])
+def test_data_counts_from_any_source_port(board, tmp_path, source_port):
+    data = noise(20_000, 4)
+    with (
+        ReceiverProcess(board, 1 << 20) as receiver,
+        closing(bind_udp(board.card_address, source_port, "card")) as card,
+    ):
+        receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part")
+        send(card, board, packets(data, 1, 0))
+        wait_until(lambda: receiver.poll().complete)
+        row = receiver.end_row()
+    assert (row.complete, row.strangers) == (True, 0)
+    assert (tmp_path / "a.part").read_bytes() == data
+
+
+def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
+    data = noise(20_000, 4)
+    other = (board.host_address, 0)
+    with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*other, "stranger")) as stranger:
+        send(card, board, packets(noise(5000, 5), 1, 0))
+        wait_until(lambda: _waiting(board) > 0)
+        assert receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part") == 4
+        stranger.sendto(packets(noise(5000, 6), 1, 0)[0], (board.host_address, board.data_port))
+        send(card, board, packets(data, 70, 999))
+        wait_until(lambda: receiver.poll().complete)
+        row = receiver.end_row()
+    assert row.complete
+    assert (row.strangers, row.stale) == (1, 4)
+    assert (tmp_path / "a.part").read_bytes() == data
+
+
+def _waiting(board: Board) -> int:
+    """Bytes the kernel holds for the data port."""
+    for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
+        words = line.split()
+        if int(words[1].split(":")[1], 16) == board.data_port and words[1].startswith(
+            socket.inet_aton(board.host_address)[::-1].hex().upper()
+        ):
+            return int(words[4].split(":")[1], 16)
+    return 0
+
+
+def test_discard_and_an_empty_row(board, tmp_path):
+    with ReceiverProcess(board, 1 << 20) as receiver:
+        receiver.begin_row(0, 1, 4096, 4096, tmp_path / "a.part")
+        receiver.discard()
+        assert not (tmp_path / "a.part").exists()
+        receiver.begin_row(0, 2, 4096, 4096, tmp_path / "a.part")
+        row = receiver.end_row()
+    assert (row.packets, row.missing, row.first_arrival_ns) == (0, [(0, 4096)], 0)
+
+
+def test_errors_come_back_to_the_host(board, tmp_path):
+    with ReceiverProcess(board, 1 << 20) as receiver:
+        with pytest.raises(DeviceError, match=f"{board.host_address}:{board.data_port}"):
+            ReceiverProcess(board, 1 << 20)
+        (tmp_path / "file").write_text("")
+        with pytest.raises(DeviceError, match="cannot reserve"):
+            receiver.begin_row(0, 1, 4096, 4096, tmp_path / "file" / "a.part")
+        with pytest.raises(DeviceError, match="no row"):
+            receiver.end_row()
+        os.kill(receiver._process.pid, signal.SIGKILL)
+        with pytest.raises(DeviceError, match="process ended"):
+            receiver.report()
+        with pytest.raises(DeviceError):
+            receiver.report()
+
+
+def test_survives_ctrl_c_and_ends_with_its_host(board):
+    receiver = ReceiverProcess(board, 1 << 20)
+    os.kill(receiver._process.pid, signal.SIGINT)
+    assert receiver.report().received == 0
+    pid = receiver._process.pid
+    receiver.close()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def test_ends_when_its_host_is_killed(board, tmp_path):
+    code = (
+        "import time\nfrom shared.config import Board\nfrom host.capture.receiver import ReceiverProcess\n"
+        f"r = ReceiverProcess(Board('RH', 'receive_h', '{board.card_address}', '{board.host_address}', 1, "
+        f"{board.data_port}, ()), 1 << 20)\n"
+        f"from pathlib import Path\nr.begin_row(0, 1, 4096, 4096, Path({str(tmp_path / 'a.part')!r}))\n"
+        "print(r._process.pid, flush=True)\ntime.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as host:
+        assert host.stdout is not None
+        pid = int(host.stdout.readline())
+        host.kill()
+    wait_until(lambda: not Path(f"/proc/{pid}/cmdline").exists() or not Path(f"/proc/{pid}/cmdline").read_bytes())
+    with closing(bind_udp(board.host_address, board.data_port, "free again")):
+        pass
+
+
+def test_kernel_drops_are_counted(board, card):
+    with closing(bind_udp(board.host_address, board.data_port, "x")) as sock:
+        enlarge_receive_buffer(sock, 8192)
+        for _ in range(200):
+            card.sendto(bytes(1466), (board.host_address, board.data_port))
+        batches, got = BatchReceiver(sock, board.card_address, batch=16), 0
+        while n := batches.receive():
+            got += n
+        assert 0 < got < 200
+        assert kernel_drops(sock) == 200 - got
+
+
+def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
+    """Two receivers, one swamped while it is stopped: only its row counts drops, and only in the row they fell in."""
+    other = Board("RV", "receive_v", board.card_address, board.host_address, 4202, 4203, ())
+    with ReceiverProcess(board, 1 << 16) as swamped, ReceiverProcess(other, 1 << 16) as quiet:
+        for receiver in (swamped, quiet):
+            receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part")
+        os.kill(swamped.pid, signal.SIGSTOP)
+        some = packets(noise(2000 * FULL, 3), 1, 0)
+        for packet in some:
+            card.sendto(packet, (board.host_address, board.data_port))
+        for packet in some[:20]:
+            card.sendto(packet, (other.host_address, other.data_port))
+        os.kill(swamped.pid, signal.SIGCONT)
+        wait_until(lambda: quiet.report().received == 20 * FULL)
+        hit, spared = swamped.end_row(), quiet.end_row()
+        assert hit.kernel_drops == 2000 - hit.packets > 0
+        assert spared.kernel_drops == 0
+        assert hit.tail_bytes == 2000 * FULL - hit.bytes
+        swamped.begin_row(1, 1, 4096, 4096, tmp_path / "next.part")
+        assert swamped.end_row().kernel_drops == 0
+
+
+def test_what_the_card_dropped_itself_is_reported_with_the_row(board, card, tmp_path):
+    data = noise(20_000, 4)
+    with ReceiverProcess(board, 1 << 20) as receiver:
+        receiver.begin_row(0, 1, len(data), 1000, tmp_path / "a.part")
+        send(card, board, packets(data, 1, 0))
+        wait_until(lambda: receiver.poll().complete)
+        row = receiver.end_row(Status.LVDS_BUFFER_FULL | Status.RECORD_COMPLETED)
+    assert row.lost_before_packets == Status.LVDS_BUFFER_FULL
+    assert not row.complete
+    assert row.missing == [(0, len(data))]
+    assert "dropped data before numbering it (LVDS_BUFFER_FULL)" in row.reason
+    assert read_index(tmp_path / "a.idx")[0]["card_status"] == row.card_status
+
+
+def test_the_short_last_packet_is_told_unasked(board, card, tmp_path):
+    """Frames were missed: the byte count is never reached, and the card's short tail says that nothing follows."""
+    with ReceiverProcess(board, 1 << 20) as receiver:
+        receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part")
+        send(card, board, packets(noise(36_864, 4), 1, 0))
+        wait_until(lambda: receiver.poll().ended)
+        assert not receiver.poll().complete
+        row = receiver.end_row()
+    assert not row.located
+    assert "4096 bytes (1 frames) early" in row.reason
+
+
+@pytest.mark.parametrize(
+    ("progress", "status", "now_s", "why"),
+    [
+        (Progress(0, 1, 9, True, 1), Status(0), 1.0, Ending.BYTES),
+        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.1, None),
+        (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.3, Ending.STATUS),
+        (Progress(0, 1, 9, False, 1_200_000_000), Status.RECORD_COMPLETED, 1.3, None),
+        (Progress(0, 1, 9, False, 1, True), Status(0), 1.1, None),
+        (Progress(0, 1, 9, False, 1, True), Status(0), 1.3, Ending.TAIL),
+        (Progress(0, 1, 9, False, 1), Status.NO_LVDS_DATA, 3.9, None),
+        (Progress(0, 1, 9, False, 1), Status(0), 4.1, Ending.SILENCE),
+        (Progress(0, 1, 0, False, 0), Status(0), 4.1, Ending.SILENCE),
+    ],
+)
+def test_a_record_ends_with_whichever_is_first(progress, status, now_s, why):
+    assert record_ending(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) is why
+
+
+def test_portable_way_receives_the_same(board, card):
+    with closing(bind_udp(board.host_address, board.data_port, "x")) as sock:
+        batches = BatchReceiver(sock, board.card_address)
+        batches._recvmmsg = None
+        card.sendto(b"0123456789abc", (board.host_address, board.data_port))
+        sock.sendto(b"stranger", (board.host_address, board.data_port))
+        assert batches.receive() == 1
+        assert batches.packets[0, :13].tobytes() == b"0123456789abc"
+        assert batches.lengths[0] == 13
+        assert batches.receive() == 0
+        assert batches.strangers == 1
+
+
+def test_address_of_another_machine():
+    with pytest.raises(DeviceError, match="not an address of this machine"):
+        bind_udp("192.0.2.1", 4098, "RH data")

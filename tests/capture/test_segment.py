@@ -1,0 +1,35 @@
+"""A row's file: memory taken again, a full disk, a damaged index."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+import pytest
+
+from host.capture.segment import Segment, read_index
+from shared.errors import DataError, DeviceError
+
+
+def test_memory_is_taken_again_and_clean(tmp_path):
+    first = Segment(tmp_path / "a", 9000)
+    first.data[:] = 7
+    first.discard()
+    second = Segment(tmp_path / "b", 8000, first.memory)
+    assert np.shares_memory(second.data, first.memory)
+    assert not second.data.any()
+    second.data[5] = 9
+    assert second.finish() == zlib.crc32((tmp_path / "b").read_bytes())
+    assert (tmp_path / "b").read_bytes() == bytes(5) + b"\t" + bytes(7994)
+
+
+def test_no_room_on_the_disk(tmp_path):
+    with pytest.raises(DeviceError, match="cannot reserve"):
+        Segment(tmp_path / "huge.part", 1 << 60)
+
+
+def test_damaged_index_is_refused(tmp_path):
+    for raw in (b"", b"[]\n", b'{"arrivals":2}\n' + bytes(16), b'{"arrivals":1}\n' + bytes(15)):
+        (tmp_path / "a.idx").write_bytes(raw)
+        with pytest.raises(DataError):
+            read_index(tmp_path / "a.idx")

@@ -1,0 +1,25 @@
+"""Options of the whole test suite."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+# A shell that starts the tests in the background has Ctrl-C ignored, and so would every program the tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# No test asserts on wall-clock speed, Hypothesis' deadline included: the machine may be busy.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("instrument")
+    group.addoption(
+        "--stage-port", metavar="PORT", help="also talk to a real stage at this port: IT WILL HOME AND MOVE"
+    )
+    group.addoption("--uml", action="store_true", help="build a user-mode Linux and run the chain on its GPIO chip")
+    group.addoption("--long", action="store_true", help="the full number of randomised rows and random bytes")

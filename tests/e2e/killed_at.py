@@ -1,0 +1,49 @@
+"""Runs a program of the instrument that kills itself, as by SIGKILL, at one exact operation on a file.
+
+    python killed_at.py OPERATION SUFFIX NTH polysight scan --out DIR
+
+At the NTH `OPERATION` (pwrite, fsync, rename, ftruncate) on a file whose name ends in SUFFIX the process is gone:
+before it, but a write is half done. This finds the instants that chance hardly ever meets.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def kill_at(operation: str, suffix: str, nth: int) -> None:
+    """Arm this process."""
+    real, left = getattr(os, operation), [nth]
+
+    def call(what: Any, *more: Any, **named: Any) -> Any:
+        name = str(Path(f"/proc/self/fd/{what}").readlink()) if isinstance(what, int) else str(more[0])
+        if name.endswith(suffix):
+            left[0] -= 1
+            if not left[0]:
+                if operation == "pwrite":
+                    data, offset = more
+                    real(what, bytes(data)[: len(data) // 2], offset)
+                os.kill(os.getpid(), signal.SIGKILL)
+        return real(what, *more, **named)
+
+    setattr(os, operation, call)
+
+
+def main(words: list[str]) -> int:
+    """Run `polysight` or `polysight-pi` with the rest of the words."""
+    operation, suffix, nth, program, *arguments = words
+    kill_at(operation, suffix, int(nth))
+    sys.argv = [str(Path(sys.executable).with_name(program)), *arguments]
+    if program == "polysight":
+        from host.cli import main as run
+    else:
+        from pi_controller.cli import main as run
+    return run()
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

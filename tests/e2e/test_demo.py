@@ -1,0 +1,46 @@
+"""`polysight demo` ends cleanly when it is interrupted, and the rig runs where there is no C++ compiler."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.xdist_group("rig")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_while_scanning(bench, small_scene, number):
+    """Ctrl-C reaches the process group, SIGTERM the demo alone; both end everything."""
+    out = bench.folder / "demo"
+    demo = bench.start(
+        "polysight", "demo", "--config", REPO / "instrument.toml", "--scene", small_scene, "--out", out,
+        "--time-scale", "5",
+    )  # fmt: skip
+
+    def scanning() -> bool:
+        assert demo.process.poll() is None, demo.err
+        return any(out.glob("scan/raw/*/*.part"))
+
+    bench.wait_for(scanning, "the demo scans")
+    if number == signal.SIGINT:
+        demo.interrupt()
+    else:
+        demo.process.terminate()
+    ended = demo.wait(15)
+    assert ended.status == 128 + signal.SIGINT
+    assert ended.err.splitlines()[-1] == "polysight demo: stopped"
+    assert "Traceback" not in ended.err
+    assert bench.processes() == {}
+    assert "Traceback" not in "".join(log.read_text() for log in (out / "rig" / "logs").iterdir())
+
+
+def test_without_a_compiler(rig_without_compiler):
+    rig = rig_without_compiler
+    assert "Python stand-in" in (rig.folder / "rig" / "logs" / "stage.log").read_text()
+    ended = rig.scan("--no-process").wait()
+    assert ended.status == 0, ended.err
+    validated = rig.polysight("validate", rig.folder / "scan")
+    assert (validated.status, validated.err) == (0, "")

@@ -1,0 +1,101 @@
+"""A scan that is interrupted, or whose disk is full, goes on where it was, and what was committed stays as it is.
+
+Kills are in test_killed_processes.py.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import resource
+
+import pytest
+
+from host.store.events import read_events
+from host.store.scanfolder import ScanFolder
+from shared.messages import RowStarted
+
+pytestmark = pytest.mark.xdist_group("rig")
+
+
+def digests(path):
+    """SHA-256 of every file of every committed row."""
+    files = [path / b.file for row in ScanFolder.load(path).committed().values() for b in row.boards.values()]
+    return {f: hashlib.sha256(f.read_bytes()).hexdigest() for name in files for f in (name, name.with_suffix(".idx"))}
+
+
+def check_whole(rig, before):
+    """The scan is finished, valid, and what was committed before has not changed."""
+    path = rig.folder / "scan"
+    after = digests(path)
+    assert {file: after[file] for file in before} == before
+    assert len(ScanFolder.load(path).committed()) == 6
+    validated = rig.polysight("validate", path)
+    assert (validated.status, validated.out, validated.err) == (0, f"{path}: whole\n", "")
+    started = [(e.row.index, e.take) for e in read_events(path / "events.msgpack").events if isinstance(e, RowStarted)]
+    assert len(set(started)) == len(started), "a take was used twice"
+
+
+def test_interrupted_once(rig):
+    scan = rig.scan("--no-process")
+    rig.wait_mid_row(scan, 1)
+    scan.interrupt()
+    ended = scan.wait(30)
+    path = rig.folder / "scan"
+    left = 6 - rig.committed()
+    assert ended.status == 6
+    assert f"{left} of 6 rows are missing" in ended.message
+    assert f"polysight resume {path}" in ended.message
+    assert 2 <= 6 - left < 6
+    assert not list(path.glob("raw/*/*.part")), "the running row was ended, not cut"
+    before = digests(path)
+    assert rig.polysight("resume", path, "--no-process").status == 0
+    check_whole(rig, before)
+
+
+def test_interrupted_twice(rig):
+    scan = rig.scan("--no-process")
+    rig.wait_mid_row(scan, 1)
+    before = digests(rig.folder / "scan")
+    scan.interrupt()
+    scan.interrupt()
+    ended = scan.wait(30)
+    assert ended.status == 6
+    assert "polysight resume" in ended.message
+    assert rig.polysight("resume", rig.folder / "scan", "--no-process").status == 0
+    check_whole(rig, before)
+
+
+def test_full_disk_on_the_pi(rig):
+    """The journal cannot be written: what the Pi says about it is not journalled, and the host must learn it all the
+    same, instead of waiting for the end of a row that nobody will tell."""
+    scan = rig.scan("--no-process")
+    rig.wait_mid_row(scan, 1)
+    journal = next((rig.folder / "rig" / "journal").glob("*.journal"))
+    unlimited = resource.RLIM_INFINITY
+    resource.prlimit(rig.pi.process.pid, resource.RLIMIT_FSIZE, (journal.stat().st_size, unlimited))
+    ended = scan.wait(30)
+    assert ended.status == 6
+    assert "the journal cannot be written" in ended.message
+    assert f"polysight resume {rig.folder / 'scan'}" in ended.message
+    before = digests(rig.folder / "scan")
+    resource.prlimit(rig.pi.process.pid, resource.RLIMIT_FSIZE, (unlimited, unlimited))
+    resumed = rig.polysight("resume", rig.folder / "scan", "--no-process")
+    assert resumed.status == 0, resumed.err
+    check_whole(rig, before)
+
+
+def test_full_disk_on_the_host(rig):
+    scan = rig.scan("--no-process")
+    rig.wait_mid_row(scan, 1)
+    before = digests(rig.folder / "scan")
+    written = (rig.folder / "scan" / "manifest.jsonl").stat().st_size
+    resource.prlimit(scan.process.pid, resource.RLIMIT_FSIZE, (written, resource.RLIM_INFINITY))
+    ended = scan.wait(30)
+    assert ended.status == 5
+    assert "cannot be written: File too large" in ended.message
+    assert f"do: free space; `polysight resume {rig.folder / 'scan'}`" in ended.message
+    validated = rig.polysight("validate", rig.folder / "scan")
+    assert validated.status == 0, validated.out
+    resumed = rig.polysight("resume", rig.folder / "scan", "--no-process")
+    assert resumed.status == 0, resumed.err
+    check_whole(rig, before)

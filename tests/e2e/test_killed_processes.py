@@ -1,0 +1,280 @@
+"""SIGKILL of the host, the Pi, or both, wherever it hits: the scan goes on, and its image is the undisturbed one's.
+
+Real processes on a simulated rig. Where each kill hits follows from its number: some come after a drawn time, others at
+an exact operation on a file (killed_at.py), in the scan or in the resume after it. `--long` takes 50 of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from host.pipeline import Pipeline
+from host.store import manifest
+from host.store.events import read_events
+from host.store.scanfolder import ScanFolder
+from host.store.validate import validate
+from shared.messages import RowStarted
+
+pytestmark = [pytest.mark.xdist_group("rig"), pytest.mark.slow]
+KILLED_AT = Path(__file__).with_name("killed_at.py")
+SCENE = """name = "a metal plate"
+seed = 4
+[grid]
+columns = 6
+rows = 4
+step_x_mm = 20.0
+step_y_mm = 20.0
+[burst]
+pulses = 4
+[image]
+columns = 20
+rows = 20
+pixel_mm = 8.0
+[[plates]]
+name = "copper"
+centre_mm = [0.0, 0.0]
+size_mm = [60.0, 60.0]
+metal = true
+"""
+METAL = ["--metal", "0,0,50,50"]  # the aperture is too small for the plate to be found by itself
+ROWS, FILES = 4, 8
+HOST_PLACES = [
+    *(("rename", ".bin", n) for n in range(1, FILES + 1)),  # rows durable, not named: before, and between two boards
+    *(("fsync", "raw/RV", n) for n in range(1, ROWS + 1)),  # named, not committed
+    *(("pwrite", "manifest.jsonl", n) for n in range(1, ROWS + 3)),  # half a line
+    *(("fsync", "manifest.jsonl", n) for n in range(2, ROWS + 5)),  # a line not synced
+    *(("pwrite", "events.msgpack", n) for n in range(1, ROWS + 3)),
+]
+PI_PLACES = [
+    *(("pwrite", ".journal", n) for n in range(1, 30)),  # half a record
+    *(("fsync", ".journal", n) for n in range(1, 12)),
+    ("ftruncate", ".journal", 1),  # while the journal is opened
+]
+RESUME_PLACES = [
+    ("ftruncate", "manifest.jsonl", 1),  # while the torn end is cut off
+    ("ftruncate", "events.msgpack", 1),
+    ("pwrite", "manifest.jsonl", 1),
+    ("pwrite", "events.msgpack", 1),
+    ("rename", ".bin", 1),
+    ("rename", ".bin", 2),
+    ("fsync", "manifest.jsonl", 3),
+]
+
+
+@dataclass
+class Kill:
+    """One try: who is killed, where, and how its resumes are killed.
+
+    Either after a number of committed rows (-1: none, and maybe before the scan is begun) and a time in seconds, or at
+    a place.
+    """
+
+    number: int
+    host: bool
+    pi: bool
+    rows: int = 0
+    wait_s: float = 0.0
+    place: tuple[str, str, int] | None = None
+    resumes: list[tuple[str, str, int]] = field(default_factory=list)
+
+    @staticmethod
+    def draw(number: int) -> Kill:
+        rng = random.Random(number)
+        kind = number % 6
+        host, pi = [(True, False), (False, True), (True, True)][kind // 2]
+        kill = Kill(number, host, pi)
+        if kind % 2 or (host and pi):
+            kill.rows = rng.randrange(-1, ROWS)
+            kill.wait_s = rng.uniform(0.0, 2.0 if kill.rows < 0 else 0.4)
+        else:
+            kill.place = rng.choice(HOST_PLACES if host else PI_PLACES)
+        if host and rng.random() < 0.5:
+            kill.resumes = rng.choices(RESUME_PLACES, k=rng.randint(1, 2))
+        return kill
+
+
+class Killed:
+    """The rig, its undisturbed scan, and what becomes of each kill."""
+
+    def __init__(self, rig: Any) -> None:
+        self.rig = rig
+        assert self.scan(rig.folder / "undisturbed").wait().status == 0
+        self.rows, self.image = rows(rig.folder / "undisturbed"), image(rig.folder / "undisturbed")
+
+    def start(self, place: tuple[str, str, int] | None, *command: str | Path) -> Any:
+        """A command, which kills itself at `place`."""
+        armed = [] if place is None else ["python", KILLED_AT, place[0], place[1], str(place[2])]
+        return self.rig.start(*armed, *command)
+
+    def scan(self, folder: Path, place: tuple[str, str, int] | None = None, *more: str) -> Any:
+        """Start a scan, or go on with it when its manifest has a first line."""
+        command = ("resume", folder) if begun(folder) else ("scan", "--config", self.rig.config, "--out", folder)
+        return self.start(place, "polysight", *command, *(more or ["--no-process"]))
+
+    def restart_pi(self, place: tuple[str, str, int] | None = None) -> None:
+        """As systemd does. With a place, its next scan kills it."""
+        self.rig.pi.kill()
+        wires = self.rig.folder / "rig" / "wires.sock"
+        self.rig.pi = self.start(place, "polysight-pi", "run", "--config", self.rig.config, "--wires", wires)
+        self.rig.pi.wait_ready()
+
+    def strike(self, kill: Kill, folder: Path) -> None:
+        """Begin a scan, kill as told, and wait until nothing of it runs any more."""
+        if kill.pi and kill.place:
+            self.restart_pi(kill.place)
+        host = self.scan(folder, kill.place if kill.host else None)
+        if kill.place is None:
+            there = lambda: host.process.poll() is not None or len(committed(folder)) >= kill.rows  # noqa: E731
+            self.rig.wait_for(there, f"{kill.rows} rows")
+            time.sleep(kill.wait_s)
+            if kill.host:
+                host.kill()
+        elif kill.pi:
+            ended = lambda: self.rig.pi.process.poll() is not None or host.process.poll() is not None  # noqa: E731
+            self.rig.wait_for(ended, "the Pi at its place, or the scan's end")
+        if kill.pi:
+            self.restart_pi()
+        ended = host.wait()
+        assert ended.status in ((-signal.SIGKILL, 0) if kill.host else (0, 5, 6)), ended.err
+
+    def check(self, kill: Kill) -> list[int]:
+        """Kill, resume, compare. Returns how many rows each resume has taken again."""
+        folder = self.rig.folder / f"scan-{kill.number}"
+        self.strike(kill, folder)
+        again = []
+        for place in [*kill.resumes, None]:
+            before = safe(folder, self.rows)
+            ended = self.scan(folder, place).wait()
+            assert ended.status == 0 or (place and ended.status == -signal.SIGKILL), f"{kill}\n{ended.err}"
+            assert before.items() <= safe(folder, self.rows).items(), kill
+            again.append(len(retaken(folder)))
+        assert validate(folder) == [], kill
+        assert rows(folder) == self.rows, kill
+        assert image(folder) == self.image, kill
+        assert max(again) <= 1, kill
+        started = [e for e in read_events(folder / "events.msgpack").events if isinstance(e, RowStarted)]
+        assert len({(e.row.index, e.take) for e in started}) == len(started), "a take was used twice"
+        return again
+
+
+def begun(folder: Path) -> bool:
+    path = folder / "manifest.jsonl"
+    return path.exists() and manifest.read(path).length > 0
+
+
+def rows(folder: Path) -> dict[str, str]:
+    """SHA-256 of every committed row of every board."""
+    files = [b.file for row in ScanFolder.load(folder).committed().values() for b in row.boards.values()]
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files}
+
+
+def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
+    """The committed rows of a scan that was broken off: all good, or there is none."""
+    if not begun(folder):
+        return {}
+    assert [f for f in validate(folder) if f.severity == "error"] == []
+    found = rows(folder)
+    assert found.items() <= truth.items()
+    return found
+
+
+def retaken(folder: Path) -> set[int]:
+    """Rows that the last resume has taken again, by the manifest."""
+    if not begun(folder):
+        return set()
+    facts = ScanFolder.load(folder).content.facts
+    since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
+    return {f["row"] for f in facts[since:] if f["fact"] in ("row_committed", "row_rejected") and f["take"] > 1}
+
+
+def image(folder: Path) -> bytes:
+    """The final image's bytes, both channels and their mask."""
+    pipeline = Pipeline(ScanFolder.load(folder))
+    for row in pipeline.source.rows():
+        pipeline.add_row(row)
+    images = pipeline.form_images()
+    return b"".join(part.tobytes() for part in (images.h, images.v, images.valid))
+
+
+@pytest.fixture(scope="module")
+def killed(make_rig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killed]:
+    rig = make_rig(tmp_path_factory.mktemp("killed"), time_scale=50.0, scene=SCENE)
+    try:
+        rig.begin()
+        yield Killed(rig)
+    finally:
+        rig.close()
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    count = 50 if metafunc.config.getoption("--long") else 6
+    if "number" in metafunc.fixturenames:
+        metafunc.parametrize("number", range(count))
+
+
+def test_killed(killed: Killed, number: int, record_property):
+    kill = Kill.draw(number)
+    again = killed.check(kill)
+    record_property("kill", f"{kill}; rows retaken by each resume: {again}")
+    print(f"{kill}: rows retaken by each resume {again}")  # noqa: T201 - shown with -s
+
+
+def test_products_of_a_killed_scan(killed: Killed):
+    """What was processed while the scan ran, and ran again, is what the undisturbed scan is processed into."""
+    folder = killed.rig.folder / "live"
+    scan = killed.scan(folder, ("rename", ".bin", 5), *METAL)
+    assert scan.wait().status == -signal.SIGKILL
+    resumed = killed.scan(folder, None, *METAL).wait()
+    assert resumed.status == 0, resumed.err
+    out = killed.rig.folder / "products"
+    processed = killed.rig.polysight("process", killed.rig.folder / "undisturbed", "--out", out, *METAL)
+    assert processed.status == 0, processed.err
+    with np.load(folder / "products" / "image.npz") as live, np.load(out / "image.npz") as undisturbed:
+        assert live.files == undisturbed.files
+        for name in live.files:
+            np.testing.assert_array_equal(live[name], undisturbed[name])
+    found = [json.loads((products / "materials.json").read_bytes()) for products in (folder / "products", out)]
+    assert found[0].pop("scan_id") != found[1].pop("scan_id")
+    assert found[0] == found[1]
+
+
+def test_pi_is_lost_with_its_journal(killed: Killed):
+    """Without a Pi the error says so; a Pi with an empty card goes on behind what the host has, and the host tells."""
+    folder = killed.rig.folder / "lost"
+    scan = killed.scan(folder)
+    killed.rig.wait_for(lambda: scan.process.poll() is not None or len(committed(folder)) >= 2, "two rows")
+    killed.rig.pi.kill()
+    ended = scan.wait()
+    assert ended.status == 5
+    assert ended.message.startswith("polysight scan: the Pi at tcp://")
+    assert "polysight-pi" in ended.message
+    before = safe(folder, killed.rows)
+    refused = killed.scan(folder).wait()
+    assert refused.status == 5
+    assert "the Pi at tcp://" in refused.message
+    known = len(read_events(folder / "events.msgpack").events)
+    scan_id = ScanFolder.load(folder).scan_id
+    (killed.rig.folder / "rig" / "journal" / f"{scan_id}.journal").unlink()
+    killed.restart_pi()
+    resumed = killed.scan(folder).wait()
+    assert resumed.status == 0, resumed.err
+    assert f"journal of this scan ends {known} events before" in " ".join(resumed.err.split())
+    assert before.items() <= rows(folder).items()
+    assert (validate(folder), rows(folder)) == ([], killed.rows)
+    assert len(retaken(folder)) <= 1
+
+
+def committed(folder: Path) -> list[int]:
+    """Rows that are committed, of a scan that may not be begun."""
+    return list(ScanFolder.load(folder).committed()) if begun(folder) else []

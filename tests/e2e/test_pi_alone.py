@@ -1,0 +1,60 @@
+"""The Pi half runs with nothing but its own dependencies: no numpy, no scipy; no gpiod where lines are simulated."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+BLOCK = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {absent}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+"""
+HOST_ONLY = ("numpy", "scipy", "sklearn", "skimage", "matplotlib", "jinja2", "rich", "gpiod", "host", "simulators")
+EVERYTHING = """
+import importlib, pkgutil
+import pi_controller, shared
+for package in (pi_controller, shared):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+"""
+HELP = "from pi_controller.cli import main\nmain({arguments})\n"
+
+
+def alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
+    code = BLOCK.format(absent=set(absent)) + code
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_every_module_imports():
+    ended = alone(EVERYTHING, *HOST_ONLY)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_the_block_blocks():
+    assert "No module named 'numpy'" in alone("import numpy", *HOST_ONLY).stderr
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["check", "--help"]])
+def test_help(arguments):
+    ended = alone(HELP.format(arguments=arguments), *HOST_ONLY)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "polysight-pi" in ended.stdout
+    assert "example" in ended.stdout
+
+
+def test_gpio_without_gpiod_is_one_message():
+    code = (
+        "from pi_controller.lines_gpiod import load_gpiod\nfrom shared.errors import PolysightError\n"
+        "try:\n    load_gpiod()\nexcept PolysightError as e:\n    print(e)\n"
+    )
+    ended = alone(code, *HOST_ONLY)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "gpiod" in ended.stdout
+    assert "do: " in ended.stdout

@@ -1,0 +1,305 @@
+"""Whatever is wrong from outside: the exit status is not 0, and one message says what, why and what to do."""
+
+from __future__ import annotations
+
+import os
+import pty
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tomli_w
+
+from shared.config import to_builtins
+
+REPO = Path(__file__).resolve().parents[2]
+RIG = REPO / "instrument.toml"
+CAPTURE = REPO.parent / "shared" / "data" / "dca1000-real" / "test_one_frame.pcap"
+SCENE = """name = "plates"
+[grid]
+columns = 12
+rows = 4
+step_x_mm = 10.0
+step_y_mm = 10.0
+[burst]
+pulses = 2
+[image]
+columns = 30
+rows = 30
+pixel_mm = 5.0
+"""
+
+
+def refused(ended, *words: str, status: int | None = None) -> None:
+    """Exit status not 0; one message with what, why and what to do, in which the words occur."""
+    assert ended.status > 0, ended
+    if status is not None:
+        assert ended.status == status, ended
+    message = ended.message
+    assert "\n  why: " in message, message
+    assert "\n  do: " in message, message
+    for word in words:
+        assert word in message, message
+
+
+# --- files the user wrote ---------------------------------------------------------------------------------------------
+
+
+def damaged_rig(folder: Path, old: str, new: str) -> Path:
+    text = RIG.read_text()
+    assert text.count(old) == 1
+    path = folder / "wrong.toml"
+    path.write_text(text.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize("program", ["polysight", "polysight-pi"])
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("baud = 115200", "baud = 115200\nbaude = 9600", ("stage", "baude")),
+        ("columns = 350", 'columns = "many"', ("grid.columns", "many", "int")),
+        ("pulses = 16", "pulses = 16 17", ("not valid TOML", "line")),
+        ("period_us = 1500.0", "period_us = 15.0", ("burst", "300 us")),
+    ],
+)
+def test_rig_file(bench, program, old, new, words):
+    path = damaged_rig(bench.folder, old, new)
+    command = ["scan", "--out", "s"] if program == "polysight" else ["run"]
+    refused(bench.run(program, *command, "--config", path), path.name, *words, status=2)
+    assert not (bench.folder / "s").exists()
+
+
+def test_files_that_are_not_there(bench):
+    refused(bench.polysight("scan", "--out", "s"), "instrument.toml: no such file", status=2)
+    refused(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
+    refused(bench.polysight("demo", "--config", RIG, "--scene", "no.toml", "--out", "d"), "no.toml: no such file")
+    refused(bench.polysight("simulate", "no.toml", "--config", RIG, "--out", "d"), "no.toml: no such file", status=2)
+    refused(bench.polysight("inspect", "no.bin"), "no.bin", status=3)
+    refused(bench.polysight("inspect", "no.pcap"), "no.pcap", status=3)
+
+
+@pytest.mark.parametrize("command", [["simulate", "scene.toml"], ["demo", "--scene", "scene.toml"]])
+def test_unknown_key_in_a_scene(bench, command):
+    (bench.folder / "scene.toml").write_text(SCENE.replace("[grid]", "colour = 3\n[grid]", 1))
+    refused(bench.polysight(*command, "--config", RIG, "--out", "d"), "scene.toml", "colour")
+
+
+# --- recorded data ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A simulated scan of nothing: no metal, no plates."""
+    folder = tmp_path_factory.mktemp("recorded")
+    (folder / "scene.toml").write_text(SCENE)
+    command = [sys.executable, "-m", "simulators", "simulate", folder / "scene.toml", "--config", RIG]
+    subprocess.run([*command, "--out", folder / "scan"], check=True, capture_output=True)
+    return folder / "scan"
+
+
+@pytest.fixture
+def scan(recorded, bench):
+    """A copy of it, to be damaged."""
+    return Path(shutil.copytree(recorded, bench.folder / "scan"))
+
+
+@pytest.mark.parametrize("command", ["process", "validate", "resume"])
+def test_folder_that_is_no_scan(bench, command):
+    out = ["--out", "out"] if command == "process" else []
+    (bench.folder / "empty").mkdir()
+    (bench.folder / "other").mkdir()
+    (bench.folder / "other" / "notes.txt").write_text("not a scan")
+    every = ("missing", "empty", "other", "other/notes.txt")
+    for name in every if command == "validate" else ("missing", "other"):
+        refused(bench.polysight(command, name, *out), name, status=3)
+    assert not (bench.folder / "out").exists()
+
+
+def test_torn_last_line_is_tolerated(bench, scan):
+    with (scan / "manifest.jsonl").open("ab") as f:
+        f.write(b'{"fact": "row_comm')
+    ended = bench.polysight("validate", scan)
+    assert (ended.status, ended.err) == (0, "")
+    assert "torn" in ended.out
+    assert bench.polysight("image", scan, "--out", "out").status == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"junk\n" * 3, None])
+def test_damaged_first_line(bench, scan, content):
+    path = scan / "manifest.jsonl"
+    path.write_bytes(path.read_bytes().replace(b"scan_id", b"scan_ID", 1) if content is None else content)
+    refused(bench.polysight("process", scan, "--out", "out"), "manifest.jsonl", "scan_started", status=3)
+    refused(bench.polysight("resume", scan), "manifest.jsonl", "scan_started", status=3)
+    ended = bench.polysight("validate", scan)
+    assert (ended.status, ended.err) == (1, "")
+    assert "error: manifest.jsonl" in ended.out
+
+
+def test_truncated_and_deleted_rows(bench, scan):
+    row = scan / "raw" / "RH" / "0002.bin"
+    with row.open("r+b") as f:
+        f.truncate(1000)
+    refused(bench.polysight("process", scan, "--out", "out"), str(row), "1000 bytes", status=3)
+    ended = bench.polysight("validate", scan)
+    assert (ended.status, ended.err) == (1, "")
+    assert ended.out.count("error:") == 1
+    assert "raw/RH/0002.bin: 1000 bytes" in ended.out
+    shutil.rmtree(scan / "raw")
+    refused(bench.polysight("image", scan, "--out", "out"), str(scan / "raw"), status=3)
+    ended = bench.polysight("validate", scan)
+    assert (ended.status, ended.out.count("error:")) == (1, 8)
+
+
+def test_scan_without_a_row(bench, scan):
+    path = scan / "manifest.jsonl"
+    path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
+    refused(bench.polysight("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
+
+
+def test_library(bench, scan):
+    process = ("process", scan, "--out", "out", "--library")
+    (bench.folder / "junk.npz").write_text("no library")
+    for name in ("no.npz", "junk.npz", "scan"):
+        refused(bench.polysight(*process, name), name, "polysight train", status=3)
+    assert not (bench.folder / "out").exists(), "found out before anything is processed"
+    refused(bench.polysight("train", "--config", RIG, "--out", "l.npz"), "--simulate")
+
+
+def test_nothing_to_refer_to(bench, scan):
+    """No metal, no plates: the images are written all the same, and the message says so."""
+    ended = bench.polysight("process", scan, "--out", "out")
+    refused(ended, "metal", "--metal", "the images are written: out/image.npz", status=3)
+    assert (bench.folder / "out" / "image.npz").exists()
+    assert not (bench.folder / "out" / "report.html").exists()
+
+
+def test_out_is_taken(bench, scan):
+    mine = bench.folder / "mine"
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("precious")
+    for command in (["image", scan], ["demo", "--config", RIG], ["scan", "--config", RIG]):
+        refused(bench.polysight(*command, "--out", mine), str(mine), "--out", status=2)
+    for command in (["image", scan], ["demo", "--config", RIG]):
+        refused(bench.polysight(*command, "--out", mine / "thesis.tex"), "thesis.tex", "--out", status=2)
+    refused(bench.polysight("scan", "--config", RIG, "--out", scan), f"polysight resume {scan}", status=2)
+    assert (mine / "thesis.tex").read_text() == "precious"
+    assert list(mine.iterdir()) == [mine / "thesis.tex"]
+    assert bench.polysight("image", scan, "--out", "out").status == 0
+    assert bench.polysight("image", scan, "--out", "out").status == 0, "earlier products may be replaced"
+
+
+@pytest.mark.parametrize("name", ["empty.bin", "empty.pcap", "text.txt", "long-text.bin", "text.pcap", "head.pcap"])
+def test_inspect_what_is_no_recording(bench, name):
+    content = {
+        "empty": b"",
+        "text": b"hello\n",
+        "long-text": b"The quick brown fox jumps over the lazy dog.\n" * 2000,
+        "head": bytes.fromhex("d4c3b2a1020004000000000000000000ffff000001000000") + b"\0" * 7,
+    }
+    (bench.folder / name).write_bytes(content[name.partition(".")[0]])
+    refused(bench.polysight("inspect", name), name, status=3)
+
+
+def test_inspect_a_truncated_capture(bench):
+    if not CAPTURE.exists():
+        pytest.skip(f"{CAPTURE} is not here: the capture of a real card is not ours to publish")
+    (bench.folder / "cut.pcap").write_bytes(CAPTURE.read_bytes()[:5000])
+    refused(bench.polysight("inspect", "cut.pcap"), "cut.pcap", "truncated", status=3)
+
+
+# --- the Pi's side ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def lonely(bench, lonely_instrument):
+    """A rig file, in which nobody answers."""
+    path = bench.folder / "rig.toml"
+    path.write_text(tomli_w.dumps(to_builtins(lonely_instrument)))
+    return path
+
+
+@pytest.fixture
+def wires(bench):
+    """Simulated wires."""
+    path = bench.folder / "wires.sock"
+    bench.start("python", "-m", "simulators.wires", "--socket", path).wait_ready()
+    return path
+
+
+def listening(address: str) -> socket.socket:
+    """A socket that holds a `tcp://` address."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    held = socket.create_server((host, int(port)))
+    return held
+
+
+def test_pi_ports_in_use(bench, lonely, lonely_instrument, wires):
+    run = ("polysight-pi", "run", "--config", lonely, "--wires", wires)
+    for address in (lonely_instrument.pi.command_address, lonely_instrument.pi.event_address):
+        with listening(address):
+            refused(bench.run(*run), address, "in use", "ss -ltnp", status=5)
+
+
+def test_no_stage(bench, lonely, lonely_instrument, wires, silent_pty):
+    run = ("polysight-pi", "run", "--config", lonely, "--wires", wires)
+    refused(bench.run(*run), lonely_instrument.stage.port, "No such file", "stage.port", status=5)
+    refused(bench.run(*run, "--stage-port", silent_pty), silent_pty, "does not answer", "make flash", status=5)
+    (bench.folder / "file").touch()
+    refused(bench.run(*run, "--stage-port", bench.folder / "file"), "file", status=5)
+    refused(bench.run("polysight-pi", "run", "--config", lonely, "--wires", "no.sock"), "no.sock", status=5)
+
+
+@pytest.fixture
+def silent_pty():
+    """A serial port on whose other end nobody listens."""
+    master, slave = pty.openpty()
+    yield os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+# --- the host and what it talks to ------------------------------------------------------------------------------------
+
+
+def test_no_pi(bench, lonely, lonely_instrument):
+    ended = bench.polysight("scan", "--config", lonely, "--out", "s")
+    refused(ended, lonely_instrument.pi.command_address, "polysight-pi run", status=5)
+    assert not (bench.folder / "s").exists()
+
+
+def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
+    """The Pi's port takes the connection and never answers: Ctrl-C ends the wait."""
+    table = to_builtins(lonely_instrument)
+    table["limits"]["command_timeout_s"] = 60.0
+    lonely.write_text(tomli_w.dumps(table))
+    with listening(lonely_instrument.pi.command_address):
+        scan = bench.start("polysight", "scan", "--config", lonely, "--out", "s")
+        bench.wait_for(lambda: "reaching" in scan.err, "the scan says that it connects")
+        scan.interrupt()
+        ended = scan.wait(10)
+    assert ended.status == 128 + signal.SIGINT
+    assert ended.message == "polysight scan: stopped"
+    assert not (bench.folder / "s").exists()
+
+
+@pytest.mark.xdist_group("rig")
+def test_cards_that_do_not_serve(rig):
+    """The simulated rig runs; one card after another is wrong."""
+    board = rig.instrument.by_name("RV")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((board.host_address, board.data_port))
+        ended = rig.scan().wait(30)
+        refused(ended, f"{board.host_address}:{board.data_port}", "ss -ulnp", status=5)
+    table = to_builtins(rig.instrument)
+    card = next(b for b in table["boards"] if b["name"] == "RV")
+    card["card_address"] = card["card_address"].rpartition(".")[0] + ".99"
+    rig.config.write_text(tomli_w.dumps(table))
+    ended = rig.scan().wait(30)
+    refused(ended, "RV", card["card_address"], "did not answer", status=5)
+    assert "doctor" not in ended.message
+    assert not (rig.folder / "scan").exists()

@@ -1,0 +1,125 @@
+"""Laws of the whole chain on raw data from an independent simulator: bytes in, images and materials out.
+
+One worker runs them all (xdist_group), so that scans are simulated once.
+"""
+
+import numpy as np
+import pytest
+
+from host.materials import Classifier, Library, pixel_accuracy
+from host.materials.segment import axis_mm, box_mask
+from host.pipeline import LIBRARY
+from host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
+
+pytestmark = pytest.mark.xdist_group("host_sim")
+
+
+def inside(scan, name, rim_mm=11.0):
+    """Pixels of a plate without its rim of about a resolution cell; bool [ny, nx]."""
+    x0, y0, x1, y1 = next(p.box_mm for p in scan.plates if p.name == name)
+    box = (x0 + rim_mm, y0 + rim_mm, x1 - rim_mm, y1 - rim_mm)
+    return box_mask(box, scan.images.x_m, scan.images.y_m) & scan.images.valid
+
+
+def correlation(a, b):
+    return abs(np.vdot(a, b)) / np.sqrt(np.vdot(a, a).real * np.vdot(b, b).real)
+
+
+def test_points_focus_within_half_a_pixel_in_both_channels(imaged):
+    scan = imaged("point-targets")
+    truth = {"middle": (0.0, 0.0), "right": (50.0, 10.0), "upper left": (-40.0, 60.0), "lower": (20.0, -55.0)}
+    x, y = axis_mm(scan.images.x_m), axis_mm(scan.images.y_m)
+    for image in (scan.images.h_raw, scan.images.v_raw):
+        for px, py in truth.values():
+            near = (np.abs(x[None, :] - px) < 15) & (np.abs(y[:, None] - py) < 15)
+            row, column = np.unravel_index(np.argmax(np.abs(image) * near), image.shape)
+            assert abs(x[column] - px) <= 1.0 + 1e-9  # half of 2 mm
+            assert abs(y[row] - py) <= 1.0 + 1e-9
+
+
+def test_synchronisation_undoes_every_disturbance(imaged):
+    """All disturbances on, against all off: the images agree."""
+    disturbed, ideal = imaged("nine-materials"), imaged("nine-materials", ideal=True)
+    at = disturbed.images.valid & ideal.images.valid
+    for channel in ("h", "v"):
+        on, off = (getattr(s.images, channel)[at] for s in (disturbed, ideal))
+        assert correlation(on, off) > 0.995, channel
+
+
+@pytest.mark.parametrize("board", ["RH", "RV"])
+def test_each_stage_of_synchronisation_shrinks_the_offsets(imaged, board):
+    """From chirps as they came to the object referenced to the direct path, all of them measured."""
+    stages = imaged("nine-materials").pipeline.quality.to_dict()["boards"][board]["synchronisation"]
+    assert stages["received"]["frequency_std_hz"] > 10e3
+    assert stages["received"]["phase_std_rad"] > 1.0
+    for key, paper in (("frequency_std_hz", 138), ("phase_std_rad", 0.022)):
+        received, aligned, averaged = (stages[name][key] for name in ("received", "aligned", "averaged"))
+        assert averaged < aligned < received / 50
+        assert aligned < paper  # the paper's figure after all stages
+
+
+def test_metal_gives_one_at_every_pixel_within_noise(imaged):
+    """A metal plate over the whole plane, referenced to its middle: P = 1 everywhere, up to the noise of a pixel."""
+    scan, again = imaged("metal-plate"), imaged("metal-plate", seed=1003)
+    at = inside(scan, "copper", rim_mm=150.0)
+    assert at.sum() > 1000
+    middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
+    first, second = (calibrate(s.images.h, s.images.v, middle).p[at] for s in (scan, again))
+    noise = np.std(first - second) / np.sqrt(2)
+    assert np.abs(first - 1).max() < 0.02 + 5 * noise
+    assert np.abs(first.mean() - 1) < 0.01
+
+
+OTHER = {"hv_gain_db": -3.0, "leakage_h": [0.08, 0.03], "leakage_v": [0.08, 0.03]}
+"""A rig that differs from the default in gain (1.5 dB of H over V) and leakage (0.05)."""
+
+
+def test_the_set_gain_is_recovered_and_does_not_reach_the_images(imaged):
+    def gains_db(scan):
+        h, v = (np.abs(scan.images.rx_calibration[b.name]).mean() for b in scan.rig.receivers)
+        c = calibrate(scan.images.h, scan.images.v, inside(scan, "copper"))
+        return 20 * np.log10(h / v), 20 * np.log10(abs(c.metal_h) / abs(c.metal_v))
+
+    (received, image), (received_other, image_other) = (
+        gains_db(imaged("nine-materials")),
+        gains_db(imaged("nine-materials", **OTHER)),
+    )
+    assert received - received_other == pytest.approx(1.5 + 3.0, abs=0.1)
+    assert image == pytest.approx(image_other, abs=0.1)
+
+
+@pytest.mark.parametrize("disturbances", [{}, OTHER])
+def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances):
+    scan = imaged("nine-materials", **disturbances)
+    leakage = complex(*disturbances.get("leakage_h", [0.05, 0.0]))
+    c = calibrate(scan.images.h, scan.images.v, inside(scan, "copper"))
+    theta = scan.pipeline.find_materials(scan.images, plates=scan.plates).theta_rad[0, 0]
+    true = complex(ratio_from_permittivity(4.75 - 2.43j, theta))
+    at = inside(scan, "ceramic")
+    measured = np.sum(c.h[at]) / np.sum(c.v[at])
+    assert abs(axial_ratio_from_known(measured, true) - leakage) < 0.012
+    h, v = correct_leakage(c.h, c.v, leakage, leakage)
+    assert abs(np.sum(h[at]) / np.sum(v[at]) / true - 1) < 0.05
+
+
+def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
+    scan = imaged("nine-materials")
+    found = scan.pipeline.find_materials(scan.images, None, Classifier(Library.load(LIBRARY)), scan.plates)
+    assert len(found.patches) == 9
+    assert all(p.truth is not None and p.verdict is not None for p in found.patches)
+    right = [p for p in found.patches if p.verdict.name == p.truth.name]
+    assert len(right) >= 8
+    assert pixel_accuracy(found) > 0.85
+    assert found.metal.certain
+    for p in found.patches:
+        if p.truth.metal:
+            assert not p.permittivity.determinable
+        else:
+            assert p.permittivity.value.real == pytest.approx(p.truth.permittivity.real, rel=0.1), p.truth.name
+
+
+def test_the_library_never_saw_the_demo_scene():
+    library = Library.load(LIBRARY)
+    assert library.simulated
+    assert "nine-materials" not in library.scans
+    assert len(library.scans) == 8

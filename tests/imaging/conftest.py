@@ -1,0 +1,85 @@
+"""Small scenes of known truth: point targets and a uniform plane, as synchronised rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from host.imaging.grid import Antennas, row_offsets_m
+from host.sync.chain import SyncedRow
+from shared.config import Board, Instrument, load_instrument
+from shared.raster import plan_raster
+from shared.units import SPEED_OF_LIGHT_M_S
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def published() -> Instrument:
+    return load_instrument(ROOT / "instrument.toml")
+
+
+@pytest.fixture(scope="session")
+def make_rig(published):
+    """The published rig with a small grid and image."""
+
+    def make(columns=31, rows=31, step_x=4.0, step_y=4.0, pixels=(40, 40), pixel=2.0) -> Instrument:
+        grid = msgspec.structs.replace(published.grid, columns=columns, rows=rows, step_x_mm=step_x, step_y_mm=step_y)
+        image = msgspec.structs.replace(published.image, columns=pixels[0], rows=pixels[1], pixel_mm=pixel)
+        return msgspec.structs.replace(published, grid=grid, image=image)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def synced_row():
+    """A synchronised row from samples [rx, position, sample]."""
+
+    def make(samples, valid=None) -> SyncedRow:
+        n = samples.shape[1]
+        valid = np.ones(n, bool) if valid is None else valid
+        zero = np.zeros(n)
+        samples = np.where(valid[:, None], samples, 0).astype(np.complex64)
+        return SyncedRow(samples, valid, np.full(n, 16), zero, zero, zero, zero, {})
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def points_rows(synced_row):
+    """Rows of point targets [(x, y, z) m] with complex amplitudes, direct path included, in plan order."""
+
+    def make(
+        rig: Instrument,
+        board: Board,
+        points,
+        amplitudes,
+        direct: float = 1.0,
+        gains=(1, 1, 1, 1),
+        noise: float = 0.0,
+        shifts_m=None,
+        jitter_m=None,
+    ) -> Iterator[tuple[int, SyncedRow]]:
+        rng = np.random.default_rng(4)
+        antennas = Antennas.of(rig, board)
+        f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
+        for row in plan_raster(rig.grid):
+            u = np.column_stack([row_offsets_m(rig, row), np.zeros(row.points)])
+            u[:, 0] += 0 if shifts_m is None else shifts_m[row.index]
+            u += 0 if jitter_m is None else jitter_m[row.index]
+            s = np.tile((direct / antennas.direct_m)[:, None, None].astype(complex), (1, row.points, f.size))
+            for point, amplitude in zip(points, amplitudes, strict=True):
+                d = np.linalg.norm(point - u - antennas.tx_m, axis=1) + np.linalg.norm(
+                    point - u - antennas.rx_m[:, None], axis=2
+                )
+                excess = d - antennas.direct_m[:, None]
+                s += amplitude * np.exp(2j * np.pi * f * excess[..., None] / SPEED_OF_LIGHT_M_S)
+            if noise:
+                s += noise * (rng.standard_normal(s.shape) + 1j * rng.standard_normal(s.shape))
+            yield row.index, synced_row(s * np.array(gains)[:, None, None])
+
+    return make

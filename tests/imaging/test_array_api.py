@@ -1,0 +1,92 @@
+"""The same code on another array library: array-api-strict always, PyTorch or CuPy on a GPU where there is one."""
+
+import importlib
+
+import numpy as np
+import pytest
+
+from host.imaging import backproject, project
+from host.imaging.aperture import Aperture
+from host.imaging.direct import DirectImager
+from host.imaging.grid import Antennas, image_grid, row_offsets_m
+from host.imaging.incremental import IncrementalImager
+from host.imaging.spectral import SpectralImager
+from shared.errors import ConfigError
+from shared.raster import plan_raster
+
+
+def _strict():
+    return importlib.import_module("array_api_strict"), None
+
+
+def _gpu():
+    try:
+        torch = importlib.import_module("torch")
+    except ImportError:
+        torch = None
+    if torch is not None and torch.cuda.is_available():
+        return importlib.import_module("array_api_compat.torch"), "cuda"
+    try:
+        cupy = importlib.import_module("cupy")
+        cupy.zeros(1)
+    except Exception:  # noqa: BLE001 - whatever CuPy says without a GPU
+        pytest.skip("no GPU with PyTorch or CuPy here")
+    return importlib.import_module("array_api_compat.cupy"), None
+
+
+@pytest.fixture(params=[_strict, _gpu], ids=["array-api-strict", "gpu"])
+def library(request):
+    return request.param()
+
+
+@pytest.fixture
+def aperture(make_rig):
+    rig = make_rig(15, 6, 4.0, 4.0, (12, 10))
+    grid, antennas = image_grid(rig), Antennas.of(rig, rig.receivers[0])
+    offsets = [np.pad(row_offsets_m(rig, r)[:: r.direction], ((0, 0), (0, 1))) for r in plan_raster(rig.grid)]
+    return Aperture(antennas, np.stack(offsets), np.linspace(76.3e9, 79.7e9, 7), grid)
+
+
+def _back(array):
+    array = array.cpu() if hasattr(array, "cpu") else array
+    return np.asarray(array.get() if hasattr(array, "get") else array)
+
+
+@pytest.mark.parametrize("make", [SpectralImager, IncrementalImager, DirectImager])
+def test_images_and_samples_are_those_of_numpy(aperture, library, make):
+    xp, device = library
+    rng = np.random.default_rng(0)
+    samples = (rng.standard_normal(aperture.shape) + 1j * rng.standard_normal(aperture.shape)).astype(np.complex64)
+    pixels = (rng.standard_normal(aperture.grid.shape) + 0j).astype(np.complex64)
+    echo, weights = samples[:, :, 0, 0], rng.uniform(size=aperture.shape[2:]).astype(np.float32)
+    plain = make(aperture)
+    other = make(aperture) if make is DirectImager else make(aperture, xp=xp, device=device)
+
+    def put(array):
+        return xp.asarray(array, device=device)
+
+    for got, want in (
+        (other.image(put(samples)), plain.image(samples)),
+        (other.constant(put(echo), put(weights)), plain.constant(echo, weights)),
+        (other.samples(put(pixels)), plain.samples(pixels)),
+    ):
+        assert type(got) is type(put(samples))
+        assert np.abs(_back(got) - want).max() < 1e-5 * np.abs(want).max()
+
+
+def test_backproject_and_project_run_where_their_samples_lie(library):
+    xp, device = library
+    rng = np.random.default_rng(1)
+    f, reference = 76e9 + 1e8 * np.arange(9), rng.uniform(0, 1, 7)
+    places = [rng.uniform(-0.5, 0.5, (7, 3)) for _ in range(3)]
+    samples, pixels = (rng.standard_normal(shape) + 1j for shape in ((7, 9), 7))
+    for function, array in ((backproject, samples), (project, pixels)):
+        got = function(xp.asarray(array, device=device), f, *places, reference)
+        np.testing.assert_allclose(_back(got), function(array, f, *places, reference), rtol=1e-9)
+
+
+def test_without_array_api_compat_other_libraries_are_refused_in_words(monkeypatch, aperture):
+    strict = importlib.import_module("array_api_strict")
+    monkeypatch.setitem(importlib.import_module("sys").modules, "array_api_compat", None)
+    with pytest.raises(ConfigError, match="array-api-compat"):
+        DirectImager(aperture).image(strict.asarray(np.zeros(aperture.shape, np.complex64)))

@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from host.imaging import backproject, project
+from shared.units import SPEED_OF_LIGHT_M_S as C
+
+
+def _phase_history(f, tx, rx, reference, points, amplitudes):
+    out = np.zeros((len(tx), f.size), complex)
+    for point, amplitude in zip(points, amplitudes, strict=True):
+        d = np.linalg.norm(point - tx, axis=1) + np.linalg.norm(point - rx, axis=1) - reference
+        out += amplitude * np.exp(2j * np.pi * f * d[:, None] / C)
+    return out
+
+
+def test_a_monostatic_radar_referenced_to_the_scene_centre_focuses_in_three_dimensions():
+    rng = np.random.default_rng(0)
+    f = np.linspace(9e9, 10e9, 40)
+    angle = np.linspace(-0.1, 0.1, 60)
+    radar = 50 * np.column_stack([np.sin(angle), np.full(60, -1.0), 0.3 + 0.06 * rng.standard_normal(60)])
+    reference = 2 * np.linalg.norm(radar, axis=1)
+    points, amplitudes = np.array([[1.0, -0.5, 0.2], [-1.5, 1.0, 0.0]]), np.array([1.0, 0.5j])
+    samples = _phase_history(f, radar, radar, reference, points, amplitudes)
+    axes = np.linspace(-2, 2, 81), np.linspace(-2, 2, 41)
+    x, y = np.meshgrid(*axes)
+    voxels = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.2)])
+    image = np.abs(backproject(samples, f, radar, radar, voxels, reference)) / samples.size
+    at = voxels[np.argmax(image)]
+    assert np.abs(at - points[0]).max() < 1e-9
+    assert image.max() == pytest.approx(1, abs=0.15)
+    along_z = points[0] + np.linspace(-1, 1, 21)[:, None] * [0, 0, 1]
+    focus = backproject(samples, f, radar, radar, along_z, reference) / samples.size
+    assert np.argmax(np.abs(focus)) == 10
+    assert np.angle(focus[10]) == pytest.approx(0, abs=0.15)
+
+
+def test_evenly_spaced_frequencies_by_horner_equal_the_plain_sum():
+    rng = np.random.default_rng(1)
+    f = 76e9 + 1e8 * np.arange(9)
+    tx, rx, voxels = (rng.uniform(-0.5, 0.5, (7, 3)) for _ in range(3))
+    reference = rng.uniform(0, 1, 7)
+    s = rng.standard_normal((7, 9)) + 1j * rng.standard_normal((7, 9))
+    order = rng.permutation(9)
+    even = backproject(s, f, tx, rx, voxels, reference)
+    shuffled = backproject(s[:, order], f[order], tx, rx, voxels, reference)
+    np.testing.assert_allclose(even, shuffled, rtol=1e-8)
+    d = np.linalg.norm(voxels[:, None] - tx, axis=2) + np.linalg.norm(voxels[:, None] - rx, axis=2) - reference
+    plain = (s * np.exp(-2j * np.pi * d[..., None] * f / C)).sum(axis=(1, 2))
+    np.testing.assert_allclose(even, plain, rtol=1e-8)
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_project_is_its_adjoint_for_any_antennas_and_voxels(even):
+    rng = np.random.default_rng(5)
+    f = 76e9 + (4e8 * np.arange(9) if even else np.sort(rng.uniform(0, 4e9, 9)))
+    tx, rx, reference = rng.uniform(-1, 1, (40, 3)), rng.uniform(-1, 1, (40, 3)), rng.uniform(0, 2, 40)
+    voxels = rng.uniform(-1, 1, (30, 3))
+    y, x = (rng.standard_normal(n) + 1j * rng.standard_normal(n) for n in ((40, 9), 30))
+    forward = np.vdot(project(x, f, tx, rx, voxels, reference), y)
+    back = np.vdot(x, backproject(y, f, tx, rx, voxels, reference))
+    assert abs(forward - back) < 1e-10 * np.linalg.norm(x) * np.linalg.norm(y)
+
+
+def test_it_is_linear_and_one_frequency_works():
+    rng = np.random.default_rng(2)
+    tx, rx, voxels = (rng.uniform(-0.5, 0.5, (5, 3)) for _ in range(3))
+    a, b = (rng.standard_normal((5, 1)) + 0j for _ in range(2))
+    args = ([77e9], tx, rx, voxels, np.zeros(5))
+    np.testing.assert_allclose(
+        backproject(a + 2j * b, *args), backproject(a, *args) + 2j * backproject(b, *args), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"samples": np.zeros(3)}, {"frequencies_hz": [1.0]}, {"tx_m": np.zeros((2, 3))}, {"voxels_m": np.zeros(3)}],
+)
+def test_shapes_that_do_not_fit_are_refused(change):
+    good = {
+        "samples": np.zeros((3, 2)),
+        "frequencies_hz": [1.0, 2.0],
+        "tx_m": np.zeros((3, 3)),
+        "rx_m": np.zeros((3, 3)),
+        "voxels_m": np.zeros((4, 3)),
+        "reference_m": np.zeros(3),
+    }
+    assert backproject(**good).shape == (4,)
+    with pytest.raises(ValueError, match="must be"):
+        backproject(**{**good, **change})

@@ -1,0 +1,201 @@
+"""Three imagers, one contract: the same image, and each the adjoint of its own forward model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from host.imaging import image_grid
+from host.imaging.aperture import Aperture, irregular
+from host.imaging.direct import DirectImager
+from host.imaging.grid import Antennas, row_offsets_m
+from host.imaging.imager import choose_imager
+from host.imaging.incremental import IncrementalImager
+from host.imaging.kernels import forget
+from host.imaging.reduce import reduction, scene_gate_m
+from host.imaging.spectral import SpectralImager
+from shared.raster import plan_raster
+from shared.units import SPEED_OF_LIGHT_M_S
+
+IMAGERS = [SpectralImager, IncrementalImager, DirectImager]
+# columns, rows, steps (mm), pixels, pixel (mm): common lattices, none in x, coarser and finer pixels, full width.
+GRIDS = [
+    (15, 8, 2.0, 2.0, (20, 16), 2.0),
+    (9, 8, 5.0, 5.0, (20, 16), 2.0),
+    (31, 6, 10.0, 6.0, (30, 9), 2.0),
+    (40, 5, 2.137, 3.0, (20, 16), 2.0),
+    (30, 5, 4.0, 4.0, (10, 8), 4.0),
+    (20, 5, 2.0, 2.0, (25, 21), 0.5),
+    (1, 8, 2.0, 2.0, (9, 7), 2.0),
+    (12, 1, 2.0, 2.0, (9, 7), 2.0),
+    (350, 2, 2.0, 2.0, (150, 2), 2.0),
+]
+
+
+@pytest.fixture
+def aperture(make_rig):
+    def make(columns, rows, step_x, step_y, pixels, pixel, shifts_m=None, board=1) -> Aperture:
+        rig = make_rig(columns, rows, step_x, step_y, pixels, pixel)
+        plan, grid = plan_raster(rig.grid), image_grid(rig)
+        antennas = Antennas.of(rig, rig.receivers[board])
+        offsets = np.stack([np.pad(row_offsets_m(rig, r)[:: r.direction], ((0, 0), (0, 1))) for r in plan])
+        if shifts_m is not None:
+            offsets[..., 0] += np.asarray(shifts_m)[:, None]
+        gate = reduction(rig.chirp, scene_gate_m((antennas,), plan, grid))
+        return Aperture(antennas, offsets, gate.frequencies_hz, grid)
+
+    return make
+
+
+def _noise(rng, shape):
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+
+
+def _samples(aperture, rng):
+    """A point in noise, some positions missing."""
+    pixels = np.zeros(aperture.grid.shape, complex)
+    pixels[aperture.grid.shape[0] // 3, aperture.grid.shape[1] // 2] = 1j
+    samples = DirectImager(aperture).samples(pixels) + 0.3 * _noise(rng, aperture.shape)
+    return (samples * (rng.uniform(size=aperture.shape[2:]) > 0.1)).astype(np.complex64)
+
+
+@pytest.mark.parametrize("shifts", ["serpentine", "every row its own"])
+@pytest.mark.parametrize("grid", GRIDS)
+def test_spectral_and_row_by_row_equal_the_direct_sum(aperture, grid, shifts):
+    rng = np.random.default_rng(1)
+    a = aperture(*grid, shifts_m=None if shifts == "serpentine" else rng.uniform(-1e-3, 1e-3, grid[1]))
+    samples, d = _samples(a, rng), a.antennas.mirror_m(a.grid.z_m) - a.antennas.direct_m
+    echo = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(d, a.frequencies_hz)).astype(np.complex64)
+    weights = rng.uniform(0, 1, a.shape[2:]).astype(np.float32)
+    images = [make(a).image(samples) for make in IMAGERS]
+    echoes = [make(a).constant(echo, weights) for make in IMAGERS]
+    for (spectral, rows, direct), peak in ((images, np.prod(a.shape)), (echoes, weights.sum() * echo.size)):
+        # Of a point's peak. The fewer positions, the less of what each rounds differently averages out.
+        bound = 1e-6 if a.shape[3] > 300 else 5e-6 if a.shape[2] * a.shape[3] > 20 else 4e-5
+        assert np.abs(spectral - direct).max() < bound * peak
+        assert np.abs(rows - direct).max() < bound * peak
+
+
+@pytest.mark.parametrize("make", IMAGERS)
+@pytest.mark.parametrize("grid", GRIDS)
+def test_every_imager_is_the_adjoint_of_its_forward_model(aperture, grid, make):
+    rng = np.random.default_rng(2)
+    a = aperture(*grid)
+    imager, pixels, samples = make(a), _noise(rng, a.grid.shape), _noise(rng, a.shape)
+    forward, back = np.vdot(imager.samples(pixels), samples), np.vdot(pixels, imager.image(samples))
+    assert abs(forward - back) < 1e-5 * np.linalg.norm(pixels) * np.linalg.norm(imager.image(samples))
+
+
+def test_forward_models_agree(aperture):
+    rng = np.random.default_rng(3)
+    a = aperture(31, 12, 4.0, 4.0, (20, 16), 2.0)
+    pixels = _noise(rng, a.grid.shape)
+    spectral, rows, direct = (make(a).samples(pixels) for make in IMAGERS)
+    for got in (spectral, rows):
+        assert np.linalg.norm(got - direct) < 3e-5 * np.linalg.norm(direct)
+
+
+@pytest.mark.parametrize("make", IMAGERS)
+def test_a_common_phase_goes_through(aperture, make):
+    a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
+    samples = _samples(a, np.random.default_rng(4))
+    turned = make(a).image((samples * np.exp(0.7j)).astype(np.complex64))
+    np.testing.assert_allclose(turned, make(a).image(samples) * np.exp(0.7j), atol=1e-6 * np.abs(turned).max())
+
+
+def test_a_row_taken_again_replaces_the_earlier_take_whatever_the_order(aperture):
+    rng = np.random.default_rng(5)
+    a = aperture(15, 6, 4.0, 4.0, (12, 10), 2.0)
+    samples, wrong = _samples(a, rng), _noise(rng, a.shape)
+    none, starts = np.zeros(15, np.float32), a.offsets_m[:, 0, 0]
+    imager = IncrementalImager(a)
+    for r in rng.permutation(6):
+        imager.add_row(r, wrong[:, :, r], none, starts[r] + 1e-4)
+        imager.add_row(r, -wrong[:, :, r], none, starts[r] + 1e-4)
+        imager.add_row(r, samples[:, :, r], none, starts[r])
+    expected = SpectralImager(a).image(samples)
+    assert np.abs(imager.image_of_sum(np.ones(4)) - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_kernels_made_anew_give_the_same_image(aperture):
+    a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
+    samples = _samples(a, np.random.default_rng(6))
+    warm = SpectralImager(a).image(samples)
+    forget()
+    np.testing.assert_array_equal(SpectralImager(a).image(samples), warm)
+
+
+def test_another_geometry_gets_other_kernels(aperture):
+    rng = np.random.default_rng(7)
+    a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
+    samples = _noise(rng, a.shape)
+    lower = Aperture(a.antennas, a.offsets_m, a.frequencies_hz, replace(a.grid, z_m=a.grid.z_m + 5e-3))
+    for geometry in (a, lower):
+        spectral, direct = SpectralImager(geometry).image(samples), DirectImager(geometry).image(samples)
+        assert np.abs(spectral - direct).max() < 3e-5 * np.abs(direct).max()
+
+
+def _jitter_x(offsets):
+    offsets[2, 3, 0] += 2e-5
+
+
+def _jitter_z(offsets):
+    offsets[2, 3, 2] += 2e-5
+
+
+def _sag(offsets):
+    offsets[2, :, 1] += np.linspace(0, 1e-4, offsets.shape[1])
+
+
+def _lost_row(offsets):
+    offsets[3:, :, 1] += 1e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (_jitter_x, "not evenly spaced"),
+        (_jitter_z, "not in one plane"),
+        (_sag, "not straight"),
+        (_lost_row, "rows are not evenly spaced"),
+    ],
+)
+def test_positions_that_form_no_lattice_go_to_the_direct_imager_with_a_notice(aperture, change, reason):
+    a = aperture(9, 6, 4.0, 4.0, (8, 8), 2.0)
+    assert isinstance(choose_imager(a)[0], SpectralImager)
+    assert choose_imager(a)[1] is None
+    change(a.offsets_m)
+    imager, notice = choose_imager(a)
+    assert isinstance(imager, DirectImager)
+    assert reason in notice
+
+
+def test_a_micrometre_of_jitter_stays_with_the_spectral_imager(aperture):
+    rng = np.random.default_rng(8)
+    a = aperture(31, 12, 4.0, 4.0, (12, 10), 2.0)
+    a.offsets_m[..., 0] += rng.uniform(-3e-7, 3e-7, a.offsets_m.shape[:2])
+    assert irregular(a) is None
+    samples = DirectImager(a).samples(np.eye(10, 12))
+    got, exact = SpectralImager(a).image(samples), DirectImager(a).image(samples)
+    assert np.abs(got - exact).max() < 2e-4 * np.abs(exact).max()
+
+
+def test_a_curved_surface_is_imaged_where_it_is(aperture):
+    a = aperture(31, 21, 4.0, 4.0, (11, 11), 2.0)
+    z = a.grid.z_m + 5e-3 * np.sin(np.arange(121).reshape(11, 11) / 9)
+    bent = Aperture(a.antennas, a.offsets_m, a.frequencies_hz, replace(a.grid, z_m=z))
+    imager, notice = choose_imager(bent)
+    assert "not a plane" in notice
+    pixels = np.zeros((11, 11))
+    pixels[7, 4] = 1
+    image = imager.image(imager.samples(pixels))
+    assert np.unravel_index(np.argmax(np.abs(image)), image.shape) == (7, 4)
+    assert image[7, 4].real == pytest.approx(np.prod(a.shape))
+
+
+def test_steps_without_a_common_measure_are_named(make_rig):
+    rig = make_rig(5, 5, step_y=2.137)
+    plan, grid = plan_raster(rig.grid), image_grid(rig)
+    offsets = np.stack([np.pad(row_offsets_m(rig, r)[:: r.direction], ((0, 0), (0, 1))) for r in plan])
+    reason = irregular(Aperture(Antennas.of(rig, rig.receivers[0]), offsets, np.array([77e9]), grid))
+    assert "no common measure" in reason

@@ -1,0 +1,325 @@
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+import scipy.signal
+
+from host.imaging import ImageBuilder, backproject, image_grid
+from host.imaging.footprint import mirror_samples
+from host.imaging.grid import Antennas, row_offsets_m
+from host.imaging.reduce import reduction, scene_gate_m
+from host.sync import BoardSetup, synchronise_row
+from shared.errors import DataError
+from shared.geometry import specular_midpoint_m
+from shared.raster import plan_raster
+from shared.units import SPEED_OF_LIGHT_M_S
+
+
+def _build(rig, rows, **options):
+    builder = ImageBuilder(rig, **options)
+    for board in rig.receivers:
+        for index, row in rows(board):
+            builder.add_row(board.name, index, row)
+    return builder
+
+
+def _peak(image, x_m, y_m):
+    """Place of the strongest pixel, refined by a parabola through its neighbours."""
+    a = np.abs(image)
+    iy, ix = np.unravel_index(np.argmax(a), a.shape)
+
+    def vertex(left, mid, right):
+        return 0.5 * (left - right) / (left - 2 * mid + right)
+
+    dx, dy = vertex(*a[iy, ix - 1 : ix + 2]), vertex(*a[iy - 1 : iy + 2, ix])
+    pixel = x_m[1] - x_m[0]
+    return x_m[ix] + dx * pixel, y_m[iy] + dy * pixel
+
+
+@pytest.mark.parametrize("taper", [("kaiser", 4.0), "boxcar"])
+@pytest.mark.parametrize("place_mm", [(0.0, 0.0), (-12.3, 17.1), (21.7, -9.4)])
+def test_a_point_focuses_within_half_a_pixel_in_both_channels(make_rig, points_rows, place_mm, taper):
+    rig = make_rig(61, 41)
+    centre = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    point = centre + np.array([*place_mm, 0]) / 1e3
+    images = _build(rig, lambda b: points_rows(rig, b, [point], [0.7j]), taper=taper).finish()
+    for image in (images.h_raw, images.v_raw):
+        x, y = _peak(image, images.x_m, images.y_m)
+        assert abs(x - point[0]) < 0.5e-3
+        assert abs(y - point[1]) < 0.25e-3
+
+
+def test_a_point_on_a_pixel_has_its_phase_and_amplitude_in_both_channels(make_rig, points_rows):
+    rig = make_rig(41, 41)
+    grid = image_grid(rig)
+    point = np.array([grid.x_m[25], grid.y_m[14], grid.z_m])
+    amplitude = 0.8 * np.exp(1j)
+    images = _build(rig, lambda b: points_rows(rig, b, [point], [amplitude])).finish()
+    for raw in (images.h_raw, images.v_raw):
+        assert abs(raw[14, 25] / amplitude - 1) < 0.01
+
+
+def test_resolution_is_that_of_the_aperture(make_rig, points_rows):
+    # Without a taper: 0.886 lambda h / (2 L cos^3) by 0.886 lambda h / (2 L cos) to the -3 dB points (the spread of
+    # sin(theta_tx) + sin(theta_rx) over the aperture), h the plane's distance, L = 160 mm.
+    rig = make_rig(41, 41, pixels=(80, 80), pixel=0.5)
+    grid = image_grid(rig)
+    point = np.array([grid.x_m[40], grid.y_m[40], grid.z_m])
+    raw = np.abs(_build(rig, lambda b: points_rows(rig, b, [point], [1.0]), taper="boxcar").finish().h_raw)
+    width_x, width_y = ((line > line.max() / np.sqrt(2)).sum() * 0.5 for line in (raw[40], raw[:, 40]))
+    cos = np.cos(np.radians(54.93))
+    length, wave, height = 164.0, 3.814, 488.0
+    assert width_y == pytest.approx(0.886 * wave * height / (2 * length * cos), rel=0.15)
+    assert width_x == pytest.approx(0.886 * wave * height / (2 * length * cos**3), rel=0.15)
+
+
+@pytest.fixture
+def plane_rows(synced_row):
+    """Rows of a uniform mirror of reflectivity r; positions in `holes` are missing."""
+
+    def make(rig, board, r=1.0, holes=()):
+        antennas = Antennas.of(rig, board)
+        samples = r * mirror_samples(antennas, image_grid(rig).z_m, rig.chirp) + 1 / antennas.direct_m[:, None]
+        for row in plan_raster(rig.grid):
+            valid = np.array([(row.index, i) not in holes for i in range(row.points)])
+            yield row.index, synced_row(np.repeat(samples[:, None], row.points, axis=1), valid)
+
+    return make
+
+
+@pytest.mark.parametrize("taper", ["hann", "boxcar"])
+def test_a_uniform_plane_is_flat_after_division_whatever_is_missing(make_rig, plane_rows, taper):
+    rig = make_rig(37, 31, step_x=6.0)
+    holes = {(int(r), int(i)) for r, i in np.random.default_rng(0).integers(0, 31, (60, 2))} | {
+        (5, i) for i in range(37)
+    }
+    images = _build(rig, lambda b: plane_rows(rig, b, 0.5j, holes), taper=taper).finish()
+    assert images.valid.mean() > 0.9
+    for flat, raw in ((images.h, images.h_raw), (images.v, images.v_raw)):
+        np.testing.assert_allclose(flat[images.valid], 0.5j, atol=2e-3)
+        shown = np.abs(raw[images.valid])
+        assert shown.max() > 1.3 * shown.min()  # it was not flat before
+
+
+def test_receiver_gains_are_measured_on_the_direct_path_and_taken_out(make_rig, points_rows):
+    rig = make_rig()
+    point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    gains = np.array([1.0, 0.8 * np.exp(0.4j), 1.3 * np.exp(-0.3j), 0.9]) * 800
+    even = _build(rig, lambda b: points_rows(rig, b, [point], [0.7])).finish()
+    odd = _build(rig, lambda b: points_rows(rig, b, [point], [0.7], gains=gains))
+    np.testing.assert_allclose(odd.rx_calibration("RH"), gains, rtol=1e-3)
+    images = odd.finish()
+    np.testing.assert_allclose(images.h_raw, even.h_raw, atol=2e-3 * np.abs(even.h_raw).max())
+    np.testing.assert_allclose(images.v_raw, even.v_raw, atol=2e-3 * np.abs(even.v_raw).max())
+
+
+def test_order_of_rows_does_not_matter_and_a_later_take_replaces_an_earlier_one(make_rig, points_rows, synced_row):
+    rig = make_rig(15, 12)
+    point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    board = rig.receivers[0]
+    rows = list(points_rows(rig, board, [point], [1.0]))
+    forward, backward = ImageBuilder(rig), ImageBuilder(rig)
+    backward.add_row(board.name, 3, synced_row(np.ones_like(rows[3][1].samples)))
+    for index, row in rows:
+        forward.add_row(board.name, index, row)
+    for index, row in reversed(rows):
+        backward.add_row(board.name, index, row)
+    np.testing.assert_array_equal(forward.finish().h_raw, backward.finish().h_raw)
+
+
+def test_a_step_without_a_common_lattice_goes_to_the_direct_sum(make_rig, points_rows):
+    odd_step = make_rig(21, 11, step_y=2.137, pixels=(9, 9))
+    point = np.add(specular_midpoint_m(odd_step, odd_step.receivers[0]), (0.001, 0.001, 0))
+    raw = _build(odd_step, lambda b: points_rows(odd_step, b, [point], [1.0])).finish().h_raw
+    assert np.unravel_index(np.argmax(np.abs(raw)), raw.shape)[0] in (4, 5)
+    assert np.abs(raw).max() == pytest.approx(1, abs=0.02)
+
+
+def test_no_rows_no_image_and_no_warning(make_rig):
+    images = ImageBuilder(make_rig(5, 5, pixels=(6, 6))).finish()
+    assert not images.valid.any()
+    assert not images.h.any()
+
+
+def test_rows_of_another_plan_are_refused(make_rig, synced_row):
+    builder = ImageBuilder(make_rig(7, 5))
+    row = synced_row(np.zeros((4, 7, 256)))
+    with pytest.raises(DataError, match="not in this scan"):
+        builder.add_row("LS", 0, row)
+    with pytest.raises(DataError, match="not in this scan"):
+        builder.add_row("RH", 5, row)
+    with pytest.raises(DataError, match="6 positions"):
+        builder.add_row("RH", 0, synced_row(np.zeros((4, 6, 256))))
+
+
+def test_random_offsets_of_every_chirp_leave_the_image(make_rig, points_rows):
+    """Raw chirps with offsets, direct path as strong as the echoes and noise, through the whole chain."""
+    rig = make_rig(31, 25)
+    pulses = 3
+    rig = msgspec.structs.replace(rig, burst=msgspec.structs.replace(rig.burst, pulses=pulses))
+    rng = np.random.default_rng(6)
+    centre = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    points = centre + np.array([[-20, 10, 0], [15, -15, 0], [5, 22, 0]]) / 1e3
+    amplitudes = np.array([0.4, 0.4j, -0.3])
+    ideal = _build(rig, lambda b: points_rows(rig, b, points, amplitudes, direct=0.0)).finish()
+
+    def disturbed(board):
+        setup = BoardSetup.of(rig, board, compensate_filter=False)
+        steering = setup.path.steering  # as received, RX differ by their direct path
+        n = np.arange(256)
+        for index, row in points_rows(rig, board, points, amplitudes):
+            clean = row.samples * steering[:, None]
+            df, phase = rng.uniform(0.3, 0.45, (31, pulses)), rng.uniform(-np.pi, np.pi, (31, pulses))
+            frames = clean[:, :, None] * np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))
+            frames += 0.15 * (rng.standard_normal(frames.shape) + 1j * rng.standard_normal(frames.shape))
+            yield (
+                index,
+                synchronise_row(
+                    (800 * frames).reshape(4, -1, 256).astype(np.complex64), np.ones(31 * pulses, bool), setup
+                ),
+            )
+
+    images = _build(rig, disturbed).finish()
+    for got, want in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
+        assert abs(np.vdot(got, want)) / np.linalg.norm(got) / np.linalg.norm(want) > 0.98
+
+
+def _random_rows(rig, synced_row, rng):
+    """(board, index, row) of noise with a direct path, in random order, some taken twice, some positions missing."""
+    columns = rig.grid.columns
+    order = [(b.name, int(i)) for b in rig.receivers for i in rng.permutation(rig.grid.rows)]
+    for name, index in order + order[:5]:
+        samples = 1 + 0.5 * (rng.standard_normal((4, columns, 256)) + 1j * rng.standard_normal((4, columns, 256)))
+        yield name, index, synced_row(samples, rng.uniform(size=columns) > 0.1)
+
+
+def test_the_image_after_every_row_is_that_of_its_rows(make_rig, synced_row):
+    rig = make_rig(15, 9, pixels=(16, 14))
+    rng = np.random.default_rng(8)
+    live, plain = ImageBuilder(rig, live=True), ImageBuilder(rig)
+    for name, index, row in _random_rows(rig, synced_row, rng):
+        for builder in (live, plain):
+            builder.add_row(name, index, row)
+        now, made = live.current(), plain.finish()
+        for channel in ("h_raw", "v_raw", "h_footprint", "v_footprint"):
+            got, want = getattr(now, channel), getattr(made, channel)
+            assert np.abs(got - want).max() <= 2e-5 * max(np.abs(want).max(), 0.2)
+    for channel in ("h", "v", "valid"):
+        np.testing.assert_array_equal(getattr(live.finish(), channel), getattr(plain.finish(), channel))
+
+
+def test_rows_where_they_really_were_focus_better_than_where_the_plan_says(make_rig, points_rows):
+    """Odd rows 1.2 mm off, as backlash does it: with the true offsets the image is the undisturbed one."""
+    rig = make_rig(101, 9, pixels=(16, 9))
+    board = rig.receivers[0]
+    point = np.array(specular_midpoint_m(rig, board))
+    shifts = [1.2e-3 * (row.index % 2) for row in plan_raster(rig.grid)]
+    good, known, ignored = ImageBuilder(rig), ImageBuilder(rig), ImageBuilder(rig)
+    for index, row in points_rows(rig, board, [point], [1.0]):
+        good.add_row(board.name, index, row)
+    for index, row in points_rows(rig, board, [point], [1.0], shifts_m=shifts):
+        ignored.add_row(board.name, index, row)
+        planned = row_offsets_m(rig, plan_raster(rig.grid).row(index))
+        known.add_row(board.name, index, row, np.add(planned, [shifts[index], 0]))
+    want = good.finish().h_raw
+    error_known, error_ignored = (np.abs(b.finish().h_raw - want).max() / np.abs(want).max() for b in (known, ignored))
+    assert error_known < 0.01
+    assert error_ignored > 10 * error_known
+
+
+def test_jittered_positions_are_imaged_exactly_and_the_user_is_told(make_rig, points_rows, caplog):
+    rig = make_rig(15, 9, pixels=(9, 9))
+    board, rng = rig.receivers[0], np.random.default_rng(9)
+    grid = image_grid(rig)
+    point = np.array([grid.x_m[4], grid.y_m[4], grid.z_m])
+    jitter = rng.normal(0, 3e-4, (rig.grid.rows, rig.grid.columns, 3))
+    known, ignored = ImageBuilder(rig, live=True), ImageBuilder(rig)
+    for index, row in points_rows(rig, board, [point], [1.0], jitter_m=jitter):
+        ignored.add_row(board.name, index, row)
+        plan_row = plan_raster(rig.grid).row(index)
+        known.add_row(board.name, index, row, np.pad(row_offsets_m(rig, plan_row), ((0, 0), (0, 1))) + jitter[index])
+    images = known.finish()
+    assert abs(images.h_raw[4, 4] - 1) < 0.01
+    assert abs(ignored.finish().h_raw[4, 4]) < 0.95
+    assert any("direct sum" in n for n in images.notices)
+    assert "direct sum" in caplog.text
+    np.testing.assert_array_equal(known.current().h_raw, images.h_raw)
+
+
+def test_a_row_far_from_its_place_does_not_spoil_the_image_so_far(make_rig, synced_row):
+    """Beyond what the running sums allow, the image so far is made at once."""
+    rig = make_rig(15, 9, pixels=(16, 14))
+    live = ImageBuilder(rig, live=True)
+    for name, index, row in _random_rows(rig, synced_row, np.random.default_rng(13)):
+        planned = row_offsets_m(rig, plan_raster(rig.grid).row(index))
+        live.add_row(name, index, row, np.add(planned, [5e-3 if index == 3 else 0, 0]))
+    np.testing.assert_array_equal(live.current().h_raw, live.finish().h_raw)
+
+
+def test_a_masked_position_is_as_if_it_had_not_been_scanned(make_rig, synced_row):
+    rig = make_rig(15, 9, pixels=(16, 14))
+    rng = np.random.default_rng(12)
+    kept = rng.uniform(size=(9, 15)) > 0.4
+    masked, never = ImageBuilder(rig, live=True), ImageBuilder(rig)
+    for name, index, row in _random_rows(rig, synced_row, rng):
+        masked.add_row(name, index, row)
+        met = kept[index][:: plan_raster(rig.grid).row(index).direction]
+        never.add_row(name, index, synced_row(row.samples, row.valid & met))
+    for board in masked.boards.values():
+        board.keep(kept)
+    np.testing.assert_array_equal(masked.current().h_raw, never.finish().h_raw)
+    np.testing.assert_array_equal(masked.rx_calibration("RV"), never.rx_calibration("RV"))
+
+
+def test_points_anywhere_are_found_within_a_tenth_of_a_pixel_and_their_phase_within_0_05_rad(make_rig, points_rows):
+    """Place: the peak on a ten times finer grid. Phase: at the true place."""
+    rig = make_rig(61, 41, pixels=(60, 50))
+    rng, grid = np.random.default_rng(10), image_grid(rig)
+    for board in rig.receivers:
+        for _ in range(3):
+            point = np.array([rng.uniform(*grid.x_m[[5, -6]]), rng.uniform(*grid.y_m[[5, -6]]), grid.z_m])
+            amplitude = np.exp(1j * rng.uniform(-np.pi, np.pi))
+            samples = _build(rig, lambda b, p=point, a=amplitude: points_rows(rig, b, [p], [a])).boards[board.name]
+            fine = np.arange(-8, 9) * 2e-4
+            image, _, _ = samples.image(replace(grid, x_m=point[0] + fine, y_m=point[1] + fine, pixel_m=2e-4))
+            x, y = _peak(image, point[0] + fine, point[1] + fine)
+            assert np.hypot(x - point[0], y - point[1]) < 0.1 * grid.pixel_m
+            assert abs(np.angle(image[8, 8] / amplitude)) < 0.05
+
+
+def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, synced_row):
+    """All 192 samples of every chirp summed in double precision, against 9 frequencies in single."""
+    rig = make_rig(31, 21, 8.0, 8.0, pixels=(12, 10))
+    board, chirp = rig.receivers[1], rig.chirp
+    antennas, grid, plan = Antennas.of(rig, board), image_grid(rig), plan_raster(rig.grid)
+    a, b = chirp.linear_samples
+    f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    shift = np.stack([np.pad(row_offsets_m(rig, row), ((0, 0), (0, 1))) for row in plan])
+    point = np.array([grid.x_m[5], grid.y_m[4], grid.z_m])
+    d = np.linalg.norm(point - shift - antennas.tx_m, axis=-1) + np.linalg.norm(
+        point - shift - antennas.rx_m[:, None, None], axis=-1
+    )
+    echo = np.exp(2j * np.pi * f * (d - antennas.direct_m[:, None, None])[..., None] / SPEED_OF_LIGHT_M_S)
+    builder = ImageBuilder(rig, taper="boxcar")
+    gate = reduction(chirp, scene_gate_m(tuple(Antennas.of(rig, r) for r in rig.receivers), plan, grid))
+    # A direct path of 1 / d_rx keeps the receivers' gains at 1; what the echo leaks into its estimate is put back.
+    echo -= (echo @ gate.direct)[..., None]
+    samples = (echo + 1 / antennas.direct_m[:, None, None, None]).astype(np.complex64)
+    for row in plan:
+        builder.add_row(board.name, row.index, synced_row(samples[:, row.index]))
+    got = builder.boards[board.name].image()[0]
+
+    window = scipy.signal.get_window("hann", b - a + 2, fftbins=False)[1:-1]
+    window /= window.sum()
+    pixels = np.stack(np.meshgrid([4, 5, 7], [0, 4, 9]), axis=-1).reshape(-1, 2)
+    voxels = np.array([[grid.x_m[i], grid.y_m[j], grid.z_m] for i, j in pixels])
+    want = np.zeros(len(voxels), complex)
+    for rx in range(4):
+        place = shift.reshape(-1, 3)
+        pairs = (antennas.tx_m + place, antennas.rx_m[rx] + place, voxels, np.full(len(place), antennas.direct_m[rx]))
+        all_samples = (echo[rx, ..., a:b] * window).reshape(len(place), -1)
+        want += backproject(all_samples, f[a:b], *pairs)
+    want /= 4 * plan.positions
+    at = np.array([got[j, i] for i, j in pixels])
+    assert np.abs(at - want).max() < 2e-6 * np.abs(want).max()

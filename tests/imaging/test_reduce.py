@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.imaging.grid import Antennas, image_grid
+from host.imaging.reduce import reduction, scene_gate_m
+from shared.raster import plan_raster
+from shared.units import SPEED_OF_LIGHT_M_S as C
+
+GATE = (0.30, 0.47)
+
+
+def _sweep(chirp):
+    return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+
+
+@given(st.floats(*GATE), st.floats(*GATE))
+def test_few_samples_give_every_matched_filter_output_of_all(published, echo_m, pixel_m):
+    chirp = published.chirp
+    a, b = chirp.linear_samples
+    gate = reduction(chirp, GATE)
+    x = np.exp(2j * np.pi * _sweep(chirp) * echo_m / C)
+    weight = scipy.signal.get_window("hann", b - a + 2, fftbins=False)[1:-1]
+    all_samples = (weight / weight.sum() * x[a:b] * np.exp(-2j * np.pi * _sweep(chirp)[a:b] * pixel_m / C)).sum()
+    few = (gate.matrix @ x * np.exp(-2j * np.pi * gate.frequencies_hz * pixel_m / C)).sum()
+    assert abs(few - all_samples) < 1e-3  # the echo's leak into the direct path's estimate is all that differs
+    assert len(gate.frequencies_hz) <= 10
+
+
+def test_without_the_direct_path_removal_the_error_is_below_1e_4_of_the_peak(published):
+    chirp = published.chirp
+    gate = reduction(chirp, GATE, extra=5)
+    finer = reduction(chirp, GATE, extra=30)
+    pixels = np.linspace(*GATE, 200)
+    x = np.exp(2j * np.pi * _sweep(chirp) * 0.36 / C)
+    few, many = (np.exp(-2j * np.pi * np.outer(pixels, g.frequencies_hz) / C) @ (g.matrix @ x) for g in (gate, finer))
+    assert np.abs(few - many).max() < 1e-4
+
+
+@given(st.floats(*GATE))
+def test_the_model_says_how_an_echo_comes_out(published, echo_m):
+    gate = reduction(published.chirp, GATE)
+    came_out = gate.matrix @ np.exp(2j * np.pi * _sweep(published.chirp) * echo_m / C)
+    np.testing.assert_allclose(gate.model @ np.exp(2j * np.pi * gate.frequencies_hz * echo_m / C), came_out, atol=1e-4)
+
+
+@pytest.mark.parametrize("window", ["hann", "boxcar"])
+def test_the_direct_path_vanishes_and_is_measured(published, window):
+    gate = reduction(published.chirp, GATE, window)
+    direct = np.full(256, 3.0 + 4.0j)
+    np.testing.assert_allclose(gate.matrix @ direct, 0, atol=1e-9)
+    assert gate.direct @ direct == pytest.approx(3 + 4j)
+    echo = np.exp(2j * np.pi * _sweep(published.chirp) * 0.35 / C)
+    assert abs(gate.direct @ echo) < 2e-3
+
+
+def test_gate_holds_every_pixel_at_every_position(make_rig):
+    rig = make_rig()
+    grid, plan = image_grid(rig), plan_raster(rig.grid)
+    for board in rig.receivers:
+        antennas = Antennas.of(rig, board)
+        low, high = scene_gate_m((antennas,), plan, grid)
+        rng = np.random.default_rng(0)
+        u = rng.uniform(-0.06, 0.06, (2, 500))
+        x, y = rng.choice(grid.x_m, 500) - u[0], rng.choice(grid.y_m, 500) - u[1]
+        excess = antennas.excess_m(x, y, grid.z_m)
+        assert low - 1e-4 <= excess.min()
+        assert excess.max() <= high + 1e-9

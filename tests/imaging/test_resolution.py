@@ -1,0 +1,76 @@
+import msgspec
+import numpy as np
+import pytest
+
+from host.imaging import ImageBuilder
+from host.imaging.facts import board_facts
+from host.imaging.resolution import point_response
+from shared.geometry import specular_midpoint_m
+
+
+def _full(rig, **options):
+    board = ImageBuilder(rig, **options).boards["RH"]
+    board.valid[:] = True
+    return board
+
+
+@pytest.mark.parametrize(("columns", "rows", "step"), [(41, 41, 4.0), (350, 200, 2.0)])
+def test_without_a_taper_the_measured_response_is_the_geometrys_limit(make_rig, columns, rows, step):
+    board = _full(make_rig(columns, rows, step, step, pixels=(31, 31)), taper="boxcar", window="boxcar")
+    response = point_response(board.aperture, board.weights)
+    np.testing.assert_allclose(response.width_mm, response.limit_mm, rtol=0.08)
+    assert max(response.sidelobe_db) < -11  # a sinc's first sidelobe is -13.3 dB
+
+
+def test_the_limit_is_that_of_the_plane_wave_formula_and_the_papers_is_not(make_rig):
+    board = _full(make_rig(41, 41, 4.0, 4.0, pixels=(31, 31)), taper="boxcar")
+    response = point_response(board.aperture, board.weights)
+    cos, wave, height, length = np.cos(np.radians(54.93)), 3.82, 488.0, 160.0
+    plane = (0.886 * wave * height / (2 * length * cos**3), 0.886 * wave * height / (2 * length * cos))
+    np.testing.assert_allclose(response.limit_mm, plane, rtol=0.1)
+    np.testing.assert_allclose(response.paper_mm, wave * 499 / length, rtol=0.03)
+
+
+def test_the_published_scan_reaches_what_the_simulation_of_its_geometry_says(make_rig):
+    """5.4 x 3.6 mm without a taper; the paper's r lambda / L is 2.8 mm along its 0.7 m and 4.9 mm along its 0.4 m."""
+    board = _full(make_rig(350, 200, 2.0, 2.0, pixels=(150, 150)), taper="boxcar")
+    response = point_response(board.aperture, board.weights)
+    np.testing.assert_allclose(response.width_mm, (5.4, 3.6), atol=0.35)
+    np.testing.assert_allclose(response.paper_mm, (2.7, 4.8), atol=0.15)
+
+
+def test_a_taper_trades_width_for_sidelobes(make_rig):
+    rig = make_rig(41, 41, 4.0, 4.0, pixels=(31, 31))
+
+    def of(name):
+        board = _full(msgspec.structs.replace(rig, image=msgspec.structs.replace(rig.image, apodisation=name)))
+        return point_response(board.aperture, board.weights)
+
+    none, kaiser, taylor = of("none"), of("kaiser"), of("taylor")
+    for tapered in (kaiser, taylor):
+        assert min(np.subtract(tapered.width_mm, none.width_mm)) > 0
+        assert max(tapered.sidelobe_db) < max(none.sidelobe_db) - 8
+
+
+def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
+    rig = make_rig(31, 21, 4.0, 4.0, pixels=(9, 9))
+    point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    builder = ImageBuilder(rig, taper="boxcar")
+    rng = np.random.default_rng(0)
+    for index, row in points_rows(rig, rig.receivers[0], [point], [1.0]):
+        row.valid[rng.uniform(size=31) < 0.05] = False
+        builder.add_row("RH", index, row)
+    board = builder.boards["RH"]
+    facts = board_facts(board)
+    assert facts["masked_positions"] == (~board.valid).sum() > 10
+    assert facts["masked"] == pytest.approx(facts["masked_positions"] / facts["positions"], abs=1e-6)
+    summed = np.abs(board.image()[0]).max() * float(board.count) / (board.valid.size * 4)
+    whole = np.abs(board.image()[0]).max()
+    assert -20 * np.log10(summed / whole) == pytest.approx(facts["loss_db"], abs=1e-3)
+    assert whole == pytest.approx(1, abs=0.03)  # the image itself does not fall
+
+
+def test_no_data_no_response(make_rig):
+    facts = board_facts(ImageBuilder(make_rig(5, 5)).boards["RV"])
+    assert facts["masked"] == 1
+    assert "loss_db" not in facts

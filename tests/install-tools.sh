@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# Debian packages the tests use (with `kernel`: and those of `make test-uml`): installed when root or passwordless sudo is there, else named with how to get them.
+set -u
+missing=()
+command -v g++ >/dev/null || missing+=(g++)
+command -v make >/dev/null || missing+=(make)
+command -v gcc >/dev/null || missing+=(gcc libc6-dev)
+command -v avr-g++ >/dev/null || missing+=(gcc-avr avr-libc binutils-avr)
+[ -d /usr/share/arduino/hardware/arduino/avr/cores/arduino ] || missing+=(arduino-core-avr)
+[ -f /usr/include/simavr/sim_avr.h ] || missing+=(libsimavr-dev)
+[ -f /usr/include/libelf.h ] || missing+=(libelf-dev)
+command -v avrdude >/dev/null || missing+=(avrdude)
+command -v arduino-builder >/dev/null || missing+=(arduino-builder)
+if [ "${1-}" = kernel ]; then
+  for tool in flex bison bc; do command -v $tool >/dev/null || missing+=($tool); done
+  command -v xz >/dev/null || missing+=(xz-utils)
+fi
+[ ${#missing[@]} -eq 0 ] && exit 0
+as_root=()
+if [ "$(id -u)" -ne 0 ]; then
+  if sudo -n true 2>/dev/null; then as_root=(sudo -n); else as_root=(false); fi
+fi
+if [ "${as_root[0]-}" != false ] && command -v apt-get >/dev/null; then
+  echo "installing ${missing[*]}"
+  "${as_root[@]}" apt-get update -qq >/dev/null 2>&1
+  if "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "${missing[@]}" >/dev/null 2>&1; then exit 0; fi
+fi
+echo "Not installed: ${missing[*]}. The tests that need them are skipped and counted below." >&2
+echo "To run them too: sudo apt-get install ${missing[*]}" >&2

@@ -1,0 +1,108 @@
+"""Synthetic image pairs of plates: Fresnel, leakage, gains, band limit with ringing, uneven illumination, noise.
+
+Written for these tests alone; the whole chain from raw data is tested elsewhere.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from host.materials import TruthPlate, analyse
+
+THETA = np.radians(55.0)
+NINE = {
+    "rubber": 5.06 - 1.11j,
+    "cardboard (rough)": 4.54 - 0.56j,
+    "silicone rubber": 3.52 - 0.82j,
+    "PET 0.5 mm": 3.78 - 0.70j,
+    "ceramic": 4.75 - 2.43j,
+    "acrylic 3 mm": 4.00 - 0.40j,
+    "glass fibre": 4.69 - 0.70j,
+    "copper": None,
+    "wood (thin)": 2.61 - 0.01j,
+}
+
+
+@dataclass
+class Synthetic:
+    h: np.ndarray
+    v: np.ndarray
+    x_m: np.ndarray
+    y_m: np.ndarray
+    plates: tuple[TruthPlate, ...]
+    theta: float = THETA
+
+    def analyse(self, **more):
+        return analyse(self.h, self.v, self.x_m, self.y_m, theta_rad=self.theta, plates=self.plates, **more)
+
+
+def smooth_field(rng, shape, correlation_px):
+    """Random field of unit rms that varies slowly over the plane."""
+    field = ndimage.gaussian_filter(rng.standard_normal(shape), correlation_px, mode="wrap")
+    return field / field.std()
+
+
+def reflect(eps, theta):
+    """r_s, r_p of Eq. 2, written out on its own."""
+    if eps is None:
+        return -1.0, -1.0
+    n = np.sqrt(eps)
+    c, ct = np.cos(theta), np.sqrt(1 - np.sin(theta) ** 2 / eps)
+    return (c - n * ct) / (c + n * ct), (ct - n * c) / (ct + n * c)
+
+
+def make(
+    seed,
+    materials=None,
+    uneven=0.01,
+    noise=0.006,
+    gain_h=1.0,
+    gain_v=0.3 + 0.6j,
+    leak=(0.0, 0.0),
+    size_mm=45.0,
+    pitch_mm=60.0,
+    jitter_mm=5.0,
+    pixels=150,
+    pixel_mm=2.0,
+    theta=THETA,
+):
+    """An image pair of plates in random order on a 3 x 3 raster with random shifts."""
+    rng = np.random.default_rng(seed)
+    materials = NINE if materials is None else materials
+    x = (np.arange(pixels) - (pixels - 1) / 2) * pixel_mm
+    places = [((i % 3 - 1) * pitch_mm, (i // 3 - 1) * pitch_mm) for i in rng.permutation(9)]
+    s, p = np.zeros((pixels, pixels), complex), np.zeros((pixels, pixels), complex)
+    plates = []
+    for (name, eps), (cx, cy) in zip(materials.items(), places, strict=False):
+        cx, cy = cx + rng.uniform(-jitter_mm, jitter_mm), cy + rng.uniform(-jitter_mm, jitter_mm)
+        half = size_mm / 2
+        plates.append(TruthPlate(name, (cx - half, cy - half, cx + half, cy + half), eps, metal=eps is None))
+        inside = (abs(x[:, None] - cy) <= half) & (abs(x[None, :] - cx) <= half)
+        s[inside], p[inside] = reflect(eps, theta)
+    h, v = gain_h * (s + leak[0] * p), gain_v * (p + leak[1] * s)
+    frequency = np.fft.fftfreq(pixels, pixel_mm)
+    passed = (abs(frequency[:, None]) < 0.443 / 3.6) & (abs(frequency[None, :]) < 0.443 / 5.4)
+    out = []
+    for channel, gain in ((h, abs(gain_h)), (v, abs(gain_v))):
+        n = rng.standard_normal((2, pixels, pixels))
+        n = np.fft.ifft2(np.fft.fft2(n[0] + 1j * n[1]) * passed)
+        n *= noise * gain / np.sqrt(np.mean(abs(n) ** 2)) if noise else 0.0
+        light = np.exp(uneven * (smooth_field(rng, channel.shape, 20) + 1j * smooth_field(rng, channel.shape, 20)))
+        out.append((np.fft.ifft2(np.fft.fft2(channel) * passed) * light + n).astype(np.complex64))
+    common = np.exp(1j * rng.uniform(-3, 3))
+    axis = x / 1e3
+    return Synthetic(
+        out[0] * np.complex64(common), out[1] * np.complex64(common), axis - 0.0132, axis + 0.1, tuple(plates)
+    )
+
+
+@pytest.fixture(scope="session")
+def synthetic():
+    return make
+
+
+@pytest.fixture(scope="session")
+def nine():
+    return NINE

@@ -1,0 +1,111 @@
+"""The published material files: read as they are, and never run."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from host.materials import Entry
+from host.materials.authors import read_material, read_materials, read_pickle, write_materials
+from shared.errors import DataError
+
+RNG = np.random.default_rng(1)
+
+
+GAIN = 3.0 * np.exp(0.7j)
+
+
+def content(n=90, gain=GAIN):
+    h = gain * (0.6 + 0.01 * RNG.standard_normal(n))
+    v = 0.5 * (0.15 + 0.01 * RNG.standard_normal(n)).astype(complex)
+    metal_h, metal_v = gain * np.ones(40), 0.5 * np.ones(40, complex)
+    return {
+        "name": "PET",
+        "thickness": 0.5,
+        "collection_name": "scan_12",
+        "incident_angle": 55,
+        "ref_name": "copper",
+        "ref_thickness": 1.0,
+        "values": [(h / v).astype(np.complex64), h.astype(np.complex64), v.astype(np.complex64)],
+        "ref_values": [(metal_h / metal_v).astype(np.complex64), metal_h.astype(np.complex64), metal_v],
+    }
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_values_come_out_relative_to_the_reference(tmp_path, protocol):
+    path = tmp_path / "PET_55.pkl"
+    path.write_bytes(pickle.dumps(content(), protocol=protocol))
+    entry = read_material(path)
+    assert (entry.name, entry.scan, entry.incidence_deg, entry.reference) == ("PET", "scan_12", 55.0, "copper")
+    assert entry.thickness_mm == 0.5
+    assert not entry.simulated
+    assert np.median(entry.h) == pytest.approx(0.6, rel=0.01)
+    assert np.median(entry.v) == pytest.approx(0.15, rel=0.03)
+    assert np.median(entry.p.real) == pytest.approx(4.0, rel=0.03)
+
+
+def test_older_names_of_numpy_are_read(tmp_path):
+    path = tmp_path / "PET_55.pkl"
+    path.write_bytes(pickle.dumps(content(), protocol=2).replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
+    assert read_material(path).name == "PET"
+
+
+class Hostile:
+    def __init__(self, target):
+        self.target = target
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.target}",)
+
+
+def test_a_hostile_file_is_refused_and_does_nothing(tmp_path):
+    target, path = tmp_path / "ran", tmp_path / "evil_55.pkl"
+    path.write_bytes(pickle.dumps(content() | {"name": Hostile(target)}))
+    with pytest.raises(DataError, match=r"wants to call (posix|os)\.system"):
+        read_material(path)
+    assert not target.exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "name"), [("builtins", "eval"), ("numpy", "load"), ("builtins", "getattr"), ("numpy.f2py", "main")]
+)
+def test_no_other_name_is_admitted(tmp_path, module, name):
+    path = tmp_path / "x.pkl"
+    path.write_bytes(f"c{module}\n{name}\n(S'1'\ntR.".encode())
+    with pytest.raises(DataError, match="refused"):
+        read_pickle(path)
+
+
+def test_damaged_files_are_errors_at_every_length(tmp_path):
+    whole = pickle.dumps(content(4))
+    path = tmp_path / "x.pkl"
+    for n in range(0, len(whole), 7):
+        path.write_bytes(whole[:n])
+        with pytest.raises(DataError):
+            read_material(path)
+
+
+@pytest.mark.parametrize("broken", [{"values": [np.ones(2), np.ones(3), np.ones(2)]}, {"ref_values": [[0], [0], [0]]}])
+def test_other_forms_are_errors(tmp_path, broken):
+    path = tmp_path / "x.pkl"
+    path.write_bytes(pickle.dumps(content() | broken))
+    with pytest.raises(DataError):
+        read_material(path)
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    entries = [
+        Entry("Cane Sugar (1.3%, w glass)", f"s{i}", *(np.full(5, a, np.float32) for a in (0.7, 0.2)),
+              np.full(5, 3 + 1j, np.complex64), 55.0, False, thickness_mm=None)
+        for i in range(2)
+    ]  # fmt: skip
+    write_materials(tmp_path / "materials", entries)
+    back = read_materials(tmp_path / "materials").entries
+    assert sorted(e.scan for e in back) == ["s0", "s1"]
+    for e in back:
+        assert e.name == entries[0].name
+        np.testing.assert_allclose(e.p, entries[0].p)
+        np.testing.assert_allclose(e.h, entries[0].h)
+    with pytest.raises(DataError, match="no material files"):
+        read_materials(tmp_path)

@@ -1,0 +1,75 @@
+"""A line from polarisation angle to concentration: recovered, judged on what it has not seen, with honest intervals."""
+
+import numpy as np
+import pytest
+
+from host.materials import Entry, Library
+from host.materials.concentration import Line, concentrations, fit_concentration, polarisation_angle_rad
+from shared.errors import DataError
+
+SUGAR = {"water": 0.0, "sugar (1.3%)": 1.3, "sugar (3.8%)": 3.8, "sugar (5.1%)": 5.1, "sugar (7.4%)": 7.4}
+
+
+def entry(name, angle_rad, scan="a", incidence_deg=55.0):
+    p = np.full(9, np.tan(angle_rad) * np.exp(0.3j), np.complex64)
+    return Entry(name, scan, np.ones(9, np.float32), np.ones(9, np.float32), p, incidence_deg, True)
+
+
+def library(rng=None, noise=0.0, slope=-20.0, patches=3):
+    entries = []
+    for name, percent in SUGAR.items():
+        for scan in range(patches):
+            angle = 1.2 + percent / slope / 1.0 * 0.05 + (noise * rng.standard_normal() if rng else 0.0)
+            entries.append(entry(name, angle, f"scan{scan}"))
+    return Library(tuple(entries))
+
+
+def test_angle_of_metal_is_45_degrees():
+    assert polarisation_angle_rad(np.exp(1j)) == pytest.approx(np.pi / 4)
+
+
+def test_an_exact_line_is_recovered_and_tells_what_it_has_not_seen():
+    result = fit_concentration(library(), {"water": 0.0})
+    assert result.line.slope == pytest.approx(-400.0, rel=1e-4)
+    assert result.median_error < 1e-3
+    assert len(result.left_out) == 15
+    assert {r.true_percent for r in result.left_out} == set(SUGAR.values())
+
+
+def test_a_concentration_is_judged_without_its_own_patches():
+    """One concentration that lies off the line: the others do not hide it."""
+    entries = [*library().entries, *(entry("sugar (9.0%)", 1.25, f"scan{i}") for i in range(3))]
+    result = fit_concentration(Library(tuple(entries)), {"water": 0.0})
+    off = [r for r in result.left_out if r.true_percent == 9.0]
+    assert all(abs(r.percent - 9.0) > 5.0 for r in off)
+
+
+def test_prediction_intervals_cover_as_often_as_they_say():
+    rng = np.random.default_rng(3)
+    inside = []
+    for _ in range(400):
+        y = np.repeat([0.0, 1.3, 3.8, 5.1, 6.3], 2)
+        x = 1.2 - y / 400 + 0.002 * rng.standard_normal(y.size)
+        line = Line.through(x, y)
+        truth = rng.uniform(0, 6)
+        low, high = line.interval(1.2 - truth / 400 + 0.002 * rng.standard_normal(), 0.9)
+        inside.append(low <= truth <= high)
+    assert 0.84 < np.mean(inside) < 0.96
+
+
+def test_names_tell_concentrations_unless_they_are_given():
+    assert concentrations(["Cane Sugar (1.3%, w glass)", "salt 12 %", "oil", "water"], {"water": 0.0}) == {
+        "Cane Sugar (1.3%, w glass)": 1.3,
+        "salt 12 %": 12.0,
+        "water": 0.0,
+    }
+
+
+def test_what_cannot_be_fitted_is_refused():
+    with pytest.raises(DataError, match="2 known"):
+        fit_concentration(Library(tuple(e for e in library().entries if e.name in ("sugar (1.3%)", "sugar (3.8%)"))))
+    mixed = [*library().entries, entry("sugar (9.9%)", 1.1, incidence_deg=60.0)]
+    with pytest.raises(DataError, match="incidence"):
+        fit_concentration(Library(tuple(mixed)))
+    with pytest.raises(DataError, match="line"):
+        Line.through([1.0, 1.0, 1.0], [0.0, 1.0, 2.0])

@@ -1,0 +1,136 @@
+"""A layer within a stack: what was put in comes back, error bars tell the truth, ambiguity is said."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from host.materials.layers import Bands, Layer, Spectrum, fit_layer, predict
+from host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
+from shared.config import load_instrument
+from shared.errors import DataError, PolysightError
+
+THETA = np.radians(55.0)
+WATER = 9.37 - 18.0j
+GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)
+CHIRP = load_instrument(Path(__file__).parents[2] / "instrument.toml").chirp
+BANDS = Spectrum.of(CHIRP, 4)
+
+
+def measured(stack, sigma=1e-4, sigma_h=None, spectrum=BANDS, rng=None):
+    q, h = predict(stack, spectrum, THETA)
+    k = q.size
+    if rng is not None:
+        q = q + sigma * (rng.normal(size=k) + 1j * rng.normal(size=k))
+        h = h + (sigma_h or 0.0) * rng.normal(size=k)
+    if sigma_h is None:
+        return Bands(spectrum, q, np.full(k, sigma))
+    return Bands(spectrum, q, np.full(k, sigma), h, np.full(k, sigma_h))
+
+
+def test_a_half_space_is_eq2_and_eq3():
+    eps = 3.78 - 0.7j
+    q, _ = predict([Layer("pet", eps)], BANDS, THETA)
+    np.testing.assert_allclose(1 / q, ratio_from_permittivity(eps, THETA), rtol=1e-12)
+    fit = fit_layer(measured([Layer("pet", eps)]), [Layer("pet")], THETA)
+    assert fit.permittivity == pytest.approx(permittivity_from_ratio(1 / q[0], THETA), rel=1e-6)
+
+
+@settings(max_examples=25)
+@given(st.floats(2.0, 12.0), st.floats(0.05, 5.0), st.floats(0.3e-3, 4e-3))
+def test_a_sheet_of_known_thickness_is_recovered(real, loss, thickness):
+    eps = complex(real, -loss)
+    fit = fit_layer(measured([Layer("sheet", eps, thickness)]), [Layer("sheet", None, thickness)], THETA)
+    candidates = [fit.permittivity, *(r.permittivity for r in fit.rivals)]
+    assert min(abs(c - eps) for c in candidates) < 1e-3 * abs(eps)
+
+
+@settings(max_examples=15)
+@given(st.floats(3.0, 15.0), st.floats(3.0, 25.0), st.floats(1e-3, 3.5e-3))
+def test_a_liquid_behind_a_wall_is_recovered(real, loss, wall):
+    glass = Layer("glass", 5.5 - 0.05j, wall)
+    fit = fit_layer(measured([glass, Layer("liquid", complex(real, -loss))]), [glass, Layer("liquid")], THETA)
+    candidates = [fit.permittivity, *(r.permittivity for r in fit.rivals)]
+    assert min(abs(c - complex(real, -loss)) for c in candidates) < 1e-2 * abs(complex(real, -loss))
+
+
+def test_water_behind_glass_where_eq3_is_off_by_a_factor():
+    """One percent of the ratio, as after calibration: the stack gives water within 10 %, one interface does not."""
+    stack = [GLASS, Layer("water", WATER)]
+    rng = np.random.default_rng(2)
+    fits = [
+        fit_layer(measured(stack, 0.01, 0.03, rng=rng), [GLASS, Layer("water")], THETA).permittivity for _ in range(20)
+    ]
+    assert np.sqrt(np.mean([(f.real / 9.37 - 1) ** 2 for f in fits])) < 0.1
+    assert np.sqrt(np.mean([(f.imag / -18.0 - 1) ** 2 for f in fits])) < 0.1
+    q, _ = predict(stack, BANDS, THETA)
+    single = permittivity_from_ratio(1 / q.mean(), THETA)
+    assert single.real < 9.37 / 1.5 or single.real > 9.37 * 1.5 or abs(single.imag) < 18 / 1.5
+
+
+def test_thickness_is_fitted_when_asked():
+    eps, d = 3.56 - 0.18j, 1e-3
+    bands = measured([Layer("acrylic", eps, d)], 1e-3, 5e-3)
+    fit = fit_layer(bands, [Layer("acrylic", None, d)], THETA, thickness_range_m=(0.5e-3, 2e-3))
+    truth = [s for s in (fit, *fit.rivals) if abs(s.permittivity - eps) < 0.1]
+    assert truth
+    assert truth[0].thickness_m == pytest.approx(d, rel=0.02)
+
+
+def test_error_bars_are_those_of_repeated_measurements():
+    stack, unknown = [Layer("pvc", 4.15 - 0.81j, 1.5e-3)], [Layer("pvc", None, 1.5e-3)]
+    rng = np.random.default_rng(1)
+    fits = [fit_layer(measured(stack, 0.01, rng=rng), unknown, THETA) for _ in range(60)]
+    near = [f for f in fits if abs(f.permittivity - stack[0].permittivity) < 1.0]
+    assert len(near) > 50
+    for value, claimed in (
+        ([f.permittivity.real for f in near], [f.std_real for f in near]),
+        ([-f.permittivity.imag for f in near], [f.std_loss for f in near]),
+    ):
+        assert np.std(value) == pytest.approx(np.median(claimed), rel=0.35)
+
+
+def test_ambiguity_is_said():
+    """The ratio of one narrow band repeats with every half wave in the sheet; the whole sweep tells them apart."""
+    eps, sheet = 7.0 - 0.1j, [Layer("sheet", None, 2e-3)]
+    band = Spectrum(np.array([[76.3e9]]), np.array([[1.0]]))
+    narrow = fit_layer(measured([Layer("sheet", eps, 2e-3)], 0.005, spectrum=band), sheet, THETA)
+    assert narrow.ambiguous
+    assert any(abs(s.permittivity.real - eps.real) < 3 * s.std_real for s in (narrow, *narrow.rivals))
+    assert any("explains the data as well" in w for w in narrow.warnings())
+    wide = fit_layer(measured([Layer("sheet", eps, 2e-3)], 0.005), sheet, THETA)
+    assert not wide.ambiguous
+    assert abs(wide.permittivity - eps) < 1e-3
+
+
+def test_what_the_wave_does_not_reach_has_a_large_error_bar():
+    wall = Layer("lossy wall", 6.0 - 6.0j, 5e-3)
+    fit = fit_layer(measured([wall, Layer("liquid", WATER)], 0.01), [wall, Layer("liquid")], THETA)
+    assert any("large" in w or "as well" in w for w in fit.warnings())
+
+
+def test_a_stack_that_is_not_the_one_measured_is_noticed():
+    bands = measured([GLASS, Layer("water", WATER)], 0.003)
+    fit = fit_layer(bands, [Layer("sheet", None, 0.2e-3)], THETA)
+    assert any("does not explain" in w for w in fit.warnings())
+
+
+@pytest.mark.parametrize(
+    ("stack", "word"),
+    [
+        ([GLASS], "0 layers"),
+        ([Layer("a", None, 1e-3), Layer("b")], "2 layers"),
+        ([Layer("a", 2.0), Layer("b")], "without thickness"),
+    ],
+)
+def test_stacks_that_cannot_be_fitted_are_refused(stack, word):
+    with pytest.raises(PolysightError, match=word):
+        fit_layer(measured([GLASS]), stack, THETA)
+
+
+def test_fewer_data_than_unknowns_are_refused():
+    bands = measured([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.of(CHIRP, 1))
+    with pytest.raises(DataError, match="2 numbers for 3 unknowns"):
+        fit_layer(bands, [Layer("sheet", None, 1e-3)], THETA, (0.5e-3, 2e-3))

@@ -1,0 +1,273 @@
+"""Library, classifier and permittivity: round trip, refusal of code, recovery of known materials, unknown ones."""
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from host.materials import (
+    UNKNOWN,
+    Classifier,
+    Library,
+    TrainingScan,
+    Weights,
+    analyse,
+    estimate_permittivity,
+    fit_weights,
+    make_library,
+    median_ratio,
+    pixel_accuracy,
+    read_truth,
+    table2,
+)
+from host.materials.classify import ratio_distance, vote
+from host.materials.library import FORMAT
+from host.polarimetry import fresnel
+from shared.errors import DataError
+
+THETA = np.radians(55.0)
+
+
+@pytest.fixture(scope="session")
+def library(synthetic):
+    """Six placements that no test scene repeats."""
+    return make_library(
+        [TrainingScan(f"train-{s}", synthetic(s).analyse(), True, s, {"made by": "test"}) for s in range(1000, 1006)],
+        note="synthetic images",
+    )
+
+
+def test_library_round_trips(tmp_path, library):
+    library.save(tmp_path / "l.npz")
+    again = Library.load(tmp_path / "l.npz")
+    assert again.names == library.names
+    assert again.scans == library.scans
+    assert again.fit == json.loads(json.dumps(library.fit))
+    assert again.note == "synthetic images"
+    assert again.simulated
+    for a, b in zip(library.entries, again.entries, strict=True):
+        assert (a.name, a.scan, a.seed, a.permittivity, a.versions) == (
+            b.name,
+            b.scan,
+            b.seed,
+            b.permittivity,
+            b.versions,
+        )
+        np.testing.assert_array_equal(a.h, b.h)
+        np.testing.assert_array_equal(a.p, b.p)
+    assert [p.name for p in tmp_path.iterdir()] == ["l.npz"]
+
+
+class Bomb:
+    """Runs when unpickled."""
+
+    def __reduce__(self):
+        return (pytest.fail, ("a pickle was executed",))
+
+
+def test_pickles_and_damaged_files_are_refused(tmp_path, library):
+    bomb = tmp_path / "bomb.npz"
+    np.savez(bomb, meta=np.array([Bomb()], object), h=np.zeros(0), v=np.zeros(0), p=np.zeros(0), allow_pickle=True)
+    raw = tmp_path / "raw.npz"
+    raw.write_bytes(pickle.dumps(Bomb()))
+    library.save(tmp_path / "good.npz")
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes((tmp_path / "good.npz").read_bytes()[:2000])
+    other = tmp_path / "other.npz"
+    meta = np.frombuffer(json.dumps({"format": "polysight-library-99"}).encode(), np.uint8)
+    np.savez(other, meta=meta, h=np.zeros(0), v=np.zeros(0), p=np.zeros(0))
+    short = tmp_path / "short.npz"
+    meta = np.frombuffer(
+        json.dumps({"format": FORMAT, "fit": {}, "note": "", "entries": [{"pixels": 3, "name": "a"}]}).encode(),
+        np.uint8,
+    )
+    np.savez(short, meta=meta, h=np.zeros(0), v=np.zeros(0), p=np.zeros(0))
+    for path in (bomb, raw, cut, other, short, tmp_path / "absent.npz"):
+        with pytest.raises(DataError, match=path.name):
+            Library.load(path)
+
+
+def test_at_least_eight_of_nine_named_right(synthetic, library):
+    classifier = Classifier(library)
+    for seed in range(5):
+        result = synthetic(seed).analyse(classifier=classifier)
+        right = sum(r.verdict.name == r.truth.name for r in result.patches)
+        assert len(result.patches) == 9
+        assert right >= 8
+        assert pixel_accuracy(result) > 0.75
+        for r in result.patches:
+            assert 0 < r.verdict.confidence <= 1
+            assert sum(r.verdict.votes.values()) == pytest.approx(1)
+
+
+def test_polarimetry_beats_one_channel(library):
+    """The law behind the instrument: P separates what |H| cannot, and all three together are no worse than P."""
+    channel = library.fit["by_channel"]
+    assert channel["p"] > channel["h"] + 0.1
+    assert library.fit["pixel_accuracy"] >= channel["p"]
+
+
+def test_far_material_is_unknown(synthetic, library):
+    strange = {"copper": None, "water": 9.37 - 18.0j, "foam": 1.3 - 0.0j, "rubber": 5.06 - 1.11j}
+    result = synthetic(11, strange, noise=0.002).analyse(classifier=Classifier(library))
+    names = {r.truth.name: r.verdict.name for r in result.patches if r.truth}
+    assert names["water"] == UNKNOWN
+    assert names["rubber"] == "rubber"
+    assert names["copper"] == "copper"
+
+
+def test_weights_need_two_scans_and_splits_are_by_scan(library):
+    with pytest.raises(DataError, match="at least 2"):
+        fit_weights(library.select(library.scans[:1]))
+    # With names shuffled among patches only the patch's own pixels could tell: a split that leaks would succeed.
+    some = library.select(library.scans[:4])
+    names = np.random.default_rng(0).permutation([e.name for e in some.entries])
+    shuffled = Library(tuple(replace(e, name=str(n)) for e, n in zip(some.entries, names, strict=True)))
+    assert fit_weights(shuffled, pixels_per_patch=6).pixel_accuracy < 0.4
+
+
+def test_unusable_libraries_are_refused(library):
+    with pytest.raises(DataError, match="empty"):
+        Classifier(Library(()))
+    with pytest.raises(DataError, match="weights"):
+        Classifier(Library(library.entries, {"weights": {"h": 1}}))
+    with pytest.raises(DataError, match="known material"):
+        make_library([])
+
+
+def test_distances_are_distances():
+    rng = np.random.default_rng(3)
+    a, b, c = rng.standard_normal((3, 200)) + 1j * rng.standard_normal((3, 200))
+    for measure in ("paper", "inverse", "log"):
+        ab, bc, ac = (ratio_distance(*pair, measure) for pair in ((a, b), (b, c), (a, c)))
+        np.testing.assert_allclose(ab, ratio_distance(b, a, measure), rtol=1e-9)
+        assert (ac <= ab + bc + 1e-9).all()
+        np.testing.assert_allclose(ratio_distance(a, a, measure), 0, atol=1e-12)
+    # A gain error of 3 % is the same distance for every material.
+    np.testing.assert_allclose(ratio_distance(a, 1.03 * a, "log"), np.log(1.03), rtol=1e-9)
+
+
+def test_pixels_that_are_not_finite_are_unknown(library):
+    c = Classifier(library, Weights())
+    names, distance = c.pixels([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
+    assert names[1] == names[2] == UNKNOWN
+    assert names[0] != UNKNOWN
+    assert np.isinf(distance[1:]).all()
+    assert c.patch([], [], []).name == UNKNOWN
+
+
+def test_vote_is_a_majority():
+    v = vote(np.array(["a", "b", "a", "unknown"]), np.array([0.1, 0.2, 0.3, 9.0]))
+    assert (v.name, v.confidence, v.pixels) == ("a", 0.5, 4)
+    assert list(v.votes) == ["a", "b", "unknown"]
+
+
+@pytest.mark.parametrize("row", [m for m in table2() if m.number not in (1, 23)], ids=lambda m: m.name)
+def test_permittivity_of_table2_is_recovered_with_noise(row):
+    rng = np.random.default_rng(row.number)
+    r_s, r_p = fresnel(row.permittivity, THETA)
+    n = rng.standard_normal((4, 150)) * 0.003
+    e = estimate_permittivity(r_s + n[0] + 1j * n[1], r_p + n[2] + 1j * n[3], THETA)
+    assert e.value.real == pytest.approx(row.permittivity.real, rel=0.05)
+    assert e.value.imag == pytest.approx(row.permittivity.imag, abs=0.15)
+    assert e.real_range[0] <= e.value.real <= e.real_range[1]
+    assert e.pixels == 150
+
+
+def test_metal_has_no_permittivity():
+    rng = np.random.default_rng(0)
+    n = rng.standard_normal((4, 150)) * 0.01
+    e = estimate_permittivity(1 + n[0] + 1j * n[1], 1 + n[2] + 1j * n[3], THETA)
+    assert not e.determinable
+    assert e.metal_distance < 0.05
+    assert not estimate_permittivity(np.zeros(0, complex), np.zeros(0, complex), THETA).determinable
+
+
+def test_median_ratio_is_unbiased_where_v_nearly_vanishes():
+    """At the Brewster angle the mean of H/V does not exist; the estimate must not care, nor mind a few wild pixels."""
+    rng = np.random.default_rng(1)
+    r_s, r_p = fresnel(2.61 - 0.01j, THETA)
+    n = rng.standard_normal((4, 20000)) * 0.03
+    h, v = r_s + n[0] + 1j * n[1], r_p + n[2] + 1j * n[3]
+    v[:500] = 50.0
+    assert abs(1 / median_ratio(h, v) - r_p / r_s) < 0.006
+
+
+def test_permittivity_of_the_plates_within_ten_percent(synthetic):
+    result = synthetic(21).analyse()
+    for r in result.patches:
+        if r.truth.metal:
+            assert not r.permittivity.determinable
+        else:
+            assert r.permittivity.value.real == pytest.approx(r.truth.permittivity.real, rel=0.10)
+
+
+def test_leakage_biases_and_is_removed_when_given(synthetic):
+    scene = synthetic(22, leak=(0.05, 0.05), noise=0.0, uneven=0.0)
+    for leakage, limit in (((0.0, 0.0), np.inf), ((0.05, 0.05), 0.03)):
+        worst = max(
+            abs(r.permittivity.value.real / r.truth.permittivity.real - 1)
+            for r in scene.analyse(leakage=leakage).patches
+            if not r.truth.metal
+        )
+        assert worst < limit
+    uncorrected = scene.analyse()
+    assert any(
+        abs(r.permittivity.value.real / r.truth.permittivity.real - 1) > 0.1
+        for r in uncorrected.patches
+        if not r.truth.metal
+    )
+
+
+def test_rows_are_plain_json(synthetic, library):
+    result = synthetic(3).analyse(classifier=Classifier(library))
+    rows = json.loads(json.dumps(result.rows(), allow_nan=False))
+    assert len(rows) == 9
+    metal = next(r for r in rows if r["metal_reference"])
+    assert metal["permittivity"] is None
+    assert metal["metal_like"]
+    assert metal["truth"]["metal"]
+    other = next(r for r in rows if not r["metal_reference"])
+    assert other["permittivity"]["real_p30_p70"][0] <= other["permittivity"]["real_p30_p70"][1]
+    assert other["incidence_deg"] == pytest.approx(55.0)
+
+
+def test_truth_is_carried_but_never_used(synthetic, library):
+    scene = synthetic(4)
+    classifier = Classifier(library)
+    told = scene.analyse(classifier=classifier)
+    blind = analyse(scene.h, scene.v, scene.x_m, scene.y_m, theta_rad=THETA, classifier=classifier)
+    assert [r.verdict for r in told.patches] == [r.verdict for r in blind.patches]
+    assert all(r.truth is None for r in blind.patches)
+    assert pixel_accuracy(blind) is None
+
+
+def test_truth_files(tmp_path):
+    path = tmp_path / "truth.json"
+    plate = {"name": "PET", "centre_mm": [10, -20], "size_mm": [45, 30], "permittivity": [3.78, 0.7]}
+    path.write_text(
+        json.dumps({"plates": [plate, {"name": "Cu", "centre_mm": [0, 0], "size_mm": [1, 1], "metal": True}]})
+    )
+    pet, copper = read_truth(path)
+    assert pet.permittivity == 3.78 - 0.7j
+    assert pet.box_mm == (-12.5, -35.0, 32.5, -5.0)
+    assert copper.metal
+    for text in ("{}", '{"plates": [{"name": "x"}]}', "no json"):
+        path.write_text(text)
+        with pytest.raises(DataError):
+            read_truth(path)
+    with pytest.raises(DataError):
+        read_truth(tmp_path / "absent.json")
+
+
+def test_table2_is_complete():
+    rows = table2()
+    assert [r.number for r in rows] == list(range(1, 37))
+    by_name = {r.name: r for r in rows}
+    assert by_name["PET (0.5 mm)"].permittivity == 3.78 - 0.70j
+    assert by_name["PET (0.5 mm)"].thickness_mm == 0.5
+    assert by_name["Ceramic"].permittivity == 4.75 - 2.43j
+    assert by_name["Water (with glass)"].permittivity == 3.66 - 0.43j
+    assert "not given" in by_name["Cork"].note

@@ -1,0 +1,147 @@
+"""Segmentation finds every plate and nothing else; boxes by hand; the metal reference."""
+
+import json
+
+import numpy as np
+import pytest
+
+from host.materials import (
+    SegmentSettings,
+    find_metal,
+    metal_by_label,
+    metal_in_box,
+    patches_from_labels,
+    read_labels,
+    segment,
+    truth_labels,
+    write_labels,
+)
+from host.materials.segment import box_mask
+from host.materials.truth import match
+from shared.errors import DataError
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nine_plates_and_no_more(synthetic, seed):
+    scene = synthetic(seed, noise=0.03, uneven=0.05)
+    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    matched = match(found.patches, scene.plates)
+    assert len(found.patches) == 9
+    assert len(matched) == 9
+    for patch in found.patches:
+        truth = matched[patch.label].box_mm
+        np.testing.assert_allclose(patch.box_mm, truth, atol=5.0)
+        inside = box_mask(truth, scene.x_m, scene.y_m)
+        assert not (patch.interior & ~inside).any()
+        assert patch.interior.sum() > 80
+        assert patch.pixels == patch.mask.sum()
+        assert (found.labels[patch.mask] == patch.label).all()
+
+
+@pytest.mark.parametrize("count", [1, 4, 7])
+def test_their_number_is_not_told(synthetic, nine, count):
+    few = dict(list(nine.items())[:count])
+    scene = synthetic(3, few)
+    assert len(segment(scene.h, scene.v, scene.x_m, scene.y_m).patches) == count
+
+
+def test_dim_plate_beside_bright_one_is_found(synthetic):
+    scene = synthetic(5, {"copper": None, "wood": 2.61 - 0.01j, "second": None}, pitch_mm=54.0, jitter_mm=0.0)
+    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    assert len(found.patches) == 3
+
+
+def test_noise_alone_has_no_patches(synthetic):
+    scene = synthetic(1, {}, noise=0.1)
+    assert segment(scene.h, scene.v, scene.x_m, scene.y_m).patches == ()
+
+
+def test_gain_between_channels_does_not_matter(synthetic):
+    scene = synthetic(2)
+    a = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    b = segment(scene.h * np.complex64(30j), scene.v * np.complex64(0.01), scene.x_m, scene.y_m)
+    np.testing.assert_array_equal(a.labels, b.labels)
+
+
+def test_invalid_part_is_left_out(synthetic):
+    scene = synthetic(2)
+    valid = np.ones(scene.h.shape, bool)
+    valid[:, :75] = False
+    found = segment(scene.h, scene.v, scene.x_m, scene.y_m, valid)
+    assert found.patches
+    assert not found.labels[:, :75].any()
+    with pytest.raises(DataError, match="no valid pixel"):
+        segment(scene.h, scene.v, scene.x_m, scene.y_m, np.zeros_like(valid))
+    with pytest.raises(DataError, match="axes"):
+        segment(scene.h, scene.v, scene.x_m[:-1], scene.y_m)
+
+
+def test_outline_encloses_the_patch(synthetic):
+    scene = synthetic(4)
+    for patch in segment(scene.h, scene.v, scene.x_m, scene.y_m, settings=SegmentSettings(margin_mm=6.0)).patches:
+        np.testing.assert_allclose(patch.outline_mm.min(axis=0), patch.box_mm[:2], atol=2.1)
+        np.testing.assert_allclose(patch.outline_mm.max(axis=0), patch.box_mm[2:], atol=2.1)
+
+
+def test_metal_is_found_by_itself_whatever_the_gains(synthetic):
+    for seed in range(4):
+        scene = synthetic(seed, gain_v=0.05j)
+        found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+        metal = find_metal(scene.h, scene.v, found)
+        assert match(found.patches, scene.plates)[metal.label].name == "copper"
+        assert metal.certain
+        assert "brightest in both channels" in metal.how
+
+
+def test_scene_without_metal_is_called_uncertain(synthetic, nine):
+    scene = synthetic(0, {n: e for n, e in nine.items() if e is not None})
+    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    metal = find_metal(scene.h, scene.v, found)
+    assert not metal.certain
+    assert "--metal" in metal.how
+
+
+def test_metal_by_box_and_label(synthetic):
+    scene = synthetic(0)
+    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    copper = next(p for p in scene.plates if p.metal)
+    by_box = metal_in_box(copper.box_mm, found, scene.x_m, scene.y_m)
+    assert by_box.label is not None
+    assert (by_box.mask == metal_by_label(by_box.label, found).mask).all()
+    with pytest.raises(DataError, match="no valid pixel"):
+        metal_in_box((1e3, 1e3, 2e3, 2e3), found, scene.x_m, scene.y_m)
+    with pytest.raises(DataError, match="no patch 99"):
+        metal_by_label(99, found)
+
+
+def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
+    scene = synthetic(0)
+    boxes = {"acrylic": (10.0, 20.0, 30.0, 35.0), "copper": (60.0, 60.0, 80.0, 82.0)}
+    write_labels(tmp_path / "l.json", boxes, "by hand")
+    assert read_labels(tmp_path / "l.json") == boxes
+    found, names = patches_from_labels(boxes, scene.x_m, scene.y_m)
+    assert names == {1: "acrylic", 2: "copper"}
+    assert found.patches[0].pixels == 20 * 15
+    assert found.labels[20, 10] == 1
+    assert found.labels[35, 10] == 0
+    flipped, _ = patches_from_labels(boxes, scene.x_m, scene.y_m, flip_y=True)
+    np.testing.assert_array_equal(flipped.labels, found.labels[::-1])
+    with pytest.raises(DataError, match="holds no pixel"):
+        patches_from_labels({"far": (500.0, 0.0, 600.0, 10.0)}, scene.x_m, scene.y_m)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"labels": 3}', '{"labels": {"a": [1, 2, 3]}}', json.dumps({"labels": [1]})]
+)
+def test_bad_label_files_are_refused(tmp_path, text):
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"bad\.json"):
+        read_labels(path)
+
+
+def test_truth_labels_agree_with_boxes(synthetic):
+    scene = synthetic(7)
+    labels = truth_labels(scene.plates, scene.x_m, scene.y_m)
+    assert set(np.unique(labels)) == set(range(10))
+    assert (labels > 0).mean() == pytest.approx(9 * 45**2 / 300**2, rel=0.05)

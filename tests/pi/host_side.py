@@ -1,0 +1,89 @@
+"""The host's end of the Pi's sockets, as small as can be."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from shared import messages as m
+from shared.config import Instrument
+from shared.raster import plan_raster
+from shared.sockets import requester, subscriber
+
+LIMIT_S = 60.0
+
+
+class HostSide:
+    """Commands, and every event seen."""
+
+    def __init__(self, command_address: str, event_address: str, instrument: Instrument) -> None:
+        self.context: Any = zmq.Context()
+        self.commands = requester(self.context, command_address, Path("none"))
+        self.subscriber = subscriber(self.context, event_address, Path("none"))
+        self.instrument = instrument
+        self.events: list[Any] = []
+        self.wait(m.Heartbeat)  # the subscription has arrived
+
+    def ask(self, command: Any) -> Any:
+        self.commands.send(m.pack(command))
+        assert self.commands.poll(int(LIMIT_S * 1e3)), f"no reply to {command}"
+        return m.unpack_reply(self.commands.recv())
+
+    def accepted(self, command: Any) -> m.Accepted:
+        reply = self.ask(command)
+        assert isinstance(reply, m.Accepted), reply
+        return reply
+
+    def begin(self, scan_id: str = "scan", **changes: Any) -> m.BeginRun:
+        i = self.instrument
+        fields: dict[str, Any] = {
+            "scan_id": scan_id,
+            "plan": plan_raster(i.grid),
+            "pulses": i.burst.pulses,
+            "period_us": i.burst.period_us,
+            "width_us": i.burst.width_us,
+            "speed_mm_s": i.stage.speed_mm_s,
+        }
+        return m.BeginRun(**{**fields, **changes})
+
+    def home(self) -> None:
+        self.accepted(m.Home())
+        self.until_state("ready")
+
+    def until_state(self, *states: str) -> m.StatusReply:
+        deadline = time.monotonic() + LIMIT_S
+        while time.monotonic() < deadline:
+            status = self.ask(m.Status())
+            if status.state in states:
+                return status
+            time.sleep(0.005)
+        raise AssertionError(f"never in {states}: {self.ask(m.Status())}")
+
+    def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float = LIMIT_S) -> Any:
+        """The next event of a kind; everything on the way is kept in `events`."""
+        deadline = time.monotonic() + limit_s
+        while (left := deadline - time.monotonic()) > 0:
+            if self.subscriber.poll(int(left * 1e3) + 1):
+                event = m.unpack_event(self.subscriber.recv_multipart()[-1])
+                self.events.append(event)
+                if isinstance(event, kind) and where(event):
+                    return event
+        raise AssertionError(f"no {kind.__name__} within {limit_s} s; seen {self.events[-5:]}")
+
+    def row(self, row_index: int, take: int = 1, scan_id: str = "scan") -> m.RowFinished:
+        self.accepted(m.RunRow(scan_id=scan_id, row_index=row_index, take=take))
+        return self.wait(m.RowFinished, lambda e: (e.row_index, e.take) == (row_index, take))
+
+    @property
+    def journalled(self) -> list[Any]:
+        return [e for e in self.events if isinstance(e, m.JOURNALLED)]
+
+    def replay(self, scan_id: str = "scan", from_seq: int = 1, limit: int = 10000) -> list[Any]:
+        return self.ask(m.Replay(scan_id=scan_id, from_seq=from_seq, limit=limit)).events
+
+    def close(self) -> None:
+        self.context.destroy(linger=0)

@@ -1,0 +1,169 @@
+"""`polysight-pi check`: each fault is found, named, and comes with what to do."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+from collections import namedtuple
+
+import msgspec
+import pytest
+from processes import run
+
+from pi_controller import checks
+from pi_controller.checks_lines import check_lines
+from pi_controller.keys import make_keys
+from simulators import gpio
+
+pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
+replace = msgspec.structs.replace
+
+
+@pytest.fixture
+def rig(instrument, tmp_path):
+    """The chip's device is made by the stand-in."""
+    return replace(instrument, pi=replace(instrument.pi, gpio_chip=str(tmp_path / "chip")))
+
+
+@pytest.fixture
+def on_chip(write_config, stage, tmp_path):
+    """Findings, by name, of the command on a stand-in chip with faults."""
+    if lacking := gpio.missing():
+        pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}")
+
+    def check(rig, *faults, port=None):
+        arguments = ("--config", write_config(rig), "--stage-port", port or stage.port, "--json")
+        done = run("check", *arguments, **gpio.environment(tmp_path / "chip", faults=faults))
+        findings = {f["name"]: f for f in json.loads(done.stdout)}
+        assert (done.returncode == 0) == all(f["verdict"] != "fail" for f in findings.values())
+        assert all(f["remedy"] for f in findings.values() if f["verdict"] != "ok"), findings
+        return findings
+
+    return check
+
+
+def test_a_whole_rig_is_all_ok(on_chip, rig):
+    found = on_chip(rig)
+    rights = ["schedule right", "locked memory"]  # as this machine has it
+    lines = ["wiring", "GPIO chip", "trigger line 26", "SYNC_IN line 22"]
+    rest = ["stage port", "stage", "journal", "disk", "keys", "command address", "event address"]
+    assert list(found) == ["plan", "clock", *rights, *lines, *rest]
+    assert {f["verdict"] for name, f in found.items() if name not in rights} == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("fault", "name", "words"),
+    [
+        ("denied", "GPIO chip", "Permission denied"),
+        ("busy:26", "trigger line 26", "another-program"),
+        ("busy:22", "SYNC_IN line 22", "another-program"),
+        ("no-edges", "trigger line 26", "reports no edges"),
+    ],
+)
+def test_faults_of_the_chip(on_chip, rig, fault, name, words):
+    found = on_chip(rig, fault)
+    assert found[name]["verdict"] == "fail"
+    assert words in found[name]["found"]
+
+
+def test_no_chip_no_line_no_port_and_a_deaf_stage(on_chip, rig, stage):
+    found = on_chip(replace(rig, pi=replace(rig.pi, gpio_chip="pinctrl-none", trigger_in=60)), port="/dev/none")
+    assert "'pinctrl-none'" in found["GPIO chip"]["found"]
+    assert "/dev/none" in found["stage port"]["found"]
+    assert found["stage"]["verdict"] == "fail"
+    found = on_chip(replace(rig, pi=replace(rig.pi, trigger_in=60)))
+    assert "no such line" in found["trigger line 60"]["found"]
+    stage.deaf = True
+    found = on_chip(rig)
+    assert (found["stage port"]["verdict"], found["stage"]["verdict"]) == ("ok", "fail")
+    assert "HELLO" in found["stage"]["found"]
+
+
+def test_wiring_and_line_release(rig, tmp_path):
+    def of(model, name, **changes):
+        changed = replace(rig, pi=replace(rig.pi, **changes))
+        return next(f for f in check_lines(changed, model, tmp_path) if f.name == name)
+
+    three = {"wiring": "lines", "sync_out": (22, 23, 24)}
+    assert of("", "wiring").verdict == "ok"
+    assert of("Raspberry Pi 4 Model B Rev 1.4", "wiring", **three).verdict == "warn"
+    assert of("Raspberry Pi 5 Model B Rev 1.0", "wiring", **three).verdict == "fail"
+    assert of("Raspberry Pi 4 Model B Rev 1.4", "line release").verdict == "warn"  # an older kernel
+    parameters = tmp_path / "pinctrl_bcm2835" / "parameters"
+    parameters.mkdir(parents=True)
+    for value, verdict in (("Y", "warn"), ("N", "ok")):
+        (parameters / "persist_gpio_outputs").write_text(value + "\n")
+        found = of("Raspberry Pi 4 Model B Rev 1.4", "line release")
+        assert found.verdict == verdict
+        assert (verdict == "ok") or "strict_gpiod" in found.remedy
+
+
+def test_rights_that_are_missing(monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert (checks._schedule().verdict, "LimitRTPRIO" in checks._schedule().remedy) == ("warn", True)
+
+    class Libc:
+        def mlockall(self, _):
+            checks.ctypes.set_errno(12)
+            return -1
+
+    monkeypatch.setattr(checks.ctypes, "CDLL", lambda *_, **__: Libc())
+    assert (checks._memory().verdict, "LimitMEMLOCK" in checks._memory().remedy) == ("warn", True)
+    monkeypatch.setattr(checks.time, "clock_getres", lambda _: 0.004)
+    assert checks._clock().verdict == "fail"
+
+
+def test_a_port_without_permission(monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refuse)
+    found = checks.attempt("stage port", lambda: checks._port("/dev/ttyACM0"))
+    assert (found.verdict, "dialout" in found.remedy) == ("fail", True)
+
+
+def test_journal_and_disk(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    found = checks.attempt("journal", lambda: checks._journal(tmp_path / "file" / "journal"))
+    assert found.verdict == "fail"
+    assert found.remedy
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(100, 99, 1 << 20))
+    found = checks.attempt("disk", lambda: checks._disk(tmp_path, checks.JOURNAL_BYTES))
+    assert (found.verdict, "1 MiB free, 100 MiB wanted" in found.found) == ("fail", True)
+
+
+def test_keys(tmp_path):
+    folder, addresses = tmp_path / "keys", ("tcp://127.0.0.1:1", "tcp://0.0.0.0:2")
+    assert checks.attempt("keys", lambda: checks._keys(folder, addresses[:1])).verdict == "ok"
+    found = checks.attempt("keys", lambda: checks._keys(folder, addresses))
+    assert (found.verdict, found.remedy) == ("fail", "polysight-pi keys")
+    make_keys(folder)
+    assert checks.attempt("keys", lambda: checks._keys(folder, addresses)).verdict == "ok"
+    (folder / "pi.key_secret").chmod(0o644)
+    found = checks.attempt("keys", lambda: checks._keys(folder, addresses))
+    assert (found.verdict, "chmod 600" in found.remedy) == ("warn", True)
+
+
+def test_addresses(tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        found = checks.attempt("command address", lambda: checks._address("command", address, tmp_path))
+    assert (found.verdict, "holds this port" in found.found) == ("fail", True)
+    found = checks.attempt("event address", lambda: checks._address("event", "tcp://0.0.0.0:*", tmp_path))
+    assert (found.verdict, "polysight-pi keys" in found.remedy) == ("fail", True)
+    found = checks.attempt("event address", lambda: checks._address("event", "tcp//x", tmp_path))
+    assert found.verdict == "fail"
+
+
+def test_a_burst_that_does_not_fit(rig):
+    slow = replace(rig, burst=replace(rig.burst, pulses=100))
+    found = checks.attempt("plan", lambda: checks._plan(slow))
+    assert (found.verdict, "burst" in found.found) == ("fail", True)

@@ -1,0 +1,164 @@
+"""Laws of the journal: whatever is cut off or damaged, what is read back is a prefix of what was written."""
+
+import errno
+import os
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pi_controller import journal as journal_module
+from pi_controller.journal import MAGIC, Journal, JournalFolder, JournalFullError
+from shared.errors import ConfigError, DataError, DeviceError
+
+payloads = st.lists(st.binary(max_size=40), max_size=12)
+
+
+def written(path, records):
+    path.unlink(missing_ok=True)
+    j = Journal(path)
+    for r in records:
+        j.append(r)
+    j.close()
+    return path.read_bytes()
+
+
+def reopened(path):
+    j = Journal(path)
+    found = j.read(1, 10**6)
+    j.close()
+    return found
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_waiting_for_the_disk():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(journal_module.os, "fsync", lambda _: None)
+        yield
+
+
+@given(records=payloads)
+@settings(max_examples=20, deadline=None)
+def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, records):
+    path = tmp_path_factory.mktemp("j") / "a.journal"
+    raw = written(path, records)
+    ends = [len(MAGIC)]
+    for r in records:
+        ends.append(ends[-1] + 12 + len(r))
+    for cut in range(len(raw) + 1):
+        path.write_bytes(raw[:cut])
+        whole = max(0, sum(e <= cut for e in ends) - 1)
+        assert reopened(path) == records[:whole]
+        assert path.stat().st_size == ends[whole]
+
+
+@given(records=st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=8), data=st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_damaged_byte_loses_only_what_lies_behind_it(tmp_path_factory, records, data):
+    path = tmp_path_factory.mktemp("j") / "a.journal"
+    raw = bytearray(written(path, records))
+    at = data.draw(st.integers(len(MAGIC), len(raw) - 1))
+    raw[at] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(raw)
+    found = reopened(path)
+    assert found == records[: len(found)]
+    assert len(MAGIC) + sum(12 + len(r) for r in records[: len(found)]) <= at
+
+
+@given(first=payloads, second=payloads, seq=st.integers(1, 30), limit=st.integers(1, 30))
+@settings(max_examples=40, deadline=None)
+def test_replay_from_any_sequence_over_a_restart(tmp_path_factory, first, second, seq, limit):
+    path = tmp_path_factory.mktemp("j") / "a.journal"
+    written(path, first)
+    j = Journal(path)
+    assert j.last_seq == len(first)
+    assert [j.append(r) for r in second] == list(range(len(first) + 1, len(first) + len(second) + 1))
+    j.commit()
+    assert j.read(seq, limit) == (first + second)[seq - 1 : seq - 1 + limit]
+    j.close()
+    folder = JournalFolder(path.parent)
+    assert folder.read("a", seq, limit) == ((first + second)[seq - 1 : seq - 1 + limit], len(first + second))
+    folder.close()
+
+
+def test_what_is_in_the_batch_is_not_on_the_disk_until_committed(tmp_path):
+    j = Journal(tmp_path / "a.journal")
+    j.append(b"x")
+    assert (j.last_seq, j.read(1, 9)) == (1, [])
+    j.commit(sync=True)
+    assert j.read(1, 9) == [b"x"]
+    j.close()
+
+
+@pytest.mark.parametrize("room", [0, 1, 13, 25])
+def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
+    j = Journal(tmp_path / "a.journal")
+    j.append(b"kept")
+    j.commit()
+    real, left = os.pwrite, [room]
+
+    def full(fd, data, offset):
+        if not left[0]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        n = real(fd, data[: left[0]], offset)
+        left[0] -= n
+        return n
+
+    monkeypatch.setattr(journal_module.os, "pwrite", full)
+    j.append(b"lost 1")
+    j.append(b"lost 2")
+    with pytest.raises(JournalFullError, match="No space left"):
+        j.commit()
+    assert (j.last_seq, j.read(1, 9)) == (1, [b"kept"])
+    monkeypatch.undo()
+    assert j.append(b"again") == 2
+    j.close()
+    assert reopened(tmp_path / "a.journal") == [b"kept", b"again"]
+
+
+def test_a_stranger_file_is_refused_and_kept(tmp_path):
+    path = tmp_path / "a.journal"
+    path.write_bytes(b"somebody's notes")
+    with pytest.raises(DataError):
+        Journal(path)
+    assert path.read_bytes() == b"somebody's notes"
+
+
+def test_one_process_a_folder(tmp_path):
+    folder = JournalFolder(tmp_path / "j")
+    with pytest.raises(DeviceError, match="in use"):
+        JournalFolder(tmp_path / "j")
+    folder.close()
+    JournalFolder(tmp_path / "j").close()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError):
+        JournalFolder(tmp_path / "file" / "j")
+
+
+@given(first=payloads, passed=st.integers(0, 40), second=payloads, seq=st.integers(1, 60), limit=st.integers(1, 30))
+@settings(max_examples=40, deadline=None)
+def test_numbers_go_on_behind_what_the_host_has(tmp_path_factory, first, passed, second, seq, limit):
+    """Whatever the journal has lost, no number is used twice, also after another restart."""
+    path = tmp_path_factory.mktemp("j") / "a.journal"
+    written(path, first)
+    j = Journal(path)
+    assert j.number_behind(passed) == max(0, passed - len(first))
+    begin = max(passed, len(first)) + 1
+    assert [j.append(r) for r in second] == list(range(begin, begin + len(second)))
+    j.close()
+    j = Journal(path)
+    numbered = {i + 1: r for i, r in enumerate(first)} | {begin + i: r for i, r in enumerate(second)}
+    assert j.last_seq == max(numbered, default=0)
+    assert j.read(seq, limit) == [r for n, r in numbered.items() if n >= seq][:limit]
+    j.close()
+
+
+@pytest.mark.parametrize("left", [b"", MAGIC[:3], bytes(8), bytes(4096)])
+def test_what_a_power_cut_leaves_of_a_new_journal_is_an_empty_one(tmp_path, left):
+    path = tmp_path / "a.journal"
+    path.write_bytes(left)
+    j = Journal(path)
+    assert (j.last_seq, path.read_bytes()) == (0, MAGIC)
+    assert j.append(b"x") == 1
+    j.close()
+    assert reopened(path) == [b"x"]

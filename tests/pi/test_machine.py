@@ -1,0 +1,349 @@
+"""Laws of the state machine and of what watches a running row, on a clock that tests turn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from fake_lines import FakeLines
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pi_controller.burst import BurstSpec
+from pi_controller.machine import Machine
+from pi_controller.rows import RefusedError
+from pi_controller.stage_driver import SILENT_HEARTBEATS, STATUS_PER_HEARTBEAT, read_slice_s
+from pi_controller.states import MOVES
+from pi_controller.supervision import StatusWatch, TriggerWatch
+from pi_controller.trigger_lines import Edge
+from pi_controller.trigger_loop import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop
+from shared import messages as m
+from shared.config import Stage
+from shared.faults import PiFault, StageError
+from shared.raster import Row
+from shared.stage_line import Immediate, Reply
+
+SPEC = BurstSpec(2, 1_500_000, 1000)
+ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
+SAFE_WITHIN_S = 0.5
+
+
+class FakeDriver:
+    """Takes everything; what was sent is kept."""
+
+    def __init__(self) -> None:
+        self.config = Stage("none")
+        self.sent: list[Immediate] = []
+        self.x_mm = self.y_mm = 0.0
+        self.firmware = "fake"
+        self.number = 0
+
+    def connect(self) -> None: ...
+    def clear(self) -> None: ...
+    def at_rest(self) -> None: ...
+    def ask_how_it_ended(self) -> None: ...
+    def note_position(self, _: Reply) -> None: ...
+
+    def send(self, byte: Immediate) -> None:
+        self.sent.append(byte)
+
+    def home(self) -> int:
+        self.number += 1
+        return self.number
+
+    def row(self, _: Any) -> int:
+        self.number += 1
+        return self.number
+
+
+class FakeLedger:
+    def __init__(self) -> None:
+        self.events: list[Any] = []
+        self.broken = False
+
+    def add(self, event: Any) -> None:
+        self.events.append(event)
+
+
+class Bench:
+    """A machine, and whoever else acts on it."""
+
+    def __init__(self) -> None:
+        self.t = 100.0
+        self.lines, self.stage, self.ledger = FakeLines(), FakeDriver(), FakeLedger()
+        self.posted: list[Any] = []
+        self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
+        parts: Any = (self.stage, self.loop, self.ledger, self.posted.append, lambda _: None)
+        self.machine = Machine(*parts, clock=lambda: self.t)
+        self.seqno = 0
+
+    def run_posted(self) -> None:
+        while self.posted:
+            item = self.posted.pop(0)
+            if isinstance(item, BurstSent):
+                self.machine.take_burst(item)
+            elif isinstance(item, LoopFault):
+                self.machine.take_loop_fault(item)
+            else:
+                item()
+
+    def later(self, seconds: float) -> None:
+        """Time goes on, in the executor's turns: until something is due, or the time is over."""
+        end = self.t + seconds
+        while self.t < end:
+            left = self.machine.seconds_left()
+            self.t = min(end, self.t + (seconds if left is None else max(left, 1e-6)))
+            self.machine.check_limits()
+            self.run_posted()
+
+    def homed(self) -> Bench:
+        self.machine.begin_run(0)
+        self.machine.home()
+        self.run_posted()
+        self.stage_says(Reply("ok", self.stage.number))
+        self.stage_says(Reply("done", self.stage.number))
+        assert self.machine.state == "ready"
+        return self
+
+    def start(self) -> None:
+        self.machine.start_row(ROW, 1, SPEC, 20.0)
+        self.row_number = self.stage.number
+
+    def stage_says(self, reply: Reply) -> None:
+        self.machine.take_stage(reply)
+        self.run_posted()
+
+    def status(self, points: int, state: str = "row") -> None:
+        self.stage_says(Reply("status", fields={"state": state, "points": str(points), "x": "0", "y": "0"}))
+
+    def edge(self) -> None:
+        self.seqno += 1
+        self.lines.t += 100_000_000
+        with self.loop._lock:
+            self.loop._take(Edge(self.lines.t, self.seqno))
+        self.run_posted()
+
+    @property
+    def armed(self) -> bool:
+        return self.loop._job is not None
+
+    def of(self, kind: type) -> list[Any]:
+        return [e for e in self.ledger.events if isinstance(e, kind)]
+
+
+def test_a_row_passes_every_state():
+    bench = Bench()
+    machine, seen = bench.machine, []
+    go = machine._states.go
+    machine._states.go = lambda state: (seen.append(state), go(state))[1]  # type: ignore[method-assign]
+    machine.home()
+    bench.run_posted()
+    bench.stage_says(Reply("ok", bench.stage.number))
+    bench.stage_says(Reply("done", bench.stage.number))
+    assert machine.state == "homed", "no run is begun"
+    machine.begin_run(0)
+    bench.start()
+    machine.hold(True)
+    machine.hold(False)
+    for _ in range(3):
+        bench.edge()
+    bench.stage_says(Reply("done", bench.row_number, fields={"points": "3"}))
+    machine.end_run()
+    assert seen == ["homing", "homed", "ready", "running", "held", "running", "done", "ready", "homed"]
+    assert bench.of(m.RowFinished)[-1].status == "done"
+
+
+def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
+    bench = Bench().homed()
+    bench.start()
+    bench.edge()
+    bench.edge()
+    bench.stage_says(Reply("done", bench.row_number, fields={"points": "3"}))
+    assert bench.machine.state == "done"
+    bench.later(2.0)
+    finished = bench.of(m.RowFinished)[-1]
+    assert (finished.status, finished.fault) == ("fault", PiFault.POINTS_MISMATCH)
+    assert bench.machine.state == "ready"
+
+
+@pytest.mark.parametrize("held", [False, True])
+@given(beats=st.integers(0, 30), heartbeat_ms=st.integers(10, 100))
+def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms):
+    """From its last sign of life to outputs dead and the stage told to stop, in virtual time."""
+    bench = Bench().homed()
+    bench.machine.begin_run(heartbeat_ms)
+    bench.start()
+    bench.machine.hold(held) if held else None
+    for _ in range(beats):
+        bench.later(heartbeat_ms / 1e3)
+        bench.machine.host.heard(bench.t)
+    assert bench.armed, "a host that is heard is not lost"
+    last = bench.t
+    while bench.armed:
+        bench.later(0.001)
+    assert bench.t - last <= SAFE_WITHIN_S
+    assert bench.stage.sent[-1] == Immediate.STOP
+    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    finished = bench.of(m.RowFinished)[-1]
+    assert (finished.status, finished.fault) == ("fault", PiFault.HOST_LOST)
+    assert (bench.machine.state, bench.machine.fault) == ("ready", PiFault.HOST_LOST)
+
+
+def test_a_host_that_promises_nothing_is_not_watched():
+    bench = Bench().homed()
+    bench.start()
+    bench.later(20.0)
+    assert bench.armed
+
+
+@given(
+    phase=st.floats(0, 1),
+    answer_s=st.floats(0.001, 0.1),
+    heartbeat_ms=st.integers(200, 500),
+)
+def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat_ms):
+    """The link's loop in virtual time: it looks every slice; from some moment on no answer comes."""
+    heartbeat_s = heartbeat_ms / 1e3
+    watch = StatusWatch(SILENT_HEARTBEATS * heartbeat_s, 0.0)
+    watch.interval_s = heartbeat_s / STATUS_PER_HEARTBEAT
+    dead_s, t, answers = 2.0 + phase * heartbeat_s, 0.0, []
+    while True:
+        t += read_slice_s(heartbeat_s)
+        if answers and answers[0] <= t:
+            answers.pop(0)
+            watch.heard()
+        elif watch.silent_s(t):
+            break
+        if watch.is_due(t) and t + answer_s < dead_s:
+            answers.append(t + answer_s)
+        assert t < 10
+    assert dead_s < t + 1e-9, "a stage that answers is not lost"
+    assert t - dead_s <= SAFE_WITHIN_S
+
+
+@pytest.mark.parametrize("lasting", [True, False])
+def test_a_lost_trigger_line_stops_everything_at_once(lasting):
+    """The loop notices within its look-up time; the machine acts in the same turn."""
+    assert LOOK_UP_S <= SAFE_WITHIN_S / 2
+    bench = Bench().homed()
+    bench.start()
+    bench.edge()
+    job = None if lasting else bench.machine.row.job  # type: ignore[union-attr]
+    number = PiFault.TRIGGER_LINE_LOST if lasting else PiFault.EDGE_LOST
+    bench.machine.take_loop_fault(LoopFault(job, number, "gone"))
+    assert not bench.armed
+    assert bench.stage.sent == [Immediate.STOP]
+    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    assert bench.of(m.RowFinished)[-1].fault == number
+    assert bench.machine.state == ("fault" if lasting else "ready")
+    if lasting:
+        with pytest.raises(RefusedError):
+            bench.machine.home()
+
+
+def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
+    """Points go by and no edge comes: told after two more statuses, a quarter of the heartbeat apart."""
+    assert 3 * 0.5 / STATUS_PER_HEARTBEAT <= SAFE_WITHIN_S
+    bench = Bench().homed()
+    bench.start()
+    bench.status(0)
+    bench.edge()
+    bench.status(1)
+    bench.status(2)
+    assert bench.armed
+    bench.status(3)
+    assert not bench.armed
+    assert bench.machine.fault == PiFault.TRIGGER_LINE_LOST
+    assert bench.stage.sent == [Immediate.STOP]
+    assert "3 points, 1 edges" in bench.machine.reason
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), max_size=30))
+def test_a_wire_with_edges_is_never_called_off(steps):
+    """Statuses and edges in any order, statuses up to three points ahead of the edges seen when one follows soon."""
+    watch, edges = TriggerWatch(), 0
+    for ahead, more in steps:
+        edges += more + 1  # between two statuses at least one edge came
+        assert not watch.is_silent(edges + ahead, edges)
+
+
+def test_the_first_fault_wins():
+    bench = Bench().homed()
+    bench.start()
+    bench.machine.take_loop_fault(LoopFault(bench.machine.row.job, PiFault.EDGE_LOST, "2 edges lost"))  # type: ignore[union-attr]
+    bench.machine.fail(PiFault.STAGE_LOST, "silent")
+    bench.run_posted()
+    assert (bench.machine.fault, bench.machine.reason) == (PiFault.EDGE_LOST, "2 edges lost")
+    assert [e.number for e in bench.of(m.Fault)] == [PiFault.EDGE_LOST, PiFault.STAGE_LOST], "both are told"
+    finished = bench.of(m.RowFinished)[-1]
+    assert (finished.fault, finished.reason) == (PiFault.EDGE_LOST, "2 edges lost")
+    bench.machine.home()
+    assert bench.machine.fault == 0
+
+
+ACTIONS = (
+    "home", "begin", "end run", "row", "hold", "resume", "abort", "edge", "status", "ok", "done", "stopped", "limit",
+    "banner", "lines gone", "edge lost", "stage lost", "time",
+)  # fmt: skip
+
+
+@settings(max_examples=300)
+@given(st.sampled_from(["cold", "homed", "in a row"]), st.lists(st.sampled_from(ACTIONS), max_size=40))
+def test_whatever_happens(start, actions):
+    """Any order of events: only moves of the table, the first fault is kept, rows end once, and only a row is armed."""
+    bench = Bench() if start == "cold" else Bench().homed()
+    machine = bench.machine
+    if start == "in a row":
+        bench.start()
+    states = [machine.state]
+    for action in actions:
+        before = machine.fault, machine.reason
+        cleared = False
+        try:
+            if action == "home":
+                machine.home()
+                bench.run_posted()
+                cleared = True
+            elif action == "begin" and machine.row is None:
+                machine.begin_run(100)
+            elif action == "end run" and machine.row is None:
+                machine.end_run()
+            elif action == "row" and machine.state == "ready":
+                bench.start()
+                cleared = True
+            elif action in ("hold", "resume"):
+                machine.hold(action == "hold")
+            elif action == "abort":
+                machine.abort("asked for")
+            elif action == "edge":
+                bench.edge()
+            elif action == "status":
+                bench.status(len(bench.of(m.Capture)))
+            elif action == "ok":
+                bench.stage_says(Reply("ok", bench.stage.number))
+            elif action == "done":
+                bench.stage_says(Reply("done", bench.stage.number, fields={"points": "3"}))
+            elif action in ("stopped", "limit"):
+                number = StageError.STOPPED if action == "stopped" else StageError.LIMIT_SWITCH
+                bench.stage_says(Reply("alarm", number=number))
+            elif action == "banner":
+                bench.stage_says(Reply("banner"))
+            elif action == "lines gone":
+                machine.take_loop_fault(LoopFault(None, PiFault.TRIGGER_LINE_LOST, "gone"))
+            elif action == "edge lost" and machine.row is not None:
+                machine.take_loop_fault(LoopFault(machine.row.job, PiFault.EDGE_LOST, "lost"))
+            elif action == "stage lost":
+                machine.fail(PiFault.STAGE_LOST, "silent")
+            elif action == "time":
+                bench.later(0.45)
+        except RefusedError:
+            continue
+        bench.run_posted()
+        states.append(machine.state)
+        if before[0] and not cleared:
+            assert (machine.fault, machine.reason) == before, "the first fault wins"
+        assert bench.armed <= (machine.row is not None), "nothing answers an edge without a row"
+        if machine.state in ("idle", "homing", "homed", "ready", "fault") and machine.row is None:
+            assert not bench.armed
+        assert (machine.row is not None) == (len(bench.of(m.RowStarted)) == len(bench.of(m.RowFinished)) + 1)
+    assert set(states) <= set(MOVES)

@@ -1,0 +1,126 @@
+"""The serial link against a pty."""
+
+import queue
+
+import pytest
+from fake_stage import FakeStage
+
+from pi_controller.bringup import bench_stage
+from pi_controller.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
+from shared.faults import StageError
+from shared.stage_line import Command, Immediate, Reply
+
+
+@pytest.fixture
+def dry_stage():
+    stage = FakeStage(None)
+    yield stage
+    stage.close()
+
+
+def connect(stage, **options):
+    news = queue.SimpleQueue()
+    return StageLink(stage.port, 115200, news.put, **options), news
+
+
+def test_the_banner_is_awaited_and_greeted(dry_stage):
+    link, _ = connect(dry_stage)
+    assert link.firmware == "fake"
+    assert [c.verb for c in dry_stage.seen] == ["HELLO"]
+    link.close()
+
+
+def test_a_stage_without_banner_is_greeted_after_the_limit(dry_stage):
+    dry_stage.banner = False
+    link, _ = connect(dry_stage, banner_limit_s=0.05)
+    assert link.request("SET", 1, 500).kind == "ok"
+    link.close()
+
+
+def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage):
+    link, _ = connect(dry_stage)
+    dry_stage.damage = 1
+    link.request("SET", 1, 500)
+    dry_stage.lose = 1
+    link.request("SET", 2, 20)
+    assert [(c.sequence, c.verb) for c in dry_stage.seen] == [(0, "HELLO"), (1, "SET"), (2, "SET")]
+    link.close()
+
+
+def test_refusals_carry_the_table(dry_stage):
+    link, _ = connect(dry_stage)
+    with pytest.raises(StageRefusedError, match="does not know where it is") as e:
+        link.request("MOVE", 1, 2, 3)
+    assert e.value.number == StageError.NOT_HOMED
+    assert e.value.remedy
+    link.close()
+
+
+def test_numbers_wrap(dry_stage):
+    link, _ = connect(dry_stage)
+    link._sequence = 65535
+    assert link.request("SET", 1, 500).sequence == 65535
+    assert link.request("SET", 1, 500).sequence == 0
+    link.close()
+
+
+def test_answers_are_told_apart_from_what_comes_by_itself(dry_stage):
+    link, news = connect(dry_stage)
+    dry_stage.say_raw(b"\x00garbage\n" + b"x" * 500 + b"\n")
+    dry_stage.say(Reply("alarm", number=12))
+    link.request("SET", 1, 500)
+    link.send_byte(Immediate.STATUS)
+    kinds = [news.get(timeout=5).kind for _ in range(3)]
+    assert sorted(kinds) == ["alarm", "ok", "status"]
+    assert link.bad_lines == 2
+    link.close()
+
+
+def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage):
+    link, news = connect(dry_stage, silence_s=0.1)
+    link.ask_status_every(0.02)
+    assert news.get(timeout=5).kind == "status"
+    dry_stage.deaf = True
+    while not isinstance(lost := news.get(timeout=5), StageLost):
+        pass
+    assert "silent" in lost.reason
+    with pytest.raises(StageLostError):
+        link.request("SET", 1, 500)
+    link.close()
+
+
+def test_a_pulled_cable_is_a_lost_stage(dry_stage):
+    link, news = connect(dry_stage)
+    dry_stage.unplug()
+    assert isinstance(news.get(timeout=5), StageLost)
+    with pytest.raises(StageLostError):
+        link.send_byte(Immediate.STOP)
+    link.close()
+
+
+def test_no_port_and_another_protocol(tmp_path, dry_stage, monkeypatch):
+    with pytest.raises(StageLostError, match="cannot be opened"):
+        StageLink(str(tmp_path / "none"), 115200, lambda _: None)
+    monkeypatch.setattr("pi_controller.stage_link.PROTOCOL_VERSION", 9)
+    with pytest.raises(StageLostError, match="speaks protocol 1, this program speaks 9"):
+        connect(dry_stage)
+
+
+def test_other_steps_per_mm_are_refused_before_anything_moves(dry_stage, instrument):
+    dry_stage.steps = "160"
+    with (
+        pytest.raises(StageLostError, match="160 steps per mm, the rig file says 200"),
+        bench_stage(instrument.stage, dry_stage.port),
+    ):
+        pass
+    assert [c.verb for c in dry_stage.seen] == ["HELLO"]
+
+
+def test_jog_and_home_by_hand(dry_stage, instrument):
+    with bench_stage(instrument.stage, dry_stage.port) as stage:
+        with pytest.raises(StageRefusedError):
+            stage.jog(1, 1, 20)
+        assert stage.home() == (0.0, 0.0)
+        assert stage.jog(10, 5.5, 20) == (10.0, 5.5)
+        assert stage.jog(-1, 0, 20) == (9.0, 5.5)
+    assert dry_stage.seen[-1] == Command(dry_stage.seen[-1].sequence, "MOVE", (1800, 1100, 4000))

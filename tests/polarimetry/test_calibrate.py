@@ -1,0 +1,172 @@
+"""Laws of calibration: metal is 1, common gains and phases do not matter, set leakage and gain are recovered."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.polarimetry import (
+    axial_ratio_from_known,
+    calibrate,
+    calibrate_by_reference,
+    correct_leakage,
+    effective_incidence_map,
+    fresnel,
+    incidence_map,
+    multilook_ratio,
+    smooth,
+    specular_incidence_rad,
+)
+from shared.config import load_instrument
+from shared.errors import DataError, PolysightError
+from shared.geometry import incidence_deg, specular_midpoint_m
+
+ROOT = Path(__file__).resolve().parents[2]
+THETA = np.radians(55.0)
+SHAPE = (40, 60)
+METAL = np.zeros(SHAPE, bool)
+METAL[10:30, 5:25] = True
+PLATE = np.zeros(SHAPE, bool)
+PLATE[10:30, 35:55] = True
+complex_gain = st.tuples(st.floats(0.2, 5.0), st.floats(-3.1, 3.1)).map(lambda g: g[0] * np.exp(1j * g[1]))
+leak = st.tuples(st.floats(0.0, 0.12), st.floats(-3.1, 3.1)).map(lambda g: g[0] * np.exp(1j * g[1]))
+
+
+def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
+    """H and V of a metal and a dielectric plate with gains, leakage, a common phase per pixel and noise."""
+    r_s = np.zeros(SHAPE, complex)
+    r_p = np.zeros(SHAPE, complex)
+    r_s[METAL], r_p[METAL] = fresnel(np.inf, THETA)
+    r_s[PLATE], r_p[PLATE] = fresnel(eps, THETA)
+    rng = np.random.default_rng(1)
+    h, v = gain_h * (r_s + a * r_p), gain_v * (r_p + b * r_s)
+    if common is not None:
+        h, v = h * common, v * common
+    n = rng.standard_normal((4, *SHAPE)) * noise / np.sqrt(2)
+    return h + n[0] + 1j * n[1], v + n[2] + 1j * n[3]
+
+
+@given(complex_gain, complex_gain)
+def test_metal_is_one_and_gain_is_recovered(gain_h, gain_v):
+    h, v = channels(4 - 0.4j, gain_h, gain_v)
+    out = calibrate(h, v, METAL)
+    np.testing.assert_allclose(out.p[METAL], 1, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(out.h[METAL]), 1, rtol=1e-9)
+    assert out.metal_h / out.metal_v == pytest.approx(gain_h / gain_v, rel=1e-9)
+    r_s, r_p = fresnel(4 - 0.4j, THETA)
+    np.testing.assert_allclose(out.p[PLATE], r_s / r_p, rtol=1e-9)
+
+
+def test_metal_is_one_within_noise():
+    h, v = channels(4 - 0.4j, 2.0j, 0.7, noise=0.02)
+    p = calibrate(h, v, METAL).p[METAL]
+    assert abs(p.mean() - 1) < 0.005
+    assert np.abs(p - 1).max() < 0.02 / 0.7 * 6
+
+
+@given(complex_gain, st.floats(-200, 200), st.floats(-200, 200))
+def test_common_gain_and_distance_phase_do_not_change_p(gain, tilt_x, tilt_y):
+    h, v = channels(3.78 - 0.7j, 1.3j, 0.8)
+    reference = calibrate(h, v, METAL).p
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 100
+    common = gain * np.exp(1j * (tilt_x * x + tilt_y * y))
+    moved = calibrate(h * common, v * common, METAL).p
+    inside = METAL | PLATE
+    np.testing.assert_allclose(moved[inside], reference[inside], rtol=1e-9)
+
+
+@given(leak, leak, complex_gain, complex_gain)
+def test_set_leakage_is_removed(a, b, gain_h, gain_v):
+    h, v = channels(4.69 - 0.7j, gain_h, gain_v, a, b)
+    out = calibrate(h, v, METAL)
+    s, p = correct_leakage(out.h, out.v, a, b)
+    r_s, r_p = fresnel(4.69 - 0.7j, THETA)
+    np.testing.assert_allclose(s[PLATE] / p[PLATE], r_s / r_p, rtol=1e-9)
+    np.testing.assert_allclose(s[METAL] / p[METAL], 1, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(s[PLATE]), abs(r_s), rtol=1e-9)
+
+
+@given(st.floats(0.005, 0.12))
+def test_axial_ratio_is_recovered_from_a_known_plate(a):
+    h, v = channels(4.0 - 0.4j, 1.2, 0.9j, a, a)
+    p = calibrate(h, v, METAL).p
+    r_s, r_p = fresnel(4.0 - 0.4j, THETA)
+    assert axial_ratio_from_known(complex(p[PLATE].mean()), complex(r_s / r_p)) == pytest.approx(a, abs=1e-9)
+
+
+def test_metal_alone_cannot_tell_leakage_from_gain():
+    """Two rigs that differ in leakage look the same on metal: what makes a given leakage value necessary."""
+    h1, _ = channels(4.0, 1.1, 1.0, 0.1, 0.0)
+    h2, _ = channels(4.0, 1.1 * 1.1, 1.0, 0.0, 0.0)
+    np.testing.assert_allclose(h1[METAL], h2[METAL])
+    assert abs(h1[PLATE][0] - h2[PLATE][0]) > 0.01
+    with pytest.raises(PolysightError):
+        axial_ratio_from_known(1.0, 1.0)
+
+
+def test_reference_over_the_whole_plane_removes_uneven_illumination():
+    h, v = channels(4 - 0.4j)
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 40
+    light_h, light_v = (1 + 0.3 * x) * np.exp(2j * y), (1.2 - 0.2 * y) * np.exp(1j * x)
+    out = calibrate_by_reference(h * light_h, v * light_v, -light_h, -light_v)
+    r_s, r_p = fresnel(4 - 0.4j, THETA)
+    np.testing.assert_allclose(out.p[PLATE], r_s / r_p, rtol=1e-9)
+    np.testing.assert_allclose(out.p[METAL], 1, rtol=1e-9)
+
+
+def test_dark_or_empty_metal_regions_are_refused():
+    h, v = channels(4.0)
+    for mask in (np.zeros(SHAPE, bool), ~(METAL | PLATE)):
+        with pytest.raises(DataError, match="metal"):
+            calibrate(h, v, mask)
+    with pytest.raises(DataError, match="shape"):
+        calibrate(h, v, np.ones((2, 2), bool))
+
+
+def test_single_precision_stays_single():
+    h, v = (a.astype(np.complex64) for a in channels(4.0, noise=0.01))
+    out = calibrate(h, v, METAL)
+    assert out.h.dtype == out.v.dtype == out.p.dtype == np.complex64
+    assert correct_leakage(out.h, out.v, 0.05, 0.05)[0].dtype == np.complex64
+    assert smooth(out.h, 1.0).dtype == np.complex64
+
+
+def test_smoothing_keeps_constants_reduces_noise_and_respects_holes():
+    image = np.full(SHAPE, 2 - 1j)
+    np.testing.assert_allclose(smooth(image, 1.5), image)
+    rng = np.random.default_rng(2)
+    noise = rng.standard_normal(SHAPE) + 1j * rng.standard_normal(SHAPE)
+    assert smooth(noise, 2.0).std() < noise.std() / 5
+    image[3, 4] = np.nan
+    out = smooth(image, 1.5)
+    assert np.isnan(out[3, 4])
+    out[3, 4] = 2 - 1j
+    np.testing.assert_allclose(out, 2 - 1j)
+
+
+def test_multilook_ratio_ignores_the_common_phase_and_noise_in_v():
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    h, v = channels(2.61 - 0.01j, common=np.exp(1j * (0.9 * x + 0.7 * y)), noise=0.03)
+    r_s, r_p = fresnel(2.61 - 0.01j, THETA)
+    estimate = multilook_ratio(h, v, 3.0)[20, 45]
+    assert abs(1 / estimate - r_p / r_s) < 0.03
+
+
+def test_incidence_is_that_of_the_specular_midpoint():
+    rig = load_instrument(ROOT / "instrument.toml")
+    assert np.degrees(specular_incidence_rad(rig)) == pytest.approx(
+        np.mean([incidence_deg(rig, b) for b in rig.receivers]), abs=0.02
+    )
+    mx, my, _ = specular_midpoint_m(rig, rig.receivers[0])
+    x, y = mx + np.linspace(-0.15, 0.15, 7), my + np.linspace(-0.15, 0.15, 5)
+    flat = incidence_map(rig, x, y)
+    assert flat.shape == (5, 7)
+    assert np.ptp(flat) == 0
+    effective = effective_incidence_map(rig, x, y)
+    assert effective.shape == (5, 7)
+    # Half of the Fresnel zone is some 70 mm wide in x: the weighted angle is less by hundredths of a degree.
+    assert -0.15 < np.degrees(effective - flat)[2, 3] < 0
+    outside = effective_incidence_map(rig, np.array([mx + 2.0]), np.array([my]))
+    assert outside[0, 0] == pytest.approx(flat[0, 0], abs=1e-3)

@@ -1,0 +1,217 @@
+"""A board's states: each one entered only on what the radar said, each fatal event a fault with its reason."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from host.radar.board import TRANSITIONS, RadarBoard, State
+from host.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameControl
+from host.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
+from host.radar.program import program
+from shared.errors import DeviceError
+from simulators import radar_board as simulated
+from simulators.radar_board import Fault
+
+FRAMES = 32
+PERIOD_S = 1.5e-3
+
+
+@pytest.fixture
+def radar(rig, words, clock) -> RadarBoard:
+    return RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")))
+
+
+def pulses(board: simulated.RadarBoard, clock, count: int, period_s: float = PERIOD_S) -> None:
+    for _ in range(count):
+        board.trigger()
+        clock.sleep(period_s)
+
+
+def test_from_off_to_done(radar, board, clock):
+    assert radar.state is State.OFF
+    radar.configure()
+    assert radar.state is State.CONFIGURED
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
+    radar.pulses_begin()
+    assert radar.state is State.RUNNING
+    pulses(board, clock, FRAMES - 1)
+    assert radar.poll() is State.RUNNING
+    pulses(board, clock, 1)
+    assert radar.poll() is State.DONE
+
+
+def test_every_step_is_told_in_order_and_once(radar, board):
+    radar.configure()
+    radar.arm(FRAMES)
+    expected = [0x404C, 0x4000, 0x0220, 0x40E0, 0x0080, 0x0082, 0x02CC, 0x4041, 0x0083, 0x008D, 0x0086, 0x00C0]
+    expected += [0x0100, 0x0101, 0x4042, 0x4044, 0x0085, 0x4043, 0x4045, 0x02EA, 0x0102, 0x40C0, 0x0140]
+    assert board.executed == expected
+    start = struct.unpack_from("<I", board.settings[0x0100], 4)[0]
+    slope = struct.unpack_from("<h", board.settings[0x0100], 28)[0]
+    assert (start, slope) == (1416929098, 804)
+    assert struct.unpack_from("<H", board.settings[0x0102], 8)[0] == FRAMES
+
+
+def test_only_the_transmitter_transmits(rig):
+    for at in rig.boards:
+        made = program(rig, at)
+        masks = [c.tx for c in (*made.basic, *made.waveform) if hasattr(c, "tx")]
+        assert masks == ([0b010] * 2 if at.role == "transmit" else [0, 0])
+
+
+def test_armed_only_when_the_radar_says_so(radar, monkeypatch):
+    radar.configure()
+    monkeypatch.setattr(simulated, "READY_S", 1e9)
+    with pytest.raises(DeviceError, match="0x100B"):
+        radar.arm(FRAMES)
+    assert radar.state is State.FAULT
+    assert "0x100B" in radar.reason
+
+
+def test_a_missed_pulse_leaves_it_waiting(radar, board, clock):
+    radar.arm(FRAMES)
+    pulses(board, clock, FRAMES - 1)
+    clock.sleep(10.0)
+    assert radar.poll() is State.ARMED
+
+
+def test_frames_left_over_are_stopped_before_it_is_armed_anew(radar, board, clock):
+    radar.arm(FRAMES)
+    pulses(board, clock, 3)
+    radar.arm(FRAMES)
+    pulses(board, clock, FRAMES - 1)
+    assert radar.poll() is State.ARMED
+    pulses(board, clock, 1)
+    assert radar.poll() is State.DONE
+
+
+def test_a_stop_never_falls_into_a_frame(radar, board, clock):
+    radar.arm(FRAMES)
+    for n in range(5):
+        board.trigger()
+        clock.sleep(n * 3e-4)
+        radar.arm(FRAMES)
+        assert radar.state is State.ARMED
+
+
+def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, clock):
+    for frames in (FRAMES, FRAMES, 16):
+        radar.arm(frames)
+        pulses(board, clock, frames)
+        assert radar.poll() is State.DONE
+    assert board.executed.count(Frame.ID) == board.executed.count(FrameApply.ID) == 2
+    assert board.executed.count(FrameControl.ID) == 3
+
+
+@pytest.mark.parametrize(
+    ("number", "data", "words_of_it"),
+    [
+        (RF_CPU_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), "not triggered by a pulse, firmware line 4711"),
+        (RF_CPU_FAULT, struct.pack("<BBH", 2, 0, 0) + bytes(28), "data access abort"),
+        (RF_ESM_FAULT, struct.pack("<II", 0, 1), "group 2 0x00000001"),
+        (RF_ESM_FAULT, struct.pack("<II", 1 << 25, 0), "group 1 0x02000000"),
+        (ANALOG_FAULT, struct.pack("<BBHII", 1, 0, 0, 0b1010, 0), "1.3 V / 1.0 V RF supply, PA LDO shorted"),
+        (MAIN_CPU_FAULT, struct.pack("<BBH", 4, 0, 0) + bytes(28), "chirp error"),
+        (RF_ERROR, struct.pack("<II", 2, 0), "RF firmware abort"),
+    ],
+)
+@pytest.mark.parametrize("running", [False, True])
+def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, words_of_it, running):
+    radar.arm(FRAMES)
+    if running:
+        radar.pulses_begin()
+    board.say(number, data)
+    assert radar.poll() is State.FAULT
+    assert words_of_it in radar.reason
+
+
+@pytest.mark.parametrize(
+    ("number", "data"),
+    [
+        (RF_ESM_FAULT, struct.pack("<II", 1, 0)),
+        (RF_ERROR, struct.pack("<II", 7, 0)),
+        (0x1012, bytes(20)),
+        (0x1234, b""),
+    ],
+)
+def test_other_events_are_not(radar, board, number, data):
+    radar.arm(FRAMES)
+    board.say(number, data)
+    assert radar.poll() is State.ARMED
+
+
+def test_an_early_pulse_is_fatal_and_the_next_arming_resets_the_board(radar, board, clock):
+    radar.arm(FRAMES)
+    pulses(board, clock, 2, 1e-4)
+    assert radar.poll() is State.FAULT
+    assert "not triggered" in radar.reason
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
+    assert radar.reason == ""
+    assert board.executed.count(RF_POWER_UP.ID) == 2
+    pulses(board, clock, FRAMES)
+    assert radar.poll() is State.DONE
+
+
+def test_unplugged_is_a_fault_and_plugged_in_again_recovers(radar, board):
+    radar.arm(FRAMES)
+    board.plugged = False
+    assert radar.poll() is State.FAULT
+    assert "unplugged" in radar.reason
+    with pytest.raises(DeviceError, match="unplugged"):
+        radar.arm(FRAMES)
+    board.plugged = True
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
+
+
+def test_without_firmware_it_is_refused_and_with_it_written_it_runs(radar, board):
+    board.patch = False
+    with pytest.raises(DeviceError, match="no patch"):
+        radar.configure()
+    assert radar.state is State.FAULT
+    radar.configure(on_power=lambda: radar.download(bytes(range(256)) * 4))
+    assert radar.state is State.CONFIGURED
+
+
+def test_a_refused_setting_is_a_fault_that_names_it(radar, board):
+    board.inject(Fault.REFUSE)
+    with pytest.raises(DeviceError, match="DeviceConfiguration"):
+        radar.configure()
+    assert "refuses DeviceConfiguration" in radar.reason
+
+
+def test_a_board_that_stays_silent_is_named(radar, board):
+    board.destroyed = True
+    with pytest.raises(DeviceError, match="LS: the radar did not report 0x5000"):
+        radar.configure()
+
+
+def test_the_report_holds_versions_temperatures_calibration_and_every_byte_sent(radar):
+    radar.configure()
+    radar.arm(FRAMES)
+    told = radar.report()
+    assert told["rf_firmware"] == told["main_firmware"] == "2.2.3.1 patch 2.1.1.1"
+    assert told["temperatures_c"]["tx2"] == 46
+    assert told["calibration"]["temperature_c"] == 41
+    assert told["sent"][0].startswith("78566587")
+    assert told["sent"][1] == "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"
+    assert any("ready for triggers" in line for line in told["events"])
+    assert radar.report()["sent"] == []
+
+
+def test_closing_stops_what_waits(radar, board, words):
+    radar.arm(FRAMES)
+    radar.close()
+    radar.close()
+    assert words.closed
+    assert not board.ready_for_triggers
+
+
+def test_states_without_a_way_out_are_none():
+    assert set(TRANSITIONS) == set(State)
+    assert all(TRANSITIONS.values())
+    assert [s for s in State if State.ARMED in TRANSITIONS[s]] == [State.CONFIGURED, State.DONE]

@@ -1,0 +1,152 @@
+"""Sub-blocks as bytes: what another encoder made of the same parameters, codes, and fields that do not fit."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.radar.commands import (
+    GET_MAIN_VERSION,
+    GET_RF_VERSION,
+    GET_TEMPERATURES,
+    RF_INIT,
+    RF_POWER_UP,
+    SLOPE_HZ_PER_S_PER_CODE,
+    START,
+    START_HZ_PER_CODE,
+    STOP_AT_FRAME_END,
+    STOP_WHILE_WAITING,
+    AdcOutput,
+    ApllBandwidth,
+    Channels,
+    Chirp,
+    Command,
+    DataFormat,
+    DataPath,
+    DataPathClock,
+    DeviceConfiguration,
+    Frame,
+    FrameApply,
+    FrameControl,
+    HsiClock,
+    LaneEnable,
+    LdoBypass,
+    LowPower,
+    LvdsLanes,
+    Profile,
+    RfDevice,
+    slope_code,
+    start_code,
+)
+from host.radar.firmware import file_chunks
+from host.radar.messages import command, decode, encode
+
+PUBLISHED = Profile(76.01e9, 38.816929e12, 100.0, 7.0, 128.5, 256, 2.15e6, 175.0, 350.0, 30, 30)
+OTHER = Profile(76.01087e9, 38.816929e12, 100.0, 6.5, 128.5, 512, 5e6, 350.0, 2800.0, 40, 36, 3)
+# What TI's mmWaveLink library writes to its SPI driver for these parameters (run beside this project).
+VECTORS: list[tuple[Command, str]] = [
+    (DeviceConfiguration(), "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"),
+    (RF_POWER_UP, "3412214305801400001400000100e56b00400400f1e663c9"),
+    (Channels(tx=0b010), "3412214301011c00002400000100e1da80000c000f0002000000200063bd8fee"),
+    (AdcOutput("complex1x"), "3412214301011c00003400000100e1ca82000c000200010000000000f1fde42d"),
+    (AdcOutput("complex2x"), "3412214301011c00004400000100e1ba82000c000200020000000000ed524a69"),
+    (LdoBypass(), "341221438105180000540000010065a6cc0208000000000019a7ce6f"),
+    (LdoBypass(bypass=True), "34122143810518000064000001006596cc020800010000007fa1e435"),
+    (DataFormat(), "3412214385802000007400000100590b414010000f0002000100000000000000cc565a60"),
+    (LowPower(), "3412214301011800008400000100e57a83000800000000001a845d5e"),
+    (ApllBandwidth(), "3412214301012400009400000100d96a8d001400010826090000000000000000000000000a1a13dd"),
+    (RfDevice(), "341221430101200000a400000100dd5a86001000050000000000000001000000e20bc2f4"),
+    (RF_INIT, "341221438101140000b400000100694ac00004004867aad4"),
+    (
+        PUBLISHED,
+        "341221430102400000c400000100bd3900013000000000004a9f745410270000bc0200003232000000000000000000002403000000016608000000001e0000004e5a5104",
+    ),
+    (
+        OTHER,
+        "341221430102400000d400000100bd290001300000000000a4de7454102700008a020000323200000303030000000000240300000002881302030000a800000045fc8d4f",
+    ),
+    (Chirp(tx=0b010), "341221430102280000e400000100d519010118000000000000000000000000000000000000000200aa998d3b"),
+    (DataPath(), "3412214385801c0000f4000001005c8b42400c00010100020000000046a469ae"),
+    (DataPathClock(), "3412214385801800000400000100617b4440080001010000e10cb60d"),
+    (HsiClock(), "3412214301011800001400000100e5ea8500080009000000ddef4a25"),
+    (LaneEnable(), "3412214385801800002400000100615b434008000f000000c1a45aec"),
+    (LvdsLanes(), "3412214385801800003400000100614b45400800000001006f51ef83"),
+    (
+        Frame(frames=5600, period_us=1300.0, samples=256),
+        "3412214301022c00004400000100d1b902011c000000000000000100e0150002a0f703000200000000000000c512bb5b",
+    ),
+    (FrameApply(samples=256), "3412214385811c000054000001005d2ac0400c00010000000002000002cbcd89"),
+    (
+        Frame(frames=350, period_us=10000.0, samples=256, loops=16, trigger_delay_us=2.0),
+        "3412214301022c00006400000100d19902011c0000000000000010005e01000280841e000200000090010000b0a60481",
+    ),
+    (FrameApply(samples=256, chirps=16), "3412214385811c000074000001005d0ac0400c00100000000002000056c726ac"),
+    (FrameControl(START), "3412214381021800008400000100657940010800010000005e5b90a3"),
+    (FrameControl(STOP_AT_FRAME_END), "34122143810218000094000001006569400108000000000005e18ef3"),
+    (FrameControl(STOP_WHILE_WAITING), "341221438102180000a4000001006559400108000400000051177a9e"),
+    (GET_RF_VERSION, "341221434104140000b400000100a947200204009e8d2da9"),
+    (GET_MAIN_VERSION, "34122143c581140000c40000010024bae04004006c141ab5"),
+    (GET_TEMPERATURES, "34122143c105140000d4000001002926ea020400fd69edbf"),
+]
+
+
+@pytest.mark.parametrize(
+    ("sent", "expected"), VECTORS, ids=lambda v: type(v).__name__ if isinstance(v, Command) else ""
+)
+def test_bytes_are_those_of_the_reference_encoder(sent: Command, expected: str):
+    sequence = bytes.fromhex(expected)[9] >> 4
+    assert encode(command((sent.block(),), sequence=sequence)).hex() == expected
+    assert decode(bytes.fromhex(expected)).blocks == (sent.block(),)
+
+
+def test_parts_of_an_image_are_those_of_the_reference_encoder():
+    """The same image of 1000 bytes, in the reference's messages: the first (by its digest) and the last."""
+    image = bytes(range(8, 232)) + bytes(1000 - 224 - 80) + bytes(200 - n for n in range(80))
+    parts = file_chunks(image)
+    first, last = (
+        encode(command((chunk.block(),), sequence=sequence, remaining=remaining))
+        for (chunk, remaining), sequence in ((parts[0], 14), (parts[-1], 15))
+    )
+    assert hashlib.sha256(first).hexdigest() == "24b45224df911dc384cd26e20ed5b00c5316b83765837a66500c679835f06942"
+    assert last.hex() == (
+        "341221430581640000f400000100948a80405400c8c7c6c5c4c3c2c1c0bfbebdbcbbbab9b8b7b6b5b4b3b2b1b0afaead"
+        "acabaaa9a8a7a6a5a4a3a2a1a09f9e9d9c9b9a999897969594939291908f8e8d8c8b8a898887868584838281807f7e7d"
+        "7c7b7a79d72b66b3"
+    )
+
+
+def test_codes_of_the_published_chirp():
+    assert start_code(76.01e9) == 1416929098
+    assert slope_code(38.816929e12) == 804
+
+
+@given(st.integers(0x5471C71C, 0x5A000000), st.integers(-5510, 5510))
+def test_codes_are_the_nearest(start: int, slope: int):
+    assert start_code(start * START_HZ_PER_CODE) == start
+    assert slope_code(slope * SLOPE_HZ_PER_S_PER_CODE) == slope
+    assert start_code((start + 0.49) * START_HZ_PER_CODE) == start
+
+
+@given(st.integers(0, 65535), st.floats(300.0, 1.342e6), st.integers(1, 255))
+def test_frames_come_back_from_their_bytes(frames: int, period_us: float, loops: int):
+    data = Frame(frames, period_us, 256, loops).data()
+    assert len(data) == 24
+    fields = struct.unpack("<6HIHHI", data)
+    assert (fields[3], fields[4], fields[7]) == (loops, frames, 2)
+    assert fields[6] * 0.005 == pytest.approx(period_us, abs=0.0026)
+
+
+def test_a_value_that_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match=r"Frame.*does not fit"):
+        Frame(70_000, 1300.0, 256).block()
+    with pytest.raises(ValueError, match="Chirp"):
+        Chirp(tx=-1).block()
+
+
+def test_every_number_is_of_the_message_it_travels_in():
+    for sent, expected in VECTORS:
+        assert decode(bytes.fromhex(expected)).message_id == sent.block().message_id

@@ -1,0 +1,86 @@
+"""Laws of a disturbed link: a command is obeyed once or not at all, and never as another one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from host.radar.board import RadarBoard, State
+from host.radar.commands import Chirp, LdoBypass, LowPower
+from host.radar.program import program
+from host.radar.spi import Link
+from shared.errors import DeviceError
+from simulators.radar_board import Fault
+from simulators.radar_board import RadarBoard as Simulated
+
+from .conftest import BoardWords, VirtualClock, native_rig
+
+RIG = native_rig()
+LOST = st.sampled_from([Fault.NACK, Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])
+HARMLESS = st.sampled_from([Fault.EVENT_BETWEEN, Fault.BAD_SYNC])
+FRAMES = 8
+
+
+class FlippingWords(BoardWords):
+    """Flips one bit of one word, counted over both directions."""
+
+    def __init__(self, board: Simulated, clock: VirtualClock, at: int, bit: int) -> None:
+        super().__init__(board, clock)
+        self.at, self.bit, self.count = at, bit, 0
+
+    def _flip(self, word: int) -> int:
+        self.count += 1
+        return word ^ (1 << self.bit if self.count - 1 == self.at else 0)
+
+    def write(self, words: Sequence[int]) -> None:
+        super().write([self._flip(w) for w in words])
+
+    def read(self, count: int) -> list[int]:
+        return [self._flip(w) for w in super().read(count)]
+
+
+def _faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
+    lost = st.lists(LOST, max_size=2)
+    return st.one_of(lost, st.tuples(lost, HARMLESS).map(lambda t: [*t[0], t[1]]))
+
+
+@settings(deadline=None)
+@given(st.lists(_faults_of_one_command(), min_size=1, max_size=8))
+def test_whatever_is_lost_every_command_is_obeyed_in_order_and_once(faults_of_each: list[list[Fault]]):
+    """Twice only where the answer was lost and its repetition was then heard damaged: a NACK asks for a new number."""
+    clock = VirtualClock()
+    board = Simulated(lambda: clock.time)
+    radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")))
+    radar.configure()
+    board.executed.clear()
+    link: Link = radar._link
+    told = []
+    for n, faults in enumerate(faults_of_each):
+        sent = (LowPower(), LdoBypass(), Chirp(0))[n % 3]
+        board.inject(*faults)
+        link.call(sent)
+        unheard = (Fault.NACK, Fault.NO_ANSWER)
+        twice = len(faults) > 1 and faults[0] not in unheard and faults[1] is Fault.NACK
+        told += [sent.ID] * (2 if twice else 1)
+    assert board.executed == told
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 900), st.integers(0, 15))
+@example(0, 0)
+@example(7, 3)
+def test_a_flipped_bit_anywhere_never_makes_another_setting(at: int, bit: int):
+    clock = VirtualClock()
+    clean_board, board = Simulated(lambda: clock.time), Simulated(lambda: clock.time)
+    clean = RadarBoard("LS", BoardWords(clean_board, clock), clock, program(RIG, RIG.by_name("LS")))
+    clean.arm(FRAMES)
+    radar = RadarBoard("LS", FlippingWords(board, clock, at, bit), clock, program(RIG, RIG.by_name("LS")))
+    try:
+        radar.arm(FRAMES)
+    except DeviceError:
+        assert radar.state is State.FAULT
+        radar.arm(FRAMES)  # nothing flips any more
+    assert radar.state is State.ARMED
+    assert board.settings == clean_board.settings

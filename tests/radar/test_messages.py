@@ -1,0 +1,122 @@
+"""mmWaveLink messages: round trip, every flipped bit noticed, the published vectors."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.radar.messages import (
+    DEVICE_SYNC,
+    HEADER_BYTES,
+    Direction,
+    Kind,
+    Message,
+    SubBlock,
+    checksum,
+    command,
+    crc,
+    decode,
+    decode_header,
+    encode,
+)
+from shared.errors import ProtocolError
+
+START = "341221438102180000340000010065c94001080001000000a9cad469"
+STOP = "341221438102180000440000010065b94001080004000000e223f5a8"
+
+
+@st.composite
+def message(draw) -> Message:
+    ident = draw(st.integers(0, 1023))
+    numbers = st.integers(0, 31).map(lambda n: ident * 32 + n)
+    sizes = st.binary(max_size=40).filter(lambda b: len(b) % 4 == 0)
+    blocks = draw(st.lists(st.builds(SubBlock, numbers, sizes), max_size=5))
+    return Message(
+        draw(st.sampled_from(Direction)),
+        draw(st.sampled_from(Kind)),
+        ident,
+        tuple(blocks),
+        draw(st.integers(0, 15)),
+        draw(st.booleans()),
+        draw(st.integers(0, 0xFFFF)),
+    )
+
+
+@given(message())
+def test_round_trip(original: Message):
+    raw = encode(original)
+    assert len(raw) % 4 == 0
+    assert decode(raw) == original
+    assert decode_header(raw).length == len(raw) - 4
+
+
+@given(message(), st.data())
+def test_any_flipped_bit_is_noticed(original: Message, data):
+    raw = bytearray(encode(original))
+    bit = data.draw(st.integers(0, 8 * len(raw) - 1))
+    raw[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(ProtocolError):
+        decode(bytes(raw))
+
+
+def test_every_flipped_bit_of_the_published_start_is_noticed():
+    for bit in range(8 * len(bytes.fromhex(START))):
+        raw = bytearray.fromhex(START)
+        raw[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(ProtocolError):
+            decode(bytes(raw))
+
+
+@given(st.binary(max_size=300))
+def test_noise_is_refused_and_never_something_else(noise: bytes):
+    with pytest.raises(ProtocolError):
+        decode(DEVICE_SYNC + noise[: len(noise) // 2] + b"\0")
+
+
+@pytest.mark.parametrize(("sequence", "what", "expected"), [(3, 1, START), (4, 4, STOP)])
+def test_published_vectors(sequence: int, what: int, expected: str):
+    raw = encode(command((SubBlock(0x0140, struct.pack("<HH", what, 0)),), sequence=sequence))
+    assert raw.hex() == expected
+
+
+def test_checksum_of_the_control_document():
+    """Its table 2.6."""
+    words = struct.pack("<5H", 0x0281, 0x0800, 0x040C, 0x0000, 0x0001)
+    assert checksum(words) == 0xF171
+
+
+@given(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=8), st.randoms())
+def test_checksum_does_not_depend_on_the_order_of_words(words: list[int], random):
+    mixed = list(words)
+    random.shuffle(mixed)
+    assert checksum(struct.pack(f"<{len(words)}H", *words)) == checksum(struct.pack(f"<{len(words)}H", *mixed))
+
+
+def test_an_event_with_a_16_bit_crc_is_read():
+    """The first event after power-up; its CRC-16 is CCITT-FALSE, whose check value is 0x29B1."""
+    assert crc(b"123456789", 2) == bytes.fromhex("b129")
+    block = struct.pack("<HHIQQ", 0x5000, 24, 7, 0, 0)
+    head = struct.pack("<5H", Direction.MAIN_TO_HOST | Kind.EVENT << 4 | 0x280 << 6, 12 + len(block) + 2, 0, 0, 1)
+    head += checksum(head).to_bytes(2, "little")
+    raw = DEVICE_SYNC + head + block + crc(head + block, 2)
+    assert len(head) == HEADER_BYTES
+    assert decode(raw).blocks[0].id == 0x5000
+    assert decode_header(raw).crc_bytes == 2
+
+
+def test_error_of_a_response():
+    refused = Message(Direction.RF_TO_HOST, Kind.RESPONSE, 8, (SubBlock(0, struct.pack("<HH", 80, 0x0102)),))
+    assert decode(encode(refused)).error == (80, 0x0102)
+    assert command((SubBlock(0x0102),)).error is None
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match="at most 256"):
+        encode(command((SubBlock(0x4080, bytes(240)),)))
+    with pytest.raises(ValueError, match="one message id"):
+        command((SubBlock(0x0100), SubBlock(0x4040)))
+    with pytest.raises(ValueError, match="sequence 16"):
+        encode(command((SubBlock(0x0100),), sequence=16))

@@ -1,0 +1,107 @@
+"""The byte stream for the FT4232H, and a board behind it."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.radar.board import RadarBoard, State
+from host.radar.mpsse import UsbWords, read_words, set_up_spi, write_words
+from host.radar.program import program
+from shared.errors import DeviceError
+from simulators import radar_board as simulated
+from simulators.radar_usb import UsbChip
+
+
+@pytest.fixture
+def chip(board) -> UsbChip:
+    return UsbChip(board)
+
+
+@pytest.fixture
+def usb(chip, clock) -> UsbWords:
+    return UsbWords(*(chip.channel(n) for n in "ABCD"), sleep=clock.sleep)
+
+
+def test_a_word_is_selected_swapped_and_deselected():
+    assert write_words([0x1234]).hex(" ") == "80 c0 4b 11 01 00 12 34 80 c8 4b 87"
+    assert read_words(1).hex(" ") == "80 c2 4b 20 01 00 80 c8 4b 87"
+
+
+def test_the_clock_is_10_mhz_and_rests_low(chip, usb):
+    assert chip.spi_hz == 10e6
+    assert set_up_spi().hex(" ") == "8a 97 8d 86 02 00 80 c8 4b 85"
+    assert chip.errors == []
+    usb.close()
+
+
+@given(st.lists(st.integers(0, 0xFFFF), max_size=130))
+def test_words_arrive_as_they_were_sent(words):
+    chip = UsbChip(simulated.RadarBoard(lambda: 0.0))
+    usb = UsbWords(*(chip.channel(n) for n in "ABCD"), sleep=float)
+    usb.write(words)
+    assert chip.words_written == words
+    assert chip.errors == []
+
+
+@given(st.lists(st.integers(0, 0xFFFF), max_size=20), st.data())
+def test_a_stream_may_be_cut_anywhere(words, data):
+    chip = UsbChip(simulated.RadarBoard(lambda: 0.0))
+    stream = write_words(words)
+    cut = data.draw(st.integers(0, len(stream)))
+    chip.take("A", stream[:cut])
+    chip.take("A", stream[cut:])
+    assert chip.words_written == words
+
+
+@pytest.mark.parametrize("byte", [0, 1, 3, 4, 8])
+def test_a_wrong_stream_is_noticed(chip, byte):
+    """The stand-in refuses what would not be this SPI: its silence above means something."""
+    stream = bytearray(write_words([0x1234, 0x5678]))
+    stream[byte] ^= 0x09
+    chip.take("A", bytes(stream))
+    assert chip.errors or chip.words_written != [0x1234, 0x5678]
+
+
+def test_two_words_under_one_chip_select_are_noticed(chip):
+    chip.take("A", bytes.fromhex("80c04b 1101001234 1101005678"))
+    assert "two words under one chip select" in chip.errors
+
+
+def test_a_board_runs_its_frames_behind_usb(rig, board, chip, usb, clock):
+    radar = RadarBoard("RH", usb, clock, program(rig, rig.by_name("RH")))
+    radar.configure()
+    radar.arm(4)
+    for _ in range(4):
+        board.trigger()
+        clock.sleep(1.5e-3)
+    assert radar.poll() is State.DONE
+    assert chip.errors == []
+    radar.close()
+
+
+def test_the_reset_is_released_in_functional_mode_only(board, chip):
+    chip.take("D", b"\x1c")
+    for pins in (0x80, 0xC0):
+        chip.take("C", bytes((pins,)))
+    assert not board.interrupt
+    assert board.executed == []
+
+
+def test_unplugged_in_a_row_is_a_fault(rig, board, usb, clock):
+    radar = RadarBoard("RH", usb, clock, program(rig, rig.by_name("RH")))
+    radar.arm(4)
+    board.plugged = False
+    assert radar.poll() is State.FAULT
+    assert "no such USB device" in radar.reason
+    with pytest.raises(DeviceError, match="no such USB device"):
+        radar.arm(4)
+
+
+def test_a_short_read_is_an_error(chip, usb, monkeypatch):
+    monkeypatch.setattr(chip, "give", lambda name, size: b"\0" * (size - 1))  # noqa: ARG005
+    with pytest.raises(DeviceError, match="3 of 4 bytes"):
+        usb.read(2)
+    with pytest.raises(DeviceError, match="USB"):
+        usb.interrupt()

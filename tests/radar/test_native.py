@@ -1,0 +1,165 @@
+"""All boards of a rig under native control: armed together, done together, and what the manifest keeps."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import pytest
+
+from host.radar.backends import radar_control
+from host.radar.interface import RadarState
+from host.radar.native import NativeRadars
+from host.store.manifest import decode_line, encode_line
+from shared.config import Instrument, NativeRadar, Radar, decode, to_builtins
+from shared.errors import ConfigError, DeviceError
+from simulators.radar_board import RadarBoard
+from simulators.radar_usb import UsbChip
+from tests.radar.conftest import BoardWords
+
+PERIOD_S = 1.5e-3
+FRAMES = 24
+
+
+class Boards:
+    """Simulated boards by USB serial number."""
+
+    def __init__(self, rig: Instrument, clock) -> None:
+        self.clock = clock
+        self.by_serial = {b.usb_serial: RadarBoard(lambda: clock.time) for b in rig.radar.native.values()}
+        self.words = {s: BoardWords(b, clock) for s, b in self.by_serial.items()}
+
+    def pulses(self, count: int, but: str = "") -> None:
+        for _ in range(count):
+            for serial, board in self.by_serial.items():
+                if serial != but:
+                    board.trigger()
+            self.clock.sleep(PERIOD_S)
+
+
+@pytest.fixture
+def boards(rig, clock) -> Boards:
+    return Boards(rig, clock)
+
+
+@pytest.fixture
+def radars(rig, boards, clock):
+    with NativeRadars(rig, boards.words.__getitem__, clock) as made:
+        yield made
+
+
+def test_each_board_is_bound_by_its_serial_number(rig, radars, boards):
+    assert radars.states() == {}
+    for board in rig.boards:
+        tx = boards.by_serial[f"FT{board.name}"].settings[0x0101][18]
+        assert tx == (0b010 if board.role == "transmit" else 0)
+
+
+def test_a_row_is_done_when_every_board_says_so(radars, boards):
+    radars.arm(FRAMES)
+    assert {s.state for s in radars.states().values()} == {RadarState.ARMED}
+    radars.row_begins()
+    boards.pulses(FRAMES - 1)
+    assert {s.state for s in radars.states().values()} == {RadarState.ARMED}
+    boards.pulses(1)
+    assert {n: s.state for n, s in radars.states().items()} == dict.fromkeys(("LS", "RH", "RV"), RadarState.DONE)
+
+
+def test_a_board_that_missed_a_pulse_still_waits(radars, boards):
+    radars.arm(FRAMES)
+    boards.pulses(1, but="FTRV")
+    boards.pulses(FRAMES - 1)
+    states = radars.states()
+    assert states["RH"].state is RadarState.DONE
+    assert states["RV"].state is RadarState.ARMED
+    assert radars.wait_done(3.0) == ["RV"]
+    radars.arm(FRAMES)
+    boards.pulses(FRAMES)
+    assert radars.wait_done(3.0) == []
+
+
+def test_a_fault_is_told_and_the_next_row_resets_that_board_alone(radars, boards):
+    radars.arm(FRAMES)
+    bad = boards.by_serial["FTRH"]
+    bad.trigger()
+    bad.trigger()
+    states = radars.states()
+    assert states["RH"].state is RadarState.FAULT
+    assert "not triggered by a pulse" in states["RH"].detail
+    assert states["RV"].state is RadarState.ARMED
+    radars.arm(FRAMES)
+    assert bad.executed.count(0x4000) == 2
+    assert boards.by_serial["FTRV"].executed.count(0x4000) == 1
+    boards.pulses(FRAMES)
+    assert {s.state for s in radars.states().values()} == {RadarState.DONE}
+
+
+def test_the_report_fits_the_manifest_and_is_told_once(radars):
+    radars.arm(FRAMES)
+    told = radars.report()
+    assert decode_line(encode_line({"fact": "radars", **told})) == {"fact": "radars", **json.loads(json.dumps(told))}
+    assert set(told["boards"]) == {"LS", "RH", "RV"}
+    assert told["boards"]["RV"]["rf_firmware"] == "2.2.3.1 patch 2.1.1.1"
+    assert set(told["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
+    assert len(told["boards"]["RV"]["sent"]) > 40
+    assert 0.9e6 < told["direct_if_hz"]["RH"] < 1.05e6
+    assert any(c.startswith("IF budget of RV") for c in told["constraints"])
+    again = radars.report()
+    assert again["boards"]["RV"]["sent"] == []
+    assert "constraints" not in again
+
+
+def test_a_broken_constraint_is_refused_before_a_byte_is_written(rig, clock, boards):
+    def never(serial: str) -> BoardWords:
+        raise AssertionError(f"{serial} was opened")
+
+    wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=31))
+    with pytest.raises(ConfigError, match="RX gain step"):
+        NativeRadars(wrong, never, clock)
+    with NativeRadars(rig, boards.words.__getitem__, clock) as made, pytest.raises(ConfigError, match="frames"):
+        made.arm(65536)
+
+
+def test_ldo_bypass_never_reaches_a_board_without_its_acknowledgement(rig, clock, boards):
+    native = {n: msgspec.structs.replace(b, ldo_bypass=True) for n, b in rig.radar.native.items()}
+    wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
+    with pytest.raises(ConfigError, match="LDO bypass of LS"):
+        NativeRadars(wrong, boards.words.__getitem__, clock)
+    assert not any(b.destroyed for b in boards.by_serial.values())
+
+
+def test_a_board_that_fails_at_the_start_closes_the_others(rig, clock, boards):
+    boards.by_serial["FTRV"].patch = False
+    with pytest.raises(DeviceError, match="RV: its rf firmware has no patch"):
+        NativeRadars(rig, boards.words.__getitem__, clock)
+    assert all(w.closed for w in boards.words.values())
+
+
+def test_three_boards_behind_usb(rig, clock, boards):
+    from host.radar.mpsse import UsbWords
+
+    chips = {s: UsbChip(b) for s, b in boards.by_serial.items()}
+    with NativeRadars(
+        rig, lambda s: UsbWords(*(chips[s].channel(n) for n in "ABCD"), sleep=clock.sleep), clock
+    ) as made:
+        made.arm(FRAMES)
+        boards.pulses(FRAMES)
+        assert {s.state for s in made.states().values()} == {RadarState.DONE}
+    assert [c.errors for c in chips.values()] == [[], [], []]
+
+
+def test_the_rig_file_must_name_every_board_and_each_serial_once(rig):
+    table = to_builtins(rig)
+    del table["radar"]["native"]["RV"]
+    with pytest.raises(ConfigError, match=r"radar\.native for each of the boards"):
+        decode(table, Instrument, "rig.toml")
+    twice = {n: NativeRadar("FT1") for n in ("LS", "RH", "RV")}
+    with pytest.raises(ValueError, match="its own usb_serial"):
+        Radar(control="native", native=twice)
+    assert decode(to_builtins(rig), Instrument, "rig.toml") == rig
+
+
+def test_the_backend_is_chosen_by_the_rig_file(rig, monkeypatch):
+    monkeypatch.setattr("host.radar.native.NativeRadars.__init__", lambda self, rig: setattr(self, "rig", rig))
+    made = radar_control(rig)
+    assert isinstance(made, NativeRadars)

@@ -1,0 +1,117 @@
+"""The simulated rig under native control: its rig file, its signals, and its chip behind a socket."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from host.radar.board import RadarBoard, State
+from host.radar.native import open_board
+from host.radar.program import program
+from host.radar.spi import SystemClock
+from host.radar.validator import constraints
+from shared.config import load_instrument
+from shared.errors import DeviceError
+from simulators.radar import SimulatedRig
+from simulators.radar_board import RadarBoard as Simulated
+from simulators.radar_socket import RadarSocket
+from simulators.rig import derive
+from simulators.scene import decode_scene
+
+from .conftest import RIG_FILE
+
+EMPTY = decode_scene({"name": "the direct path alone"}, "test")
+
+
+def test_the_derived_rig_breaks_no_constraint_and_reaches_every_board(tmp_path: Path):
+    rig = derive(load_instrument(RIG_FILE), EMPTY, tmp_path, native=True)
+    assert rig.radar.control == "native"
+    assert [c for c in constraints(rig, 5600) if not c.holds] == []
+    assert len({b.usb_serial for b in rig.radar.native.values()}) == 3
+    assert all(b.usb_serial.startswith("tcp://127.") for b in rig.radar.native.values())
+
+
+def test_programmed_offsets_make_the_signals_that_the_scene_s_offset_made(tmp_path: Path):
+    """The same start frequencies by either way: the same samples."""
+    plain = derive(load_instrument(RIG_FILE), EMPTY, tmp_path)
+    native = derive(load_instrument(RIG_FILE), EMPTY, tmp_path, native=True)
+    at = np.zeros(2)
+    a, b = (SimulatedRig(rig, EMPTY, 5).signals("RH", at, at) for rig in (plain, native))
+    np.testing.assert_array_equal(a, b)
+    moved = tuple(
+        msgspec.structs.replace(x, start_offset_hz=x.start_offset_hz + 1e5) if x.name == "RH" else x
+        for x in native.boards
+    )
+    other = SimulatedRig(msgspec.structs.replace(native, boards=moved), EMPTY, 5).signals("RH", at, at)
+    assert not np.allclose(a, other)
+
+
+@pytest.fixture
+def served():
+    """A simulated board at a TCP address, served by a thread."""
+    board = Simulated(time.monotonic)
+    made = RadarSocket("tcp://127.0.0.1:0", board)
+    stop = threading.Event()
+
+    def serve() -> None:
+        while not stop.wait(0.0005):
+            made.serve()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    yield made, board
+    stop.set()
+    thread.join()
+    made.close()
+
+
+def test_a_board_runs_a_row_over_its_socket(rig, served):
+    made, board = served
+    radar = RadarBoard("LS", open_board(made.address), SystemClock(), program(rig, rig.by_name("LS")))
+    radar.configure()
+    radar.arm(2)
+    for n in range(2):
+        assert board.trigger(n * 1.5e-3)
+    deadline = time.monotonic() + 30
+    while radar.poll() is not State.DONE:
+        assert time.monotonic() < deadline
+    assert made.chip.errors == []
+    radar.close()
+
+
+def test_a_board_unplugged_behind_its_socket_is_a_fault_that_says_where(rig, served):
+    made, board = served
+    radar = RadarBoard("LS", open_board(made.address), SystemClock(), program(rig, rig.by_name("LS")))
+    radar.configure()
+    board.plugged = False
+    assert radar.poll() is State.FAULT
+    assert made.address in radar.reason
+    radar.close()
+
+
+def test_nobody_at_the_address_is_named():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with pytest.raises(DeviceError, match=f"tcp://127.0.0.1:{port}: cannot be reached"):
+        open_board(f"tcp://127.0.0.1:{port}")
+    with pytest.raises(DeviceError, match="cannot be reached"):
+        open_board("tcp://nonsense")
+
+
+def test_a_request_cut_anywhere_is_taken_whole(served):
+    made, _ = served
+    ask = struct.pack("<ccH", b"B", b"W", 2) + b"\x81\x87" + struct.pack("<ccH", b"B", b"R", 1)
+    with socket.create_connection(("127.0.0.1", int(made.address.rpartition(":")[2]))) as client:
+        client.settimeout(30)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for byte in ask:
+            client.sendall(bytes((byte,)))
+            time.sleep(0.001)
+        assert client.recv(3, socket.MSG_WAITALL) == b"\x01\x00\x00"

@@ -1,0 +1,159 @@
+"""Messages over words: every way in which one is lost, damaged or overtaken."""
+
+from __future__ import annotations
+
+import pytest
+
+from host.radar.commands import GET_TEMPERATURES, RF_POWER_UP, DeviceConfiguration, LowPower
+from host.radar.events import CALIBRATION_REPORT, MAIN_POWER_UP, RF_POWER_UP_DONE
+from host.radar.firmware import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
+from host.radar.messages import READY_TO_READ, decode
+from host.radar.spi import ATTEMPTS, Link
+from shared.errors import DeviceError
+from simulators.radar_board import Fault
+
+
+def ignored(_):
+    """An event that nobody keeps."""
+
+
+@pytest.fixture
+def sent() -> list[bytes]:
+    return []
+
+
+@pytest.fixture
+def link(words, clock, sent) -> Link:
+    """A link to a board whose both cores are up."""
+    made = Link("RH", words, clock, sent.append)
+    words.reset(held=True)
+    words.reset(held=False)
+    made.wait_for((MAIN_POWER_UP,), 1.0, ignored)
+    made.call(DeviceConfiguration())
+    made.call(RF_POWER_UP)
+    made.wait_for((RF_POWER_UP_DONE,), 1.0, ignored)
+    sent.clear()
+    return made
+
+
+def commands(sent: list[bytes]):
+    return [decode(raw) for raw in sent if raw != READY_TO_READ]
+
+
+def test_sequence_numbers_count_on_and_wrap(link, sent):
+    for _ in range(20):
+        link.call(GET_TEMPERATURES)
+    assert [m.sequence for m in commands(sent)] == [(2 + n) % 16 for n in range(20)]
+    assert not any(m.retry for m in commands(sent))
+    assert link.warnings == []
+
+
+def test_reading_is_announced_by_the_ready_word_each_time(link, sent):
+    link.call(GET_TEMPERATURES)
+    assert [raw == READY_TO_READ for raw in sent] == [False, True]
+
+
+@pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])
+def test_a_lost_answer_is_asked_for_again_with_the_same_sequence(link, board, sent, fault):
+    before = list(board.executed)
+    board.inject(fault)
+    link.call(LowPower())
+    assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (2, True)]
+    assert board.executed == [*before, LowPower.ID]  # obeyed once
+    assert "sent 2 times" in link.warnings[-1]
+    link.call(LowPower())
+    assert commands(sent)[-1].sequence == 3
+
+
+def test_a_nack_is_answered_by_a_new_sequence_without_the_retry_flag(link, board, sent):
+    board.inject(Fault.NACK)
+    link.call(LowPower())
+    assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (3, False)]
+    assert board.executed[-1] == LowPower.ID
+
+
+def test_words_before_the_sync_word_are_skipped(link, board, sent):
+    board.inject(Fault.BAD_SYNC)
+    link.call(LowPower())
+    assert len(commands(sent)) == 1
+
+
+def test_an_event_between_command_and_answer_is_kept(link, board, sent):
+    board.inject(Fault.EVENT_BETWEEN)
+    link.call(LowPower())
+    assert len(commands(sent)) == 1
+    assert [e.id for e in link.poll()] == [CALIBRATION_REPORT]
+    assert link.poll() == []
+
+
+def test_events_come_in_order_and_once(link, board):
+    for number in (0x100B, 0x100F, 0x1012):
+        board.say(number, bytes(20))
+    assert [e.id for e in link.poll()] == [0x100B, 0x100F, 0x1012]
+
+
+def test_a_refusal_is_an_error_in_words_and_is_not_repeated(link, board, sent):
+    board.inject(Fault.REFUSE)
+    with pytest.raises(DeviceError, match=r"RH: the radar refuses LowPower.*error while processing.*error 6"):
+        link.call(LowPower())
+    assert len(commands(sent)) == 1
+
+
+def test_it_gives_up_after_its_tries(link, board, sent, clock):
+    board.inject(*[Fault.NO_ANSWER] * ATTEMPTS)
+    began = clock.time
+    with pytest.raises(DeviceError, match="no valid answer"):
+        link.call(LowPower())
+    assert [m.retry for m in commands(sent)] == [False, True, True]
+    assert clock.time - began == pytest.approx(ATTEMPTS * 1.0, rel=0.05)
+
+
+@pytest.mark.parametrize("fault", [f for f in Fault if f not in (Fault.BAD_SYNC, Fault.EVENT_BETWEEN, Fault.REFUSE)])
+def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
+    link = Link("RH", words, clock, sent.append)
+    words.reset(held=True)
+    words.reset(held=False)
+    link.wait_for((MAIN_POWER_UP,), 1.0, ignored)
+    board.inject(fault)
+    with pytest.raises(DeviceError, match="no valid answer"):
+        link.call(RF_POWER_UP)
+    assert len(commands(sent)) == 1
+
+
+def test_unplugged_is_an_error_at_once(link, board):
+    board.plugged = False
+    with pytest.raises(DeviceError, match="unplugged"):
+        link.call(LowPower())
+    with pytest.raises(DeviceError, match="unplugged"):
+        link.poll()
+
+
+def test_an_event_that_never_comes_is_named(link):
+    with pytest.raises(DeviceError, match="did not report 0x100B within 2 s"):
+        link.wait_for((0x100B,), 2.0, ignored)
+
+
+def test_firmware_goes_in_parts_and_the_slow_erase_is_waited_for(words, clock, board, sent):
+    board.patch = False
+    link = Link("RH", words, clock, sent.append)
+    words.reset(held=True)
+    words.reset(held=False)
+    link.wait_for((MAIN_POWER_UP,), 1.0, ignored)
+    image = bytes(n % 251 for n in range(1000))
+    for n, (chunk, remaining) in enumerate(file_chunks(image, TO_FLASH)):
+        link.call(chunk, timeout_s=ERASE_TIMEOUT_S if n == 0 else 1.0, remaining=remaining)
+    assert board.patch
+    assert [m.remaining_chunks for m in commands(sent)] == [4, 3, 2, 1, 0]
+    assert clock.time > board.erase_s
+    with pytest.raises(DeviceError, match="no valid answer"):
+        link.call(next(iter(file_chunks(image, TO_FLASH)))[0], remaining=4)
+
+
+@pytest.mark.parametrize("size", [1, 223, 224, 225, 456, 457, 1000])
+def test_parts_of_an_image_join_to_it(size):
+    image = bytes(n % 251 for n in range(size))
+    parts = file_chunks(image)
+    joined = b"".join(chunk.part for chunk, _ in parts)
+    assert joined == bytes((4, 0, 0, 0)) + size.to_bytes(4, "little") + image
+    assert all(len(chunk.part) <= 232 for chunk, _ in parts)
+    assert [remaining for _, remaining in parts] == list(reversed(range(len(parts))))

@@ -1,0 +1,138 @@
+"""Each named constraint: it holds for the published chirp, and is broken and named by a value outside it."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+
+from host.radar.validator import constraints, direct_if_hz, require
+from shared.config import Instrument, NativeRadar
+from shared.errors import ConfigError
+from shared.geometry import direct_path_m
+
+FRAMES = 5600
+
+
+def changed(rig: Instrument, table: str, **values) -> Instrument:
+    """A rig with values that its own declaration might refuse, too."""
+    part = msgspec.structs.replace(getattr(rig, table))
+    for key, value in values.items():
+        msgspec.structs.force_setattr(part, key, value)
+    whole = msgspec.structs.replace(rig)
+    msgspec.structs.force_setattr(whole, table, part)
+    return whole
+
+
+def broken(rig: Instrument, frames: int = FRAMES) -> set[str]:
+    return {c.name for c in constraints(rig, frames) if not c.holds}
+
+
+def of_receiver(rig: Instrument, **values) -> Instrument:
+    boards = tuple(msgspec.structs.replace(b, **values) if b.name == "RH" else b for b in rig.boards)
+    return msgspec.structs.replace(rig, boards=boards)
+
+
+def test_the_published_chirp_with_centred_receivers_holds(rig):
+    require(rig, FRAMES)
+    assert broken(rig) == set()
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "values"),
+    [
+        ("frame period", "burst", {"period_us": 450.0}),
+        ("inter-frame time", "burst", {"period_us": 728.0}),
+        ("pulse width", "burst", {"width_us": 4.1}),
+        ("pulse width", "burst", {"width_us": 0.02}),
+        ("ADC window", "chirp", {"ramp_end_us": 126.0}),
+        ("sample memory", "chirp", {"samples": 1025}),
+        ("samples", "chirp", {"samples": 31}),
+        ("sample rate", "chirp", {"sample_rate_hz": 1.9e6}),
+        ("sample rate", "chirp", {"sample_rate_hz": 23e6}),
+        ("sample rate step", "chirp", {"sample_rate_hz": 2.1502e6}),
+        ("slope", "chirp", {"slope_hz_per_s": 267e12}),
+        ("ADC start", "chirp", {"adc_start_us": 41.0}),
+        ("ramp", "chirp", {"ramp_end_us": 5001.0}),
+        ("idle", "radar", {"idle_us": 5300.0}),
+        ("RX gain", "radar", {"rx_gain_db": 54}),
+        ("RX gain step", "radar", {"rx_gain_db": 31}),
+        ("TX back-off", "radar", {"tx_backoff_db": 21}),
+        ("sweep of RH", "chirp", {"ramp_end_us": 128.6}),
+        ("start frequency of RH", "chirp", {"start_hz": 75.99e9}),
+    ],
+)
+def test_a_value_outside_is_named_with_formula_limit_and_value(rig, name, table, values):
+    wrong = changed(rig, table, **values)
+    assert name in broken(wrong)
+    with pytest.raises(ConfigError) as caught:
+        require(wrong, FRAMES)
+    told = next(c for c in constraints(wrong, FRAMES) if c.name == name and not c.holds)
+    assert str(told) in str(caught.value)
+    assert told.formula in str(told)
+    assert f"{told.value:.9g}" in str(told)
+    assert told.remedy in str(caught.value)
+
+
+@pytest.mark.parametrize(("frames", "holds"), [(0, False), (1, True), (65535, True), (65536, False)])
+def test_frame_counts(rig, frames, holds):
+    """0 would be frames without end."""
+    assert ("frames" not in broken(rig, frames)) is holds
+
+
+def test_pulse_gap(rig, monkeypatch):
+    monkeypatch.setattr("host.radar.program.TRIGGER_MARGIN_US", 149.0)
+    assert broken(rig) == {"pulse gap"}
+
+
+def test_the_shortest_burst_period_is_where_the_chirps_leave_300_us(rig):
+    """idle + ramp + 0.01 + 300 us, and 200 us to the next pulse."""
+    edge = 100.0 + 128.5 + 0.01 + 300.0 + 200.0
+    assert "inter-frame time" not in broken(changed(rig, "burst", period_us=edge + 1e-6))
+    assert "inter-frame time" in broken(changed(rig, "burst", period_us=edge - 1e-3))
+
+
+def test_ldo_bypass_needs_this_boards_serial(rig):
+    def with_bypass(acknowledged: str) -> Instrument:
+        native = {**rig.radar.native, "RH": NativeRadar("FTRH", True, acknowledged)}
+        return msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
+
+    assert broken(with_bypass("")) == broken(with_bypass("FTRV")) == {"LDO bypass of RH"}
+    assert broken(with_bypass("FTRH")) == set()
+    with pytest.raises(ConfigError, match="may destroy"):
+        require(with_bypass("yes"), FRAMES)
+
+
+def test_expected_if_is_slope_times_path_plus_offset(rig):
+    for name in ("RH", "RV"):
+        at = rig.by_name(name)
+        mean_m = math.fsum(direct_path_m(rig, at)) / 4
+        expected = rig.chirp.slope_hz_per_s * mean_m / 299_792_458 + at.start_offset_hz
+        assert direct_if_hz(rig, at) == pytest.approx(expected, abs=120.0)  # two roundings of 53.6 Hz
+
+
+@pytest.mark.parametrize(("mode", "offset", "holds"), [
+    ("complex1x", 0.0, False), ("complex1x", 790e3, True), ("complex1x", 1.7e6, False),
+    ("complex2x", 0.0, True), ("complex2x", -1.1e6, False), ("complex2x", 700e3, False),
+])  # fmt: skip
+def test_if_budget(rig, mode, offset, holds):
+    wrong = changed(of_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
+    assert ("IF budget of RH" not in broken(wrong)) is holds
+
+
+def test_following_the_remedy_of_the_if_budget_centres_the_path(rig):
+    wrong = of_receiver(rig, start_offset_hz=0.0)
+    told = next(c for c in constraints(wrong, FRAMES) if c.name == "IF budget of RH")
+    offset = float(told.remedy.split(";")[1].split()[0])
+    mended = of_receiver(rig, start_offset_hz=offset)
+    assert direct_if_hz(mended, mended.by_name("RH")) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
+
+
+def test_every_constraint_has_a_test_that_breaks_it(rig):
+    tested = {
+        c for mark in test_a_value_outside_is_named_with_formula_limit_and_value.pytestmark for c, *_ in mark.args[1]
+    }
+    tested |= {"frames", "pulse gap", "LDO bypass of RH", "IF budget of RH"}
+    general = {c.name for c in constraints(rig, FRAMES) if not c.name.endswith((" of LS", " of RV"))}
+    assert general == tested

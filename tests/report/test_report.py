@@ -1,0 +1,282 @@
+"""The report is one file, loads nothing, says what is simulated, and its products are whole or absent."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from host.report import (
+    ReportContext,
+    banner_png,
+    plain,
+    read_image,
+    write_atomically,
+    write_image,
+    write_json,
+    write_report,
+)
+from host.report.figures import colours_of
+from host.report.quality import pretty, text
+from shared.errors import DataError
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+class Page(HTMLParser):
+    """Collects what a browser would load or show."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.sources, self.text, self.tags = [], [], []
+        self._hidden = 0
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self._hidden += tag in ("style", "script")
+        self.sources += [v for k, v in attrs if k in ("src", "href", "srcset", "data", "poster", "action")]
+
+    def handle_endtag(self, tag):
+        self._hidden -= tag in ("style", "script")
+
+    def handle_data(self, data):
+        if not self._hidden:
+            self.text.append(data)
+
+    @property
+    def words(self):
+        return " ".join(" ".join(self.text).split())
+
+
+@pytest.fixture(scope="module")
+def ctx():
+    """Two plates, one of them named wrong, and a third that was not found."""
+    rng = np.random.default_rng(0)
+    x = np.linspace(-0.06, 0.06, 61)
+    h = 0.02 * (rng.standard_normal((61, 61)) + 1j * rng.standard_normal((61, 61)))
+    v = 0.02 * (rng.standard_normal((61, 61)) + 1j * rng.standard_normal((61, 61)))
+    segments = np.zeros((61, 61), np.int32)
+    segments[20:40, 5:25], segments[20:40, 35:55] = 1, 2
+    h[segments == 1], v[segments == 1] = 1, 1
+    h[segments == 2], v[segments == 2] = 0.52, 0.12 - 0.02j
+    v[0, 0] = 0
+    with np.errstate(divide="ignore"):
+        p = (h / v).astype(np.complex64)
+    interior = np.zeros((61, 61), bool)
+    interior[25:35, 40:50] = True
+    common = {"votes": {}, "distance": 0.2, "pixels": 400, "interior_pixels": 100, "incidence_deg": 55.0}
+    rows = [
+        {
+            **common, "label": 1, "name": "copper", "confidence": 1.0, "metal_reference": True, "metal_like": True,
+            "box_mm": [-50, -20, -10, 20], "outline_mm": [[-50, -20], [-10, -20], [-10, 20]], "permittivity": None,
+            "ratio": {"real": 1.0, "imag": 0.0}, "truth": {"name": "copper", "metal": True, "permittivity": None},
+        },
+        {
+            **common, "label": 2, "name": "PET <b>", "confidence": 0.62, "metal_reference": False, "metal_like": False,
+            "box_mm": [10, -20, 50, 20], "outline_mm": [],
+            "permittivity": {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]},
+            "ratio": {"real": 4.4, "imag": 0.6},
+            "truth": {"name": "acrylic", "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
+        },
+    ]  # fmt: skip
+    return ReportContext(
+        title="Two <plates> & more",
+        simulated=True,
+        x_m=x,
+        y_m=x + 0.1,
+        h=h.astype(np.complex64),
+        v=v.astype(np.complex64),
+        p=p,
+        valid=np.ones((61, 61), bool),
+        materials=rows,
+        segments=segments,
+        pixel_names={2: (np.array(["PET <b>", "unknown"] * 50), interior)},
+        truth=[
+            {"name": "copper", "box_mm": (-50, -20, -10, 20), "permittivity": None},
+            {"name": "acrylic", "box_mm": (10, -20, 50, 20), "permittivity": 4 - 0.4j},
+            {"name": "cork", "box_mm": (-10, 30, 10, 50), "permittivity": 10.6 - 0j},
+        ],
+        metal_how="given as patch 1",
+        pixel_accuracy=0.5,
+        library_note="a library.",
+        quality={
+            "boards": {
+                "RH": {
+                    "frames_expected": 1000,
+                    "frames_received": 998,
+                    "frames_masked": 2,
+                    "synchronisation": {"averaged": {"frequency_std_hz": 31.0, "phase_std_rad": 0.005}},
+                }
+            },
+            "rows_retaken": [3],
+            "seconds_per_stage": {"align": 2.0, "image": 0.5},
+        },
+        config={"grid": "140 x 120"},
+        provenance={"scan": "abc"},
+        notes=["Never ran on hardware."],
+    )
+
+
+@pytest.fixture(scope="module")
+def page(ctx, tmp_path_factory):
+    out = tmp_path_factory.mktemp("report")
+    path = write_report(out, ctx)
+    return out, path.read_text(encoding="utf-8")
+
+
+def test_nothing_is_loaded_from_elsewhere(page):
+    _, html = page
+    assert not re.search(r"(?:https?:)?//[a-z0-9]", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html), re.IGNORECASE)
+    parsed = Page(html)
+    assert parsed.sources
+    assert all(s.startswith("data:image/png;base64,") for s in parsed.sources)
+    assert not {"script", "link", "iframe", "object"} & set(parsed.tags)
+    assert "@import" not in html
+    assert "url(" not in html
+
+
+def test_images_are_embedded_and_lie_beside_it(page):
+    out, html = page
+    inline = [base64.b64decode(s.partition(",")[2]) for s in Page(html).sources]
+    files = {p.name: p.read_bytes() for p in (out / "figures").iterdir()}
+    assert len(files) == 9
+    assert all(data.startswith(PNG) for data in files.values())
+    assert sorted(inline) == sorted(files.values())
+    assert {
+        "amplitude_h.png",
+        "amplitude_v.png",
+        "amplitude_p.png",
+        "phase_p.png",
+        "materials.png",
+        "truth.png",
+    } <= set(files)
+    assert sorted(p.name for p in out.iterdir()) == ["figures", "report.html"]
+
+
+def test_simulated_is_said_everywhere(page):
+    _, html = page
+    words = Page(html).words
+    assert words.startswith("SIMULATED: Two")
+    assert words.count("SIMULATED") >= 3 + html.count("<figure") + html.count("<caption")
+    for alt in re.findall(r'alt="([^"]*)"', html):
+        assert "simulated" in alt
+
+
+def test_measured_data_is_not_called_simulated(ctx, tmp_path):
+    html = write_report(tmp_path, replace(ctx, simulated=False)).read_text(encoding="utf-8")
+    assert "simulated" not in Page(html).words.lower()
+
+
+def test_results_stand_beside_the_truth(page):
+    _, html = page
+    words = Page(html).words
+    assert "1 of 3 plates named right" in words
+    assert "50.0 % of interior pixels" in words
+    assert "✗ acrylic" in words
+    assert "✓ copper" in words
+    assert "Not found: cork" in words
+    assert "-2.5 %" in words
+    assert "(3.80 … 4.00)" in words
+    assert "metal-like" in words
+    assert "99.80 % of 1000 frames received" in words
+    assert "RH phase (rad)" in words
+    assert "frames masked 2" in words
+    assert "averaged 31 0.005" in words
+    assert "rows retaken" in words
+    assert "Never ran on hardware." in words
+
+
+def test_names_cannot_break_the_page(page):
+    _, html = page
+    assert "PET <b>" not in html
+    assert "PET &lt;b&gt;" in html
+    assert "Two &lt;plates&gt; &amp; more" in html
+
+
+def test_bare_images_make_a_report_too(ctx, tmp_path):
+    bare = ReportContext("Bare", False, ctx.x_m, ctx.y_m, ctx.h, ctx.v, ctx.p, metal_referenced=False)
+    words = Page(write_report(tmp_path, bare).read_text(encoding="utf-8")).words
+    assert "Images" in words
+    assert "Materials" not in words
+    assert "Quality" not in words
+
+
+def test_dark_and_invalid_images_do_not_fail(ctx, tmp_path):
+    zero = np.zeros_like(ctx.h)
+    nothing = ReportContext(
+        "Dark", True, ctx.x_m, ctx.y_m, zero, zero, zero * np.complex64(np.nan), valid=np.zeros(zero.shape, bool)
+    )
+    assert write_report(tmp_path, nothing).exists()
+
+
+def test_banner_is_one_wide_picture(ctx, tmp_path):
+    banner_png(tmp_path / "banner.png", ctx)
+    data = (tmp_path / "banner.png").read_bytes()
+    assert data.startswith(PNG)
+    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))
+    assert width > 3 * height
+
+
+def test_one_material_has_one_colour(ctx):
+    table = colours_of(ctx)
+    assert {"copper", "acrylic", "cork", "PET <b>", "unknown"} == set(table)
+    assert len(set(table.values())) == len(table)
+
+
+def test_image_product_round_trips(ctx, tmp_path):
+    path = tmp_path / "products" / "image.npz"
+    write_image(path, ctx.h, ctx.v, ctx.p, ctx.x_m, ctx.y_m, ctx.valid)
+    z = read_image(path)
+    assert {k: a.dtype for k, a in z.items()} == {
+        **dict.fromkeys(("h", "v", "p"), np.dtype(np.complex64)),
+        **dict.fromkeys(("x_m", "y_m"), np.dtype(np.float64)),
+        "valid": np.dtype(np.bool_),
+    }
+    np.testing.assert_array_equal(z["h"], ctx.h)
+    np.testing.assert_array_equal(z["y_m"], ctx.y_m)
+    assert [p.name for p in path.parent.iterdir()] == ["image.npz"]
+    with pytest.raises(DataError, match="shape"):
+        write_image(path, ctx.h[1:], ctx.v, ctx.p, ctx.x_m, ctx.y_m, ctx.valid)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError, match=r"image\.npz"):
+        read_image(path)
+
+
+def test_json_products_are_strict(tmp_path):
+    content = {"a": np.float32(1.5), "b": [np.inf, float("nan"), 2 - 1j], "c": np.array([1, 2]), "d": (True, None, "ε")}
+    write_json(tmp_path / "q.json", content)
+    assert json.loads((tmp_path / "q.json").read_text(encoding="utf-8")) == {
+        "a": 1.5,
+        "b": [None, None, {"real": 2.0, "imag": -1.0}],
+        "c": [1, 2],
+        "d": [True, None, "ε"],
+    }
+    assert plain(plain(content)) == plain(content)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "x.json"
+    write_atomically(path, b"old")
+
+    def full(_fd):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+
+
+def test_numbers_read_well():
+    assert text(268800) == "268\u202f800"
+    assert text(16) == "16"
+    assert text(0.00512) == "0.00512"
+    assert text(True) == "yes"
+    assert text([]) == "none"
+    assert text({"a": 1, "b": [2, 3]}) == "a: 1, b: 2, 3"
+    assert pretty("RH if_hz") == "RH IF (Hz)"
+    assert pretty("rows_retaken") == "rows retaken"

@@ -1,0 +1,75 @@
+"""The report on what synchronisation leaves of errors."""
+
+import json
+
+import numpy as np
+import pytest
+
+from host.report.sync_report import PAPER, SyncReport, write_sync_report
+from host.sync.chain import SyncedRow
+from host.sync.residuals import STAGES
+
+SCALES = {"received": (8e4, 1.8, 0.1), "aligned": (80.0, 0.013, 0.01), "averaged": (20.0, 0.003, 0.003)}
+
+
+def row(snr_db=7.2, n=4000, seed=0):
+    """A row of errors of known size; nothing in it has an echo."""
+    rng = np.random.default_rng(seed)
+    errors = {name: rng.standard_normal((3, n)) * np.array(scale)[:, None] for name, scale in SCALES.items()}
+    errors["referenced"] = np.zeros((3, 0))
+    valid, zero = np.ones(n, bool), np.zeros(n)
+    noise = np.full(n, 500.0**2 * 10 ** (-snr_db / 10))
+    return SyncedRow(
+        np.zeros((4, n, 1), np.complex64), valid, np.full(n, 16), zero, zero + 500, zero, zero, errors, noise
+    )
+
+
+def report_of(*rows, rx=4):
+    report = SyncReport(2.15e6, (0, 192), rx)
+    for r in rows:
+        report.add(r)
+    return report
+
+
+def test_spreads_are_those_of_the_errors():
+    summary = report_of(row(seed=1), row(seed=2)).summary()
+    assert summary["chirps"] == 2 * 4000 * 16
+    for name, scale in SCALES.items():
+        stage = summary["stages"][name]
+        assert stage["samples"] == 8000
+        got = [stage[f"{q}_std"] for q in ("frequency_hz", "phase_rad", "amplitude")]
+        assert got == pytest.approx(scale, rel=0.03)
+    assert "referenced" not in summary["stages"]
+
+
+def test_the_papers_figures_are_the_bound_of_one_tone_at_7_2_db():
+    f, phase, _ = report_of(row(7.2), rx=1).bounds()["aligned"]
+    assert f == pytest.approx(PAPER["frequency_hz"], rel=0.01)
+    assert phase == pytest.approx(PAPER["phase_rad"], rel=0.02)
+
+
+def test_four_receivers_and_16_chirps_are_worth_64_times_the_power():
+    bounds = report_of(row(7.2)).bounds()
+    alone = report_of(row(7.2), rx=1).bounds()["aligned"]
+    assert bounds["averaged"] == pytest.approx(np.array(alone) / 8)
+    assert bounds["aligned"] == pytest.approx(np.array(alone) / 2)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_files_and_words(tmp_path, simulated):
+    text = write_sync_report(tmp_path, {"RH": report_of(row())}, "scan one", simulated)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["sync-RH.png", "sync.json", "sync.txt"]
+    assert (tmp_path / "sync-RH.png").read_bytes().startswith(b"\x89PNG")
+    facts = json.loads((tmp_path / "sync.json").read_text())
+    assert facts["simulated"] is simulated
+    assert set(facts["boards"]["RH"]["stages"]) < set(STAGES)
+    assert ("simulated" in text) is simulated
+    assert "138 Hz" in text
+
+
+def test_a_scan_without_a_valid_position_is_reported_as_such(tmp_path):
+    empty = SyncedRow(
+        np.zeros((4, 3, 1), np.complex64), np.zeros(3, bool), np.zeros(3, int), *(np.zeros(3) for _ in range(4))
+    )
+    text = write_sync_report(tmp_path, {"RH": report_of(empty)}, "nothing", True)
+    assert "0 chirps at 0 positions" in text

@@ -1,0 +1,79 @@
+"""Pixels drawn patch by patch: what they obey, and that the noise is set on H alone."""
+
+import inspect
+
+import numpy as np
+import pytest
+
+from host.materials.models import score
+from host.polarimetry import fresnel, permittivity_from_ratio
+from host.reproduce import patches
+from host.reproduce.patches import PAPER_KNN, Errors, calibrated_errors, draw, groups, h_accuracy
+from host.reproduce.published import published
+
+QUIET = Errors(0.0, 0.0)
+
+
+@pytest.mark.parametrize("name", ["solids", "liquids", "powders"])
+def test_without_errors_a_pixel_is_fresnel_s_reflection_relative_to_metal(name):
+    group = groups()[name]
+    seen = draw(group.materials, group.angle_deg, QUIET, seed=0, scans=2, pixels=3)
+    eps = np.array([m.permittivity for m in group.materials])
+    r_s, r_p = fresnel(eps, np.radians(group.angle_deg))
+    assert np.allclose(seen.h, -r_s[:, None])
+    assert np.allclose(seen.v, -r_p[:, None])
+    assert np.allclose(permittivity_from_ratio(seen.h / seen.v, np.radians(group.angle_deg)), eps[:, None])
+
+
+def test_the_groups_are_the_table_s_36_rows():
+    assert [m.number for g in groups().values() for m in g.materials] == list(range(1, 37))
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.5, 1.0])
+def test_errors_have_the_size_and_the_share_that_was_asked_for(shared):
+    metal = groups()["solids"].materials[:1]
+    seen = draw(metal, 60.0, Errors(0.02, 0.03, shared), seed=1, scans=3000, pixels=8)
+    r_s, _ = fresnel(metal[0].permittivity, np.radians(60.0))
+    for values, std in ((np.log(np.abs(seen.h / r_s)), 0.02), (np.angle(seen.h / -r_s), 0.03)):
+        within = values.var(axis=2, ddof=1).mean()
+        between = values.mean(axis=2).var() - within / 8
+        assert within == pytest.approx((1 - shared) * std**2, rel=0.1, abs=1e-7)
+        assert between == pytest.approx(2 * shared * std**2, rel=0.1, abs=3e-6)  # the patch's and the reference's
+
+
+def test_h_and_v_err_independently():
+    metal = groups()["solids"].materials[:1]
+    seen = draw(metal, 60.0, Errors(0.02, 0.0), seed=2, scans=3000, pixels=2)
+    assert abs(np.corrcoef(np.abs(seen.h).ravel(), np.abs(seen.v).ravel())[0, 1]) < 0.06
+
+
+@pytest.mark.parametrize("name", ["liquids", "powders"])
+def test_the_noise_reaches_the_published_accuracy_of_h_on_draws_it_was_not_set_on(name):
+    told = published()["classification"][name]["h_percent"] / 100
+    assert h_accuracy(groups()[name], calibrated_errors(name, 1), (5, 6, 7)) == pytest.approx(told, abs=0.06)
+
+
+def test_the_phase_error_is_the_published_residual_and_nothing_but_h_was_looked_at(monkeypatch):
+    seen = []
+
+    def spy(samples, model, channels="H+V+P", by_pixel=False, folds=8):
+        seen.append((model, channels, by_pixel))
+        return score(samples, model, channels, by_pixel, folds)
+
+    monkeypatch.setattr(patches, "score", spy)
+    errors = inspect.unwrap(calibrated_errors)("powders", 1)
+    assert errors.phase_rad == 0.022
+    assert set(seen) == {(PAPER_KNN, "H", True)}
+
+
+def test_v_and_p_add_to_what_h_tells():
+    group = groups()["powders"]
+    seen = draw(group.materials, group.angle_deg, calibrated_errors("powders", 1), seed=3).samples()
+    h, all_three = (score(seen, PAPER_KNN, c).pixels for c in ("H", "H+V+P"))
+    assert all_three > h + 0.2
+
+
+def test_more_noise_is_never_better():
+    group = groups()["powders"]
+    shares = [h_accuracy(group, Errors(a, 0.022), (1, 2)) for a in (0.003, 0.03, 0.3)]
+    assert shares[0] > shares[1] > shares[2] > 0.15

@@ -1,0 +1,100 @@
+"""The page and its files: every item beside the published value, and everything called simulated."""
+
+import csv
+import json
+import re
+
+import matplotlib.figure
+import pytest
+
+from host.cli import main
+from host.reproduce import catalogue, report
+from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
+from host.reproduce.published import published
+from shared.errors import DataError
+
+
+def item(key="fig3", value=1.0):
+    figure = new_figure(3, 2)
+    ax = figure.subplots()
+    ax.plot([0, value])
+    dress(ax, "a line", "x (mm)", "y (mm)")
+    table = Table("numbers", ("what", "published", "simulated"), (("one, two", "1", f"{value}"),))
+    return Item(key, f"Fig. 3: {key}", ("text & more",), (table,), {"line": Picture(figure, "a line")}, {"n": value})
+
+
+def test_every_figure_is_stamped(monkeypatch, tmp_path):
+    texts = []
+    save = matplotlib.figure.Figure.savefig
+
+    def spy(figure, *args, **kwargs):
+        texts.append(figure.get_suptitle())
+        return save(figure, *args, **kwargs)
+
+    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", spy)
+    report.write_item(tmp_path, item())
+    assert texts == ["SIMULATED"]
+
+
+def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_missing(tmp_path, monkeypatch):
+    def broken(_):
+        raise DataError("no such image", "it was not made")
+
+    makers = {"fig3": lambda _: item(), "fig20": broken, "fig21": lambda _: item("fig21")}
+    for module in (catalogue, report, __import__("host.reproduce.run", fromlist=["run"])):
+        monkeypatch.setattr(module, "MAKERS", makers)
+    assert main(["reproduce", "--out", str(tmp_path), "fig3", "fig20"]) == 1
+    page = (tmp_path / "reproduce.html").read_text(encoding="utf-8")
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+    for figure in re.findall(r"<figure>.*?</figure>", page, re.DOTALL):
+        assert "Simulated." in figure
+    for caption in re.findall(r"<caption>.*?</caption>", page, re.DOTALL):
+        assert "(simulated)" in caption
+    assert "could not be made" in page
+    assert "no such image" in page
+    assert "Not asked for in this run: fig21" in page
+    missing = page.split("not reproduced yet:")[1].split("</p>")[0]
+    assert all(key in missing for key in catalogue.TITLES if key not in makers)
+
+
+def test_the_files_hold_the_numbers(tmp_path):
+    report.write_item(tmp_path, item(value=2.5))
+    content = json.loads((tmp_path / "fig3.json").read_text())
+    assert content["simulated"] is True
+    assert content["n"] == 2.5
+    rows = list(csv.reader((tmp_path / "fig3.csv").read_text().splitlines()))
+    assert rows[0] == ["simulated: numbers"]
+    assert rows[2] == ["one, two", "1", "2.5"]
+    assert (tmp_path / "figures" / "fig3-line.png").stat().st_size > 1000
+
+
+def test_an_unknown_item_is_refused_by_name(tmp_path, capsys):
+    assert main(["reproduce", "--out", str(tmp_path / "r"), "fig99"]) != 0
+    assert "fig99" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
+
+
+def test_published_numbers_stand_in_the_data_file_alone():
+    folder = report.Path(catalogue.__file__).parent
+    numbers = [str(g["all_percent"]) for g in published()["classification"].values() if g["all_percent"] < 100]
+    numbers += [str(published()["sugar_median_error_percent"]), "0.0021", "0.1081"]
+    for file in folder.glob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        assert not [n for n in numbers if n in text], file.name
+
+
+@pytest.mark.parametrize("key", ["fig3", "fig21", "table2"])
+def test_items_are_made_and_stand_beside_the_published_values(key, tmp_path):
+    made = catalogue.MAKERS[key](Run(quick=True))
+    assert made.key == key
+    assert made.tables
+    assert made.pictures
+    assert report.write_item(tmp_path, made)
+    if key == "table2":
+        errors = [m["relative_error"] for m in made.data["materials"] if "relative_error" in m]
+        assert len(errors) == 35
+        assert max(errors) < 0.1
+        assert "published ε′" in made.tables[0].head
+    if key == "fig21":
+        assert made.data["published_median_error_percent"] == 1.548
+        assert 0 < made.data["median_error_percent"] < 3

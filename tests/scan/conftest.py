@@ -1,0 +1,340 @@
+"""A fake Pi (ZeroMQ) and fake capture cards (UDP) on a loopback subnet of their own."""
+
+from __future__ import annotations
+
+import functools
+import random
+import socket
+import struct
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from shared import messages as m
+from shared.config import Board, Instrument, decode, load_instrument, to_builtins
+from shared.raster import Row
+
+REPO = Path(__file__).resolve().parents[2]
+FULL = 1456
+
+
+@functools.cache
+def payload_of(board: str, row: int, size: int) -> bytes:
+    seed = sum(board.encode()) * 1000 + row
+    return np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8).tobytes()
+
+
+class FakeCard:
+    """Answers commands from source port 1024 and sends a row on demand; its counters go on from record to record."""
+
+    def __init__(self, board: Board, row_bytes: int) -> None:
+        self.board, self.row_bytes = board, row_bytes
+        self.commands = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.commands.bind((board.card_address, board.command_port))
+        self.commands.settimeout(0.05)
+        self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.out.bind((board.card_address, 1024))
+        self.sequence, self.count = 1, 0
+        self.recording = False
+        self.mute = False
+        self.silent_data = False
+        self.seen: list[int] = []
+        # faults by (row, take): packets to leave out, frames to leave out (as a radar that missed triggers)
+        self.drop: dict[tuple[int, int], set[int]] = {}
+        self.short: dict[tuple[int, int], int] = {}
+        self.missed: dict[tuple[int, int], set[int]] = {}  # pulses, of rows that are sent at their pace
+        self._rest = b""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            try:
+                raw, sender = self.commands.recvfrom(2048)
+            except TimeoutError:
+                continue
+            code = struct.unpack_from("<H", raw, 2)[0]
+            self.seen.append(code)
+            if self.mute:
+                continue
+            self.recording = {5: True, 6: False}.get(code, self.recording)
+            status = 0x0402 if code == 0x0E else 0
+            self.out.sendto(struct.pack("<HHHH", 0xA55A, code, status, 0xEEAA), sender)
+
+    def send_frame(self, row: int, take: int, slot: int, frame_bytes: int) -> None:
+        """The frame of one pulse, unless the radar missed it; packets leave as they fill."""
+        if slot not in self.missed.get((row, take), ()):
+            data = payload_of(self.board.name, row, self.row_bytes)
+            self._rest += data[slot * frame_bytes : (slot + 1) * frame_bytes]
+        while len(self._rest) >= FULL:
+            self._send_packet(FULL)
+
+    def end_frames(self) -> None:
+        """The short last packet, and its status."""
+        self._send_packet(len(self._rest))
+        status = struct.pack("<HHHH", 0xA55A, 0x0A, 0x0100, 0xEEAA)
+        self.out.sendto(status, (self.board.host_address, self.board.command_port))
+
+    def _send_packet(self, size: int) -> None:
+        body, self._rest = self._rest[:size], self._rest[size:]
+        head = struct.pack("<IIH", self.sequence, self.count & 0xFFFFFFFF, self.count >> 32)
+        if body:
+            self.out.sendto(head + body, (self.board.host_address, self.board.data_port))
+            self.sequence, self.count = self.sequence + 1, self.count + len(body)
+
+    def send_row(self, row: int, take: int) -> None:
+        if not self.recording or self.silent_data:
+            return
+        data = payload_of(self.board.name, row, self.row_bytes)
+        data = data[: len(data) - self.short.get((row, take), 0)]
+        to = (self.board.host_address, self.board.data_port)
+        for k, start in enumerate(range(0, len(data), FULL)):
+            body = data[start : start + FULL]
+            if k not in self.drop.get((row, take), ()):
+                head = struct.pack("<IIH", self.sequence, self.count & 0xFFFFFFFF, self.count >> 32)
+                self.out.sendto(head + body, to)
+            self.sequence += 1
+            self.count += len(body)
+        status = struct.pack("<HHHH", 0xA55A, 0x0A, 0x0100, 0xEEAA)
+        self.out.sendto(status, (self.board.host_address, self.board.command_port))
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.commands.close()
+        self.out.close()
+
+
+class FakePi:
+    """Speaks the wire protocol; a row makes every card send at once."""
+
+    def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
+        self.rig, self.cards = rig, cards
+        self.journal: dict[str, list[m.AnyEvent]] = {}
+        self.homed = False
+        self.run: m.BeginRun | None = None
+        self.state: m.State = "idle"
+        self.lose_events = 0  # leave out so many events of PUB
+        self.lose_replies = 0
+        self.fail_rows: dict[tuple[int, int], int] = {}  # (row, take): fault number
+        self.hang_at: set[int] = set()  # rows that never end; half of their data is sent
+        self.paced = False  # frames are sent at the times of their pulses
+        self.hang_after_captures = False  # such rows send their bursts before they hang
+        self.notes: dict[tuple[int, int], str] = {}  # what RowFinished says of a row that is done
+        self.wanted_end = False  # the hanging row shall end well
+        self.commands: list[m.AnyCommand] = []
+        self.rows_run: list[tuple[int, int]] = []
+        self.hanging: tuple[Row, int] | None = None
+        self.context = zmq.Context()
+        self.rep = self.context.socket(zmq.ROUTER)  # unlike REP it may leave a request without a reply
+        self.rep.bind(rig.pi.command_address)
+        self.pub = self.context.socket(zmq.PUB)
+        self.pub.bind(rig.pi.event_address)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        last = 0.0
+        while not self._stop.is_set():
+            if self.rep.poll(10):
+                *envelope, raw = self.rep.recv_multipart()
+                command = m.unpack_command(raw)
+                reply = self._answer(command)
+                if not isinstance(command, m.Alive):
+                    self.commands.append(command)
+                if self.lose_replies and not isinstance(command, m.Alive):
+                    self.lose_replies -= 1
+                else:
+                    self.rep.send_multipart([*envelope, m.pack(reply)])
+                self._after()
+            if self.wanted_end and self.hanging is not None:
+                self.wanted_end = False
+                self.finish_hanging()
+            if time.monotonic() - last > 0.05:
+                last = time.monotonic()
+                scan = self.run.scan_id if self.run else ""
+                beat = m.Heartbeat(
+                    scan_id=scan, seq=len(self.journal.get(scan, [])), t_mono_ns=1, state=self.state, period_ms=50
+                )
+                self.pub.send_multipart([b"event", m.pack(beat)])
+        self.rep.close(linger=0)
+        self.pub.close(linger=0)
+        self.context.term()
+
+    def _emit(self, kind: type, **content: object) -> None:
+        assert self.run is not None
+        events = self.journal.setdefault(self.run.scan_id, [])
+        event = kind(scan_id=self.run.scan_id, seq=len(events) + 1, t_mono_ns=time.monotonic_ns(), **content)
+        events.append(event)
+        if self.lose_events:
+            self.lose_events -= 1
+            return
+        self.pub.send_multipart([b"event", m.pack(event)])
+
+    def _answer(self, c: m.AnyCommand) -> m.AnyReply:
+        self._todo = None
+        scan = self.run.scan_id if self.run else ""
+        last = len(self.journal.get(scan, []))
+        if isinstance(c, m.Hello):
+            return m.HelloReply(
+                pi_release="t", firmware="t", backend="fake", state=self.state, scan_id=scan, last_seq=last
+            )
+        if isinstance(c, m.Status):
+            return m.StatusReply(
+                state=self.state, homed=self.homed, x_mm=0, y_mm=0, scan_id=scan, row_index=-1, take=0, points=0,
+                pulses=0, last_seq=last, fault=0, reason="",
+            )  # fmt: skip
+        if isinstance(c, m.BeginRun):
+            self.run = c
+            self._emit(m.RunStarted, plan=c.plan, resumed=bool(self.journal.get(c.scan_id)))
+        elif isinstance(c, m.EndRun):
+            self._emit(m.RunStopped, exit_status=c.exit_status, reason=c.reason)
+        elif isinstance(c, m.Home):
+            self.homed, self.state = True, "ready"
+        elif isinstance(c, m.Replay):
+            events = self.journal.get(c.scan_id, [])
+            return m.ReplayReply(events=events[c.from_seq - 1 : c.from_seq - 1 + c.limit], last_seq=len(events))
+        elif isinstance(c, m.RunRow):
+            if (c.row_index, c.take) not in self.rows_run:
+                self.rows_run.append((c.row_index, c.take))
+                self._todo = c
+        elif isinstance(c, m.Abort) and self.hanging is not None:
+            row, take = self.hanging
+            self.hanging = None
+            self._emit(
+                m.RowFinished, row_index=row.index, take=take, status="aborted", points=0, edges=0, bursts=0, pulses=0,
+                fault=113, reason=c.reason,
+            )  # fmt: skip
+        return m.Accepted(state=self.state)
+
+    def _after(self) -> None:
+        c = self._todo
+        if c is None or self.run is None:
+            return
+        row = self.run.plan.row(c.row_index)
+        self._emit(m.RowStarted, row=row, take=c.take)
+        if c.row_index in self.hang_at:
+            self.hanging = (row, c.take)
+            for card in self.cards:
+                card.short[row.index, c.take] = card.row_bytes // 2
+                card.send_row(row.index, c.take)
+            if self.hang_after_captures:
+                self._captures(row, c.take)
+            return
+        if self.paced:
+            self._run_at_its_pace(row, c.take)
+        else:
+            self._captures(row, c.take)
+            for card in self.cards:
+                card.send_row(row.index, c.take)
+        fault = self.fail_rows.get((c.row_index, c.take), 0)
+        n = row.points
+        self._emit(
+            m.RowFinished, row_index=row.index, take=c.take, status="fault" if fault else "done", points=n, edges=n,
+            bursts=n, pulses=n * self.run.pulses, fault=fault, reason=self.notes.get((c.row_index, c.take), ""),
+        )  # fmt: skip
+
+    def _captures(self, row: Row, take: int) -> None:
+        assert self.run is not None
+        for i in range(row.points):
+            self._emit(
+                m.Capture, row_index=row.index, take=take, point=i, column=row.column(i), edge_ns=i, first_pulse_ns=i,
+                last_pulse_ns=i, pulses=self.run.pulses, width_max_ns=1, jitter_ns=1,
+            )  # fmt: skip
+
+    def _run_at_its_pace(self, row: Row, take: int) -> None:
+        """Bursts 60 ms apart, pulses 1.5 ms apart, on a clock of its own, each frame 0.1 ms after its pulse."""
+        assert self.run is not None
+        n, period, ahead = self.run.pulses, 1_500_000, 77_000_000_000
+        begin = time.monotonic_ns() + 20_000_000
+        for point in range(row.points):
+            first = begin + point * 60_000_000
+            for k in range(n):
+                while (left := first + k * period + 100_000 - time.monotonic_ns()) > 0:
+                    time.sleep(left * 1e-9 if left > 2_000_000 else 0)
+                for card in self.cards:
+                    card.send_frame(row.index, take, point * n + k, self.rig.frame_bytes)
+            self._emit(
+                m.Capture, row_index=row.index, take=take, point=point, column=row.column(point), edge_ns=first + ahead,
+                first_pulse_ns=first + ahead, last_pulse_ns=first + (n - 1) * period + ahead, pulses=n, width_max_ns=1,
+                jitter_ns=1,
+            )  # fmt: skip
+        for card in self.cards:
+            card.end_frames()
+
+    def finish_hanging(self) -> None:
+        """The hanging row ends well, with no host to see it."""
+        assert self.hanging is not None
+        (row, take), self.hanging = self.hanging, None
+        n = row.points
+        self._emit(
+            m.RowFinished, row_index=row.index, take=take, status="done", points=n, edges=n, bursts=n,
+            pulses=n * self.rig.burst.pulses,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@dataclass
+class FakeRig:
+    instrument: Instrument
+    cards: dict[str, FakeCard] = field(default_factory=dict)
+    pi: FakePi | None = None
+
+    def start(self) -> None:
+        for board in self.instrument.recorded:
+            self.cards[board.name] = FakeCard(board, self.instrument.row_bytes)
+        self.start_pi()
+
+    def start_pi(self) -> None:
+        journal = self.pi.journal if self.pi else {}
+        self.pi = FakePi(self.instrument, list(self.cards.values()))
+        self.pi.journal = journal
+
+    def close(self) -> None:
+        for card in self.cards.values():
+            card.close()
+        if self.pi is not None:
+            self.pi.close()
+
+
+def small_instrument(**limits: float) -> Instrument:
+    """The published rig with a grid of 3 x 4 points and 3 pulses, on a random loopback subnet."""
+    raw = to_builtins(load_instrument(REPO / "instrument.toml"))
+    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
+    raw["grid"] |= {"columns": 3, "rows": 4}
+    raw["burst"] |= {"pulses": 3}
+    raw["limits"] |= {"end_of_record_s": 0.25, "command_timeout_s": 1.5, "free_disk_bytes": 0, **limits}
+    raw["card"]["receive_buffer_bytes"] = 1 << 20
+    for board in raw["boards"]:
+        board["host_address"] = f"{subnet}.30"
+        board["card_address"] = f"{subnet}.{board['card_address'].rpartition('.')[2]}"
+    raw["pi"] |= {"command_address": f"tcp://{subnet}.10:5601", "event_address": f"tcp://{subnet}.10:5602"}
+    return decode(raw, Instrument, "test")
+
+
+@pytest.fixture
+def rig():
+    fake = FakeRig(small_instrument())
+    fake.start()
+    yield fake
+    fake.close()
+
+
+@pytest.fixture
+def payload():
+    return payload_of
+
+
+@pytest.fixture
+def make_instrument():
+    return small_instrument

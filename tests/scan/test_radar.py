@@ -1,0 +1,277 @@
+"""Radars that are re-armed for each row: the line server's client, its errors, and a scan that depends on it."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+import time
+
+import msgspec
+import pytest
+
+from host.radar.backends import Endless, radar_control
+from host.radar.interface import BoardState, RadarControl, RadarState
+from host.radar.line_server import LINE, LineServers
+from host.scan.run import run_scan
+from host.store.scanfolder import ScanFolder
+from shared.config import Instrument, Radar, decode, to_builtins
+from shared.errors import ConfigError, DeviceError, ScanError
+from simulators.card_faults import Faults
+from simulators.line_server import LineServer
+
+
+class Server:
+    """A control server of the test's own, on a free port."""
+
+    def __init__(self) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.listener.settimeout(30)
+        self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
+        self.clients: list[socket.socket] = []
+
+    def accept(self) -> socket.socket:
+        client, _ = self.listener.accept()
+        client.settimeout(30)
+        self.clients.append(client)
+        return client
+
+    def close(self) -> None:
+        for s in (*self.clients, self.listener):
+            s.close()
+
+
+@pytest.fixture
+def server():
+    made = Server()
+    yield made
+    made.close()
+
+
+def until(condition) -> None:
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_each_row_sends_the_line_once_over_one_connection(server):
+    with LineServers({"RH": server.address}, 5.0) as radars:
+        client = server.accept()
+        for _ in range(3):
+            radars.arm(48)
+            assert client.recv(100) == b"Retrigger\n"
+            assert radars.states()["RH"].state is RadarState.UNKNOWN
+            assert "never answers" in radars.states()["RH"].detail
+    assert client.recv(1) == b""
+
+
+def test_a_server_that_closes_after_each_line_gets_a_new_connection(server):
+    with LineServers({"RH": server.address}, 5.0) as radars:
+        for row in range(3):
+            client = server.accept() if row == 0 else None
+            if client is None:
+                radars.arm(1)
+                client = server.accept()
+                assert client.recv(100) == LINE
+            client.close()
+            until(lambda: radars._is_closed("RH"))
+            assert radars.states()["RH"].state is RadarState.UNKNOWN
+
+
+def test_a_reset_is_a_fault_until_the_next_line(server):
+    with LineServers({"RH": server.address}, 5.0) as radars:
+        client = server.accept()
+        radars.arm(1)
+        assert client.recv(100) == LINE
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        client.close()
+        until(lambda: radars.states()["RH"].state is RadarState.FAULT)
+        assert "reset" in radars.states()["RH"].detail
+        radars.arm(1)
+        assert server.accept().recv(100) == LINE
+        assert radars.states()["RH"].state is RadarState.UNKNOWN
+
+
+def test_refused_connection_says_what_to_do(server):
+    server.close()
+    with pytest.raises(DeviceError, match=r"RH: .*127\.0\.0\.1:\d+: connection refused") as e:
+        LineServers({"RH": server.address}, 5.0)
+    assert "no server listens" in e.value.why
+    assert "radar.servers" in e.value.remedy
+
+
+def test_server_gone_between_rows_is_named(server):
+    with LineServers({"RH": server.address}, 5.0) as radars:
+        server.accept()
+        server.close()
+        until(lambda: radars._is_closed("RH"))
+        with pytest.raises(DeviceError, match="connection refused"):
+            radars.arm(1)
+
+
+def test_unknown_host_is_named():
+    with pytest.raises(DeviceError, match=r"no-such-host\.invalid:5000"):
+        LineServers({"RH": "no-such-host.invalid:5000"}, 2.0)
+
+
+HALF_OPEN = """
+import socket, subprocess
+from host.radar.line_server import LineServers
+from shared.errors import DeviceError
+subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+listener = socket.create_server(("127.0.0.1", 5000))
+radars = LineServers({"RH": "127.0.0.1:5000"}, 0.5)
+radars.arm(1)
+subprocess.run(["ip", "link", "set", "lo", "down"], check=True)
+try:
+    radars.arm(1)
+except DeviceError as e:
+    print(e)
+"""
+
+
+def test_half_open_connection_is_noticed():
+    """The machine vanishes without a word: here its network does, in a namespace of its own."""
+    if shutil.which("ip") is None or subprocess.run(["unshare", "-rn", "true"], check=False).returncode:
+        pytest.skip("needs iproute2 and user namespaces")
+    done = subprocess.run(
+        ["unshare", "-rn", sys.executable, "-c", HALF_OPEN], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert "has not taken the line within 0.5 s" in done.stdout
+    assert "half-open" in done.stdout
+
+
+# --- the rig file ---
+
+
+def with_radar(instrument: Instrument, **radar) -> dict:
+    return {**to_builtins(instrument), "radar": radar}
+
+
+@pytest.mark.parametrize(
+    ("radar", "rule"),
+    [
+        ({"control": "telepathy"}, "radar.control"),
+        ({"control": "line_server"}, "needs one of radar.servers for every board"),
+        ({"servers": {"XX": "127.0.0.1:5000"}}, "names no board"),
+        ({"servers": {"RH": "127.0.0.1"}}, "radar.servers"),
+        ({"servers": {"RH": "127.0.0.1:70000"}}, "1..65535"),
+    ],
+)
+def test_wrong_radar_tables_are_refused(make_instrument, radar, rule):
+    with pytest.raises(ConfigError, match=rule):
+        decode(with_radar(make_instrument(), **radar), Instrument, "test")
+
+
+def test_backend_is_that_of_the_rig_file(make_instrument):
+    assert isinstance(radar_control(make_instrument()), Endless)
+    assert make_instrument().radar == Radar()
+
+
+# --- rows that depend on it ---
+
+
+class Native(RadarControl):
+    """What a backend that talks to the radar itself would say, by the script of a test: a state for each arming."""
+
+    def __init__(self, *script: RadarState) -> None:
+        self._script, self.armed, self.closed = script, [], False
+
+    def arm(self, frames: int) -> None:
+        self.armed.append(frames)
+
+    def states(self) -> dict[str, BoardState]:
+        state = self._script[min(len(self.armed), len(self._script)) - 1]
+        return {"RH": BoardState(state, "RF core fault 7"), "RV": BoardState(RadarState.ARMED)}
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def reasons(scan: ScanFolder) -> list[str]:
+    return [reason for fact in scan.facts("row_rejected") for reason in fact["reasons"]]
+
+
+def test_radars_are_armed_for_every_take_and_let_go_at_the_end(rig, tmp_path):
+    rig.cards["RV"].drop[1, 1] = {3}
+    radars = Native(RadarState.ARMED)
+    assert run_scan(rig.instrument, tmp_path / "s", radars=radars).exit_status == "success"
+    assert radars.armed == [9] * 5  # four rows and a retake, 3 points x 3 pulses each
+    assert radars.closed
+
+
+def test_radar_in_fault_is_not_scanned_with_but_armed_again(rig, tmp_path):
+    radars = Native(RadarState.FAULT, RadarState.ARMED)
+    result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    assert rig.pi.rows_run[0] == (0, 2)  # the first take was never sent to the stage
+    assert "RH: the radar has stopped: RF core fault 7" in reasons(result.folder)
+
+
+def test_radar_that_faults_within_a_row_ends_it_at_once(rig, tmp_path):
+    rig.pi.hang_at = {0}
+    radars = Native(RadarState.ARMED)
+    seen = []
+
+    def progress(p) -> None:
+        seen.append(p.state)
+        if p.state == "running" and (p.row, p.take) == (0, 1):
+            radars._script = (RadarState.FAULT, RadarState.ARMED)
+            radars.armed = radars.armed[:1]
+        if p.phase == "retake":
+            rig.pi.hang_at = set()
+
+    result = run_scan(rig.instrument, tmp_path / "s", radars=radars, progress=progress)
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    assert "aborting" in seen
+    assert any("RF core fault 7" in r for r in reasons(result.folder))
+
+
+def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):
+    """Bursts are sent and a board stays silent: the row, which here would never end, is aborted and taken again."""
+    rig.cards["RH"].silent_data = True
+    rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
+    limits = msgspec.structs.replace(rig.instrument.limits, row_retakes=1)
+
+    def progress(p) -> None:
+        if p.phase == "retake":
+            rig.pi.hang_at = set()
+            rig.cards["RH"].silent_data = False
+
+    result = run_scan(msgspec.structs.replace(rig.instrument, limits=limits), tmp_path / "s", progress=progress)
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    assert any("no data from RH" in r for r in reasons(result.folder))
+
+
+def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_path):
+    rig.cards["RH"].silent_data = True
+    radar = Radar("line_server", dict.fromkeys((b.name for b in rig.instrument.boards), server.address))
+    with pytest.raises(ScanError, match="RH: no data") as e:
+        run_scan(msgspec.structs.replace(rig.instrument, radar=radar), tmp_path / "s")
+    assert f"asked to re-arm at {server.address}, which never answers" in e.value.why
+    lines = [server.accept().recv(1000) for _ in rig.instrument.boards]
+    assert lines == [LINE * 3] * 3
+    rejected = reasons(ScanFolder.load(tmp_path / "s"))
+    assert any("may not have obeyed" in r for r in rejected)
+
+
+# --- the simulated server ---
+
+
+def test_simulated_server_arms_once_a_line_and_fails_as_told():
+    armed = []
+    made = LineServer("127.0.0.1:0", lambda: armed.append(1), Faults(retrigger_fails=(1,), retrigger_resets=(3,)))
+    address = f"127.0.0.1:{made._listener.getsockname()[1]}"
+    with LineServers({"RH": address}, 5.0) as radars:
+        for n, want in enumerate([1, 1, 2, 2], 1):
+            radars.arm(1)
+            until(lambda n=n: made.serve() or made.lines == n)
+            assert len(armed) == want
+        until(lambda: radars.states()["RH"].state is RadarState.FAULT)
+        radars.arm(1)
+        until(lambda: made.serve() or made.lines == 5)
+        assert len(armed) == 3
+    made.close()

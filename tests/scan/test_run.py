@@ -1,0 +1,294 @@
+"""A scan against a fake Pi and fake cards: every end of a row and of a scan."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+import zlib
+from pathlib import Path
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+import tomli_w
+
+from host.scan.run import resume_scan, run_scan
+from host.scan.running import takes_so_far
+from host.scan.stop import StopRequest
+from host.store.scanfolder import ScanFolder
+from host.store.validate import validate
+from shared.config import to_builtins
+from shared.errors import DeviceError, ScanError
+
+
+def digests(scan: ScanFolder) -> dict[str, str]:
+    return {
+        b.file: hashlib.sha256((scan.path / b.file).read_bytes()).hexdigest()
+        for r in scan.committed().values()
+        for b in r.boards.values()
+    }
+
+
+def errors(path: Path) -> list[str]:
+    return [str(f) for f in validate(path) if f.severity == "error"]
+
+
+def test_whole_scan_is_bit_exact_and_valid(rig, payload, tmp_path):
+    rows, seen = [], []
+    result = run_scan(rig.instrument, tmp_path / "s", on_row=rows.append, progress=seen.append)
+    assert (result.exit_status, result.processing_error) == ("success", None)
+    assert rows == [0, 1, 2, 3]
+    scan = ScanFolder.load(tmp_path / "s")
+    assert scan.complete
+    assert scan.simulated
+    for row in scan.rows():
+        for board in ("RH", "RV"):
+            data = scan.read_row(board, row)
+            assert data.payload.tobytes() == payload(board, row, rig.instrument.row_bytes)
+            assert data.missing == []
+            assert data.mask is None
+    assert validate(tmp_path / "s") == []
+    assert {p.phase for p in seen} >= {"connect", "home", "row", "committed", "end"}
+    assert seen[-1].committed == 4
+
+
+def test_events_and_rows_read_by_an_independent_reader(rig, payload, tmp_path):
+    run_scan(rig.instrument, tmp_path / "s")
+    with (tmp_path / "s" / "events.msgpack").open("rb") as f:
+        events = list(msgpack.Unpacker(f))
+    assert [e["seq"] for e in events] == list(range(1, len(events) + 1))
+    assert (events[0]["type"], events[-1]["type"]) == ("RunStarted", "RunStopped")
+    assert sum(e["type"] == "Capture" for e in events) == rig.instrument.grid.columns * rig.instrument.grid.rows
+    raw = np.fromfile(tmp_path / "s" / "raw" / "RH" / "0002.bin", dtype=np.uint8)
+    assert raw.tobytes() == payload("RH", 2, raw.size)
+    for line in (tmp_path / "s" / "manifest.jsonl").read_text().splitlines():
+        fact = json.loads(line)
+        crc = fact.pop("crc")
+        assert crc == f"{zlib.crc32(json.dumps(fact, sort_keys=True, separators=(',', ':')).encode()):08x}"
+
+
+def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
+    rig.pi.lose_events = 7
+    assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
+    assert errors(tmp_path / "s") == []
+    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")[0]
+    assert ended["events_refetched"] >= 7
+
+
+def test_lost_reply_runs_no_row_twice(rig, tmp_path):
+    lose = {"done": False}
+
+    def progress(p):
+        if p.phase == "row" and p.row == 1 and not lose["done"]:
+            lose["done"] = True
+            rig.pi.lose_replies = 2
+
+    assert run_scan(rig.instrument, tmp_path / "s", progress=progress).exit_status == "success"
+    assert rig.pi.rows_run == [(0, 1), (1, 1), (2, 1), (3, 1)]
+
+
+@pytest.mark.parametrize("dropped", [{0}, {5}, {25}, {0, 1, 25}])
+def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, dropped):
+    rig.cards["RV"].drop[1, 1] = dropped
+    result = run_scan(rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    scan = ScanFolder.load(tmp_path / "s")
+    assert scan.committed()[1].take == 2
+    assert scan.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
+    rejected = scan.facts("row_rejected")
+    assert [(r["row"], r["take"]) for r in rejected] == [(1, 1)]
+    assert "RV" in rejected[0]["reasons"][0]
+    assert errors(tmp_path / "s") == []
+
+
+def test_missed_pulse_is_seen_by_count(rig, tmp_path):
+    rig.cards["RH"].short[2, 1] = rig.instrument.frame_bytes
+    assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
+    reason = ScanFolder.load(tmp_path / "s").facts("row_rejected")[0]["reasons"][0]
+    assert "1 frames" in reason
+    assert "SYNC_IN" in reason
+
+
+def test_fault_of_the_pi_makes_the_row_be_taken_again(rig, tmp_path):
+    rig.pi.fail_rows[0, 1] = 103
+    assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
+    assert "edge" in ScanFolder.load(tmp_path / "s").facts("row_rejected")[0]["reasons"][0]
+
+
+def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
+    for take in (1, 2, 3):
+        rig.cards["RV"].drop[1, take] = {3}
+    with pytest.raises(ScanError, match="RV") as e:
+        run_scan(rig.instrument, tmp_path / "s")
+    assert "3 takes" in e.value.what
+    scan = ScanFolder.load(tmp_path / "s")
+    assert list(scan.committed()) == [0]
+    assert scan.facts("scan_ended")[0]["exit_status"] == "fail"
+    assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
+    result = resume_scan(tmp_path / "s")
+    assert result.exit_status == "success"
+    assert ScanFolder.load(tmp_path / "s").committed()[1].take == 4
+    assert errors(tmp_path / "s") == []
+
+
+def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
+    for take in (1, 2, 3):
+        rig.cards["RV"].drop[1, take] = {3, 4, 9}
+    result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
+    assert (result.exit_status, result.incomplete_rows) == ("success", [1])
+    data = ScanFolder.load(tmp_path / "s").read_row("RV", 1)
+    assert data.missing == [(3 * 1456, 5 * 1456), (9 * 1456, 10 * 1456)]
+    want = np.frombuffer(payload("RV", 1, rig.instrument.row_bytes), dtype=np.uint8)
+    assert data.mask is not None
+    assert np.array_equal(data.payload[~data.mask], want[~data.mask])
+    assert not data.payload[data.mask].any()
+    assert errors(tmp_path / "s") == []
+
+
+def test_keep_incomplete_masks_a_slipped_row_as_a_whole(rig, tmp_path):
+    for take in (1, 2, 3):
+        rig.cards["RH"].short[1, take] = rig.instrument.frame_bytes
+    run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
+    scan = ScanFolder.load(tmp_path / "s")
+    assert scan.read_row("RH", 1).missing == [(0, rig.instrument.row_bytes)]
+    assert scan.committed()[1].boards["RH"].frames_received == 0
+
+
+def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
+    stop = StopRequest()
+
+    def progress(p):
+        if p.phase == "row" and p.row == 1 and not stop.after_row:
+            stop.request()
+
+    result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
+    assert result.exit_status == "abort"
+    assert list(result.folder.committed()) == [0, 1]
+    before = digests(result.folder)
+    (tmp_path / "s" / "raw" / "RH" / "0002.part").write_bytes(b"half a row")
+    with (tmp_path / "s" / "manifest.jsonl").open("ab") as f:
+        f.write(b'{"fact": "row_comm')
+    rows: list[int] = []
+    result = resume_scan(tmp_path / "s", on_row=rows.append)
+    assert result.exit_status == "success"
+    assert rows == [0, 1, 2, 3]
+    after = digests(result.folder)
+    assert {k: after[k] for k in before} == before
+    assert result.folder.read_row("RV", 3).payload.tobytes() == payload("RV", 3, rig.instrument.row_bytes)
+    assert errors(tmp_path / "s") == []
+    assert set(takes_so_far(result.folder)) == {0, 1, 2, 3}
+
+
+def test_stop_now_aborts_the_row(rig, tmp_path):
+    rig.pi.hang_at = {0}
+    stop = StopRequest()
+
+    def progress(p):
+        if p.phase == "row":
+            stop.request()
+            stop.request()
+
+    result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
+    assert result.exit_status == "abort"
+    assert list(result.folder.committed()) == []
+    assert not list((tmp_path / "s" / "raw").rglob("*.part"))
+    assert result.folder.facts("scan_ended")[0]["exit_status"] == "abort"
+
+
+def test_killed_host_resumes_and_committed_rows_stay(rig, payload, tmp_path):
+    """SIGKILL within row 2, of which half has come. The Pi goes on and ends the row; that end is not the new take's."""
+    (tmp_path / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig.instrument)))
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom shared.config import load_instrument\n"
+        "from host.scan.run import run_scan\nrun_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
+    )
+    rig.pi.hang_at = {2}
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "rig.toml"), str(tmp_path / "s")]) as host:
+        deadline = time.monotonic() + 30
+        while rig.pi.hanging is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        host.kill()
+    rig.pi.finish_hanging()
+    rig.pi.hang_at = set()
+    scan = ScanFolder.load(tmp_path / "s")
+    before = digests(scan)
+    assert list(scan.rows()) == [0, 1]
+    assert errors(tmp_path / "s") == []
+    result = resume_scan(tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 0)
+    assert {k: v for k, v in digests(result.folder).items() if k in before} == before
+    assert [r.take for r in result.folder.committed().values()] == [1, 1, 2, 1]
+    assert result.folder.read_row("RH", 2).payload.tobytes() == payload("RH", 2, rig.instrument.row_bytes)
+    assert validate(tmp_path / "s") == []
+
+
+def test_processing_error_does_not_stop_the_scan(rig, tmp_path):
+    def on_row(row: int) -> None:
+        if row == 1:
+            raise ScanError("cannot process")
+
+    result = run_scan(rig.instrument, tmp_path / "s", on_row=on_row)
+    assert result.exit_status == "success"
+    assert isinstance(result.processing_error, ScanError)
+
+
+def test_on_row_runs_beside_the_scan(rig, tmp_path):
+    names = set()
+    run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: names.add(threading.current_thread().name))
+    assert len(names) == 1
+    assert threading.current_thread().name not in names
+
+
+def test_no_pi(make_instrument, tmp_path):
+    instrument = make_instrument(command_timeout_s=0.3)
+    with pytest.raises(DeviceError, match="5601") as e:
+        run_scan(instrument, tmp_path / "s")
+    assert "polysight-pi run" in e.value.why
+    assert not (tmp_path / "s").exists()
+
+
+def test_mute_card_is_named(rig, tmp_path):
+    rig.cards["RV"].mute = True
+    with pytest.raises(DeviceError, match="RV") as e:
+        run_scan(rig.instrument, tmp_path / "s")
+    assert rig.instrument.by_name("RV").card_address in e.value.what
+    assert not (tmp_path / "s").exists()
+
+
+def test_no_data_is_told_from_a_mute_card(rig, tmp_path):
+    rig.cards["RH"].silent_data = True
+    with pytest.raises(ScanError, match="RH: no data") as e:
+        run_scan(rig.instrument, tmp_path / "s")
+    assert "SYNC_IN" in e.value.why
+    assert "armed" in e.value.why
+
+
+def test_port_in_use_is_named(rig, tmp_path):
+    board = rig.instrument.by_name("RV")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((board.host_address, board.data_port))
+        with pytest.raises(DeviceError, match=f"{board.host_address}:{board.data_port}") as e:
+            run_scan(rig.instrument, tmp_path / "s")
+    assert "ss -ulnp" in e.value.remedy
+
+
+def test_existing_scan_is_not_overwritten(rig, tmp_path):
+    run_scan(rig.instrument, tmp_path / "s")
+    before = digests(ScanFolder.load(tmp_path / "s"))
+    with pytest.raises(DeviceError, match="manifest"):
+        run_scan(rig.instrument, tmp_path / "s")
+    assert digests(ScanFolder.load(tmp_path / "s")) == before
+
+
+def test_full_disk_is_refused_before_the_first_row(rig, tmp_path):
+    big = msgspec.structs.replace(rig.instrument.limits, free_disk_bytes=1 << 60)
+    with pytest.raises(ScanError, match="GB free"):
+        run_scan(msgspec.structs.replace(rig.instrument, limits=big), tmp_path / "s")
+    assert rig.pi.rows_run == []

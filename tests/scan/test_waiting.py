@@ -1,0 +1,270 @@
+"""The scan waits between rows rather than lose data: for processing, for the disk; and it stops as it is told."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from host.scan import ready, row
+from host.scan.processing import NICE
+from host.scan.run import resume_scan, run_scan
+from host.scan.stop import StopRequest
+from host.store.scanfolder import ScanFolder
+from host.store.validate import validate
+from shared import messages as m
+from shared.errors import DeviceError, ScanError
+
+
+def limited(instrument, **limits):
+    return msgspec.structs.replace(instrument, limits=msgspec.structs.replace(instrument.limits, **limits))
+
+
+def receivers() -> list[int]:
+    """Process ids of this process' receivers."""
+    children = Path(f"/proc/self/task/{threading.main_thread().native_id}/children").read_text().split()
+    found = []
+    for pid in children:
+        line = Path(f"/proc/{pid}/cmdline").read_bytes()
+        if b"host.capture.receiver_process" in line:
+            found.append(int(pid))
+    return found
+
+
+def test_next_row_waits_for_processing_and_says_so(rig, tmp_path):
+    """Processing hangs on row 0: with one row allowed to wait, row 2 is committed last; released, all are."""
+    release, started, at_wait = threading.Event(), [], []
+
+    def on_row(_: int) -> None:
+        assert release.wait(60)
+
+    def progress(p) -> None:
+        if p.phase == "row" and p.message:
+            started.append(p.row)
+        if p.phase == "wait":
+            at_wait.append((p.message, list(started)))
+            release.set()
+
+    result = run_scan(limited(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=on_row, progress=progress)
+    assert result.exit_status == "success"
+    assert at_wait[0] == ("2 rows wait to be processed; the next one begins when they are fewer", [0, 1])
+    assert started == [0, 1, 2, 3]
+    assert result.processing_error is None
+    assert validate(tmp_path / "s") == []
+
+
+def test_stop_while_waiting_for_processing(rig, tmp_path):
+    release, stop = threading.Event(), StopRequest()
+
+    def progress(p) -> None:
+        if p.phase == "wait":
+            stop.request()
+            release.set()
+
+    result = run_scan(
+        limited(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=lambda _: release.wait(60) and None,
+        progress=progress, stop=stop,
+    )  # fmt: skip
+    assert (result.exit_status, sorted(result.folder.committed())) == ("abort", [0, 1])
+
+
+def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
+    stop = StopRequest()
+    run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=lambda p: p.row == 2 and stop.request())
+    release, waits = threading.Event(), []
+
+    def progress(p) -> None:
+        waits.extend([p.message] if p.phase == "wait" else [])
+        if p.phase == "committed":
+            release.set()
+
+    resume_scan(tmp_path / "s", on_row=lambda _: release.wait(60) and None, progress=progress)
+    assert waits == []
+
+
+def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, payload, tmp_path, monkeypatch):
+    """The receivers stop dead while they should write row 1, until the notice comes."""
+    monkeypatch.setattr(row, "_DISK_NOTICE_S", 0.05)
+    stopped: list[int] = []
+    notices: list[tuple[int, str]] = []
+
+    def progress(p) -> None:
+        if p.state == "writing" and p.row == 1 and p.phase == "state" and not stopped:
+            stopped.extend(receivers())
+            for pid in stopped:
+                os.kill(pid, signal.SIGSTOP)
+        if p.phase == "wait" and p.row == 1 and not notices:
+            notices.append((len(rig.pi.rows_run), p.message))
+            for pid in stopped:
+                os.kill(pid, signal.SIGCONT)
+
+    result = run_scan(rig.instrument, tmp_path / "s", progress=progress)
+    assert len(stopped) == 2
+    assert notices[0][0] == 2, "the next row has not begun"
+    assert "the disk has not taken it" in notices[0][1]
+    assert (result.exit_status, result.retakes) == ("success", 0)
+    for index in range(4):
+        assert result.folder.read_row("RH", index).payload.tobytes() == payload("RH", index, rig.instrument.row_bytes)
+
+
+def test_full_disk_between_rows_ends_the_scan_before_the_next_row(rig, tmp_path, monkeypatch):
+    real = shutil.disk_usage
+
+    def filling(path):
+        return real(path)._replace(free=rig.instrument.row_bytes if len(rig.pi.rows_run) >= 2 else 1 << 40)
+
+    monkeypatch.setattr(ready.shutil, "disk_usage", filling)
+    with pytest.raises(ScanError, match="GB free"):
+        run_scan(rig.instrument, tmp_path / "s")
+    assert rig.pi.rows_run == [(0, 1), (1, 1)]
+    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")[0]
+    assert ended["exit_status"] == "fail"
+    assert "GB free" in ended["reason"]
+    monkeypatch.undo()
+    assert resume_scan(tmp_path / "s").exit_status == "success"
+
+
+def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, tmp_path):
+    """The reservation itself fails: a limit on the size of files stands for a disk that filled up meanwhile."""
+
+    def progress(p) -> None:
+        if p.state == "waiting" and len(rig.pi.rows_run) == 2:
+            for pid in receivers():
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (1000, 1000))
+
+    with pytest.raises(DeviceError, match="cannot reserve") as e:
+        run_scan(rig.instrument, tmp_path / "s", progress=progress)
+    assert "resume" in e.value.remedy
+    assert rig.pi.rows_run == [(0, 1), (1, 1)]
+    assert not list((tmp_path / "s").rglob("*.part"))
+    result = resume_scan(tmp_path / "s")
+    assert result.exit_status == "success"
+    assert validate(tmp_path / "s") == []
+
+
+def test_capture_has_priority_over_processing(rig, tmp_path):
+    """Whatever the system permits: a receiver is real-time, or has the lower nice value by NICE at least."""
+    processing, capture = [], []
+
+    def on_row(_: int) -> None:
+        processing.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+
+    def progress(p) -> None:
+        if p.state == "running" and not capture:
+            for pid in receivers():
+                rt = os.sched_getscheduler(pid) in (os.SCHED_RR, os.SCHED_FIFO)
+                capture.append(-100 if rt else os.getpriority(os.PRIO_PROCESS, pid))
+
+    run_scan(rig.instrument, tmp_path / "s", on_row=on_row, progress=progress)
+    assert len(capture) == 2
+    assert len(processing) == 4
+    assert min(processing) - max(capture) >= NICE or min(processing) == 19
+
+
+def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
+    rig.pi.notes[1, 1] = "held on the way: some positions were passed below full speed"
+    result = run_scan(rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 0)
+    facts = {f["row"]: f for f in result.folder.facts("row_committed")}
+    assert facts[1]["take"] == 1
+    assert facts[1]["note"].startswith("held")
+    assert "note" not in facts[0]
+    assert validate(tmp_path / "s") == []
+
+
+def test_row_held_so_long_that_the_cards_ended_their_records_is_taken_again(rig, tmp_path):
+    rig.pi.notes[1, 1] = "held on the way: some positions were passed below full speed"
+    rig.cards["RV"].short[1, 1] = 3 * rig.instrument.frame_bytes
+    result = run_scan(rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    assert "the row was held" in result.folder.facts("row_rejected")[0]["reasons"][0]
+
+
+def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
+    monkeypatch.setattr(row, "row_limit_s", lambda *_: 0.3)
+    rig.pi.hang_at = {1}
+    told = []
+
+    def progress(p) -> None:
+        if p.state == "running" and (p.row, p.take) == (1, 1) and p.phase == "state":
+            rig.pi.state = "held"
+        if p.phase == "held":
+            told.append(time.monotonic())
+            threading.Timer(1.0, end).start()
+
+    def end() -> None:
+        rig.pi.hang_at = set()
+        rig.pi.state = "ready"
+        rig.pi.wanted_end = True
+
+    result = run_scan(rig.instrument, tmp_path / "s", progress=progress)
+    assert result.exit_status == "success"
+    assert len(told) == 1
+
+
+def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
+    """From the second request to Abort: no more than one turn of the loop, and no other command."""
+    rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
+    stop, turns, seen = StopRequest(), [], []
+    turn = row.RowTaker._turn
+
+    def counted(self, take) -> None:
+        turns.append(stop.now)
+        turn(self, take)
+
+    monkeypatch.setattr(row.RowTaker, "_turn", counted)
+
+    def progress(p) -> None:
+        if p.points and not stop.now:
+            stop.request()
+            stop.request()
+            seen.append(len(rig.pi.commands))
+
+    result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
+    assert result.exit_status == "abort"
+    after = rig.pi.commands[seen[0] :]
+    assert isinstance(after[0], m.Abort)
+    assert turns.count(True) <= 2, "one may be in hand; the next one waits for the end of the row"
+    assert row._TURN_MS <= 100
+    ended = result.folder.facts("scan_ended")[0]
+    assert (ended["exit_status"], ended["reason"]) == ("abort", "stopped on request, 4 of 4 rows are missing")
+
+
+@pytest.mark.parametrize("state", ["waiting", "arming"])
+def test_stop_now_before_the_row_begins_moves_nothing(rig, tmp_path, state):
+    stop = StopRequest()
+
+    def progress(p) -> None:
+        if p.state == state and len(rig.pi.rows_run) == 1:
+            stop.request()
+            stop.request()
+
+    result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
+    assert result.exit_status == "abort"
+    assert rig.pi.rows_run == [(0, 1)]
+    assert list(result.folder.committed()) == [0]
+    assert resume_scan(tmp_path / "s").exit_status == "success"
+
+
+def test_every_end_is_written_down(rig, tmp_path):
+    """An error that is no fault of the rig is an end with a reason, too."""
+
+    class BugError(Exception):
+        pass
+
+    def progress(p) -> None:
+        if p.phase == "committed" and p.row == 1:
+            raise BugError("oops")
+
+    with pytest.raises(BugError):
+        run_scan(rig.instrument, tmp_path / "s", progress=progress)
+    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")
+    assert [(f["exit_status"], f["reason"]) for f in ended] == [("fail", "BugError: oops")]
+    assert resume_scan(tmp_path / "s").exit_status == "success"

@@ -1,0 +1,70 @@
+"""The one fault table reaches the firmware; simulated wires keep edges and their times."""
+
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.errors import DeviceError, ProtocolError
+from shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
+from shared.wires import WireClient, WireEdge, WireMotion, encode, parse
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_every_number_is_explained_and_unique():
+    numbers = [*map(int, StageError), *map(int, PiFault)]
+    assert sorted(numbers) == sorted(EXPLANATIONS)
+    assert all(all(explain(k)) for k in numbers)
+    assert "unknown fault 250" in explain(250).what
+
+
+def test_the_firmware_header_is_the_table():
+    assert (ROOT / "arduino_stage" / "stage_errors.h").read_text() == c_header()
+
+
+big = st.integers(-(2**60), 2**60)
+messages = st.builds(WireEdge, big, st.integers(0, 60), st.integers(0, 1)) | st.builds(WireMotion, big, big, big, big)
+
+
+@given(messages)
+def test_wire_lines_round_trip(message: WireEdge | WireMotion):
+    assert parse(encode(message).decode().strip()) == message
+
+
+@pytest.mark.parametrize("line", ["", "S 1 2", "S 1 2 3", "M 1 2 3", "X 1 2 3", "S a 2 1"])
+def test_other_lines_are_refused(line: str):
+    with pytest.raises(ProtocolError):
+        parse(line)
+
+
+def test_client_receives_what_was_sent_in_order_and_tells_when_the_hub_ends(tmp_path: Path):
+    path = tmp_path / "hub"
+    hub = socket.socket(socket.AF_UNIX)
+    hub.bind(str(path))
+    hub.listen()
+    sent = [WireEdge(k, 26, k % 2) for k in range(1000)]
+
+    def serve() -> None:
+        peer, _ = hub.accept()
+        assert peer.recv(100) == b"L 26\n"
+        peer.sendall(b"K\n" + b"".join(map(encode, sent)))
+        peer.close()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    client = WireClient(path, listen=(26,))
+    assert [client.receive(5.0) for _ in sent] == sent
+    with pytest.raises(DeviceError, match="were closed"):
+        client.receive(5.0)
+    client.close()
+    thread.join()
+    hub.close()
+
+
+def test_nobody_listening_is_a_clear_error(tmp_path: Path):
+    with pytest.raises(DeviceError, match="nobody listens"):
+        WireClient(tmp_path / "none", timeout_s=0.05)

@@ -1,0 +1,50 @@
+"""The serpentine plan: every position once, odd rows back, centred on offset zero."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.config import Burst, Grid, Stage
+from shared.errors import ConfigError
+from shared.raster import check_burst_fits, mean_burst_travel_mm, plan_raster
+
+grids = st.builds(
+    Grid,
+    columns=st.integers(1, 40),
+    rows=st.integers(1, 40),
+    step_x_mm=st.floats(0.5, 10),
+    step_y_mm=st.floats(0.5, 10),
+)
+
+
+@given(grids)
+def test_every_position_is_met_exactly_once(grid: Grid):
+    seen = {(row.column(i), row.index) for row in plan_raster(grid) for i in range(row.points)}
+    assert seen == {(c, r) for c in range(grid.columns) for r in range(grid.rows)}
+
+
+@given(grids)
+def test_a_column_has_one_x_whatever_the_direction(grid: Grid):
+    x = {}
+    for row in plan_raster(grid):
+        for i in range(row.points):
+            assert row.x_mm(i) == pytest.approx(x.setdefault(row.column(i), row.x_mm(i)), abs=1e-9)
+
+
+@given(grids)
+def test_the_grid_is_centred_and_rows_alternate(grid: Grid):
+    rows = list(plan_raster(grid))
+    assert sum(row.y_mm for row in rows) == pytest.approx(0, abs=1e-6)
+    assert all(row.direction == (1 if row.index % 2 == 0 else -1) for row in rows)
+    assert all(row.x_mm(0) == pytest.approx(-row.x_mm(row.points - 1), abs=1e-9) for row in rows)
+
+
+def test_a_burst_longer_than_the_step_is_refused():
+    grid, stage = Grid(10, 10, 2.0, 2.0), Stage("x", speed_mm_s=100.0)
+    with pytest.raises(ConfigError, match=r"24\.00 ms, but the stage passes a point every 20\.00 ms"):
+        check_burst_fits(grid, Burst(16, 1500.0), stage)
+    check_burst_fits(grid, Burst(8, 1500.0), stage)
+
+
+def test_published_burst_travel():
+    assert mean_burst_travel_mm(Burst(16, 1500.0), Stage("x", speed_mm_s=20.0)) == pytest.approx(0.225)

@@ -1,0 +1,82 @@
+"""Laws of the stage line: round trip, and no single flipped bit is ever taken for a line."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.errors import ProtocolError
+from shared.stage_line import Command, Immediate, Reply, crc16, seal, unseal
+
+commands = st.builds(
+    Command,
+    sequence=st.integers(0, 65535),
+    verb=st.sampled_from(["HELLO", "HOME", "MOVE", "ROW", "SET", "CLEAR", "ENABLE"]),
+    args=st.lists(st.integers(-(2**31), 2**31 - 1), max_size=5).map(tuple),
+)
+fields = st.dictionaries(
+    st.sampled_from(["x", "y", "points", "pulses", "fw"]),
+    st.from_regex(r"[-A-Za-z0-9.]{1,8}", fullmatch=True),
+    max_size=3,
+)
+replies = st.one_of(
+    st.builds(Reply, kind=st.sampled_from(["ok", "done"]), sequence=st.integers(0, 65535), fields=fields),
+    st.builds(Reply, kind=st.just("error"), sequence=st.none() | st.integers(0, 65535), number=st.integers(0, 255)),
+    st.builds(Reply, kind=st.just("alarm"), number=st.integers(0, 255)),
+    st.builds(Reply, kind=st.sampled_from(["status", "banner"]), fields=fields),
+)
+
+
+@given(commands)
+def test_command_round_trip(command: Command):
+    assert Command.decode(command.encode()) == command
+
+
+@given(replies)
+def test_reply_round_trip(reply: Reply):
+    assert Reply.decode(reply.encode()) == reply
+
+
+@given(commands)
+def test_every_single_bit_flip_of_a_command_is_refused(command: Command):
+    line = command.encode()
+    for bit in range(len(line) * 8):
+        flipped = bytearray(line)
+        flipped[bit // 8] ^= 1 << bit % 8
+        for part in bytes(flipped).splitlines(keepends=True):
+            with pytest.raises(ProtocolError):
+                Command.decode(part)
+
+
+@given(replies)
+def test_every_single_bit_flip_of_a_reply_is_refused(reply: Reply):
+    line = reply.encode()
+    for bit in range(len(line) * 8):
+        flipped = bytearray(line)
+        flipped[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(ProtocolError):
+            Reply.decode(bytes(flipped))
+
+
+def test_no_immediate_byte_is_one_bit_away_from_a_line_byte():
+    alphabet = set(b"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 -*\n")
+    for immediate in Immediate:
+        assert not {int(immediate) ^ 1 << k for k in range(8)} & alphabet
+
+
+@given(st.binary(max_size=100))
+def test_random_bytes_are_refused_or_sealed(raw: bytes):
+    try:
+        body = unseal(raw)
+    except ProtocolError:
+        return
+    assert seal(body) == raw
+
+
+def test_crc_is_xmodem():
+    assert crc16(b"123456789") == 0x31C3  # check value of CRC-16/XMODEM
+
+
+@pytest.mark.parametrize("bad", [Command(70000, "HOME"), Command(1, "home"), Command(1, "MOVE", (2**31,))])
+def test_out_of_range_is_refused(bad: Command):
+    with pytest.raises(ProtocolError):
+        bad.encode()

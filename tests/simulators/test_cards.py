@@ -1,0 +1,318 @@
+"""The cards' process from end to end: a test client plays host and Pi, over the real sockets and the real hub."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from shared.config import Instrument, load_instrument, to_builtins
+from shared.wires import WireClient, WireEdge, WireMotion
+from simulators.card_faults import Faults
+from simulators.card_sender import ReceiveQueue, bound_udp
+from simulators.fault_draws import NetworkFaults
+from simulators.loopback import is_free, on_free_subnet, on_subnet
+from simulators.pattern import pattern_frames
+
+ROOT = Path(__file__).parents[2]
+TIME_SCALE = 20.0
+FRAME = 4096
+PERIOD_NS = 1_500_000
+CONFIGURE, PACKET = bytes.fromhex("01010102031e"), bytes.fromhex("be05350c0000")
+COMPLETED = bytes.fromhex("5aa50a000001aaee")
+
+
+class HostSide:
+    """The host's two sockets for one board."""
+
+    def __init__(self, rig: Instrument, name: str, sockets: ExitStack) -> None:
+        self.board = rig.by_name(name)
+        self.index = rig.boards.index(self.board)
+        self.commands = sockets.enter_context(bound_udp(self.board.host_address, self.board.command_port))
+        self.data = sockets.enter_context(bound_udp(self.board.host_address, self.board.data_port))
+        for s in (self.commands, self.data):
+            s.settimeout(5.0)
+        self.data.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+
+    def request(self, code: int, body: bytes = b"") -> bytes:
+        datagram = struct.pack("<HHH", 0xA55A, code, len(body)) + body + b"\xaa\xee"
+        self.commands.sendto(datagram, (self.board.card_address, self.board.command_port))
+        return self.message()
+
+    def message(self) -> bytes:
+        reply, source = self.commands.recvfrom(100)
+        assert source == (self.board.card_address, 1024)
+        return reply
+
+    def start(self) -> None:
+        for code, body in ((0x03, CONFIGURE), (0x0B, PACKET), (0x05, b"")):
+            assert self.request(code, body) == struct.pack("<HHHH", 0xA55A, code, 0, 0xEEAA)
+
+    def record(self) -> list[bytes]:
+        """All data packets until the record-completed status, which comes after the last of them."""
+        assert self.message() == COMPLETED
+        got = []
+        self.data.setblocking(False)
+        while True:
+            try:
+                packet, source = self.data.recvfrom(2000)
+            except BlockingIOError:
+                self.data.settimeout(5.0)
+                return got
+            assert source == (self.board.card_address, 1024)
+            got.append(packet)
+
+    def pattern(self, first: int, n: int) -> bytes:
+        return pattern_frames(self.index, first, n, 256).tobytes()
+
+
+def payload(packets: list[bytes]) -> bytes:
+    return b"".join(p[10:] for p in packets)
+
+
+def sequences(packets: list[bytes]) -> list[int]:
+    return [struct.unpack_from("<I", p)[0] for p in packets]
+
+
+Start = Callable[..., dict[str, HostSide]]
+
+
+@pytest.fixture
+def rig() -> Instrument:
+    return on_free_subnet(load_instrument(ROOT / "instrument.toml"))
+
+
+@pytest.fixture
+def start(rig: Instrument, tmp_path: Path) -> Iterator[Start]:
+    """Starts hub and cards with the given arguments; host sockets per board."""
+    running: list[subprocess.Popen[str]] = []
+    with ExitStack() as sockets:
+
+        def launch(*arguments: str) -> subprocess.Popen[str]:
+            process = sockets.enter_context(
+                subprocess.Popen([sys.executable, "-m", *arguments], stdout=subprocess.PIPE, text=True)
+            )
+            sockets.callback(process.kill)  # without effect on one that has ended
+            running.append(process)
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("ready")
+            return process
+
+        def begin(*arguments: str, boards: str = "RH,RV") -> dict[str, HostSide]:
+            config = tmp_path / "rig.toml"
+            config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
+            launch("simulators.wires", "--socket", str(tmp_path / "w.sock"))
+            common = ("--config", str(config), "--wires", str(tmp_path / "w.sock"), "--boards", boards, "--pattern")
+            launch("simulators.cards", *common, "--time-scale", str(TIME_SCALE), *arguments)
+            return {name: HostSide(rig, name, sockets) for name in boards.split(",")}
+
+        begin.processes = running  # type: ignore[attr-defined]
+        yield begin
+        for process in reversed(running):
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(5) == 0
+
+
+@pytest.fixture
+def pulse(start: Start, tmp_path: Path) -> Iterator[Callable[..., None]]:
+    """Sends n SYNC_IN pulses from pulse number `first` on, 1.5 ms apart; returns when the hub has passed them on."""
+    del start
+    clients: list[WireClient] = []
+
+    def send(first: int, n: int, line: int = 22) -> None:
+        if not clients:
+            clients.append(WireClient(tmp_path / "w.sock"))
+            clients.append(WireClient(tmp_path / "w.sock", (22, 23)))  # joined last, and so is told last
+        edges = []
+        for k in range(first, first + n):
+            edges += [WireEdge(k * PERIOD_NS, line, 1), WireEdge(k * PERIOD_NS + 1000, line, 0)]
+        clients[0].send(*edges)
+        while clients[1].receive(5.0) != edges[-1]:
+            pass
+
+    yield send
+    for client in clients:
+        client.close()
+
+
+def test_two_records_of_two_boards_arrive_bit_for_bit(start: Start, pulse: Callable[..., None]) -> None:
+    hosts = start()
+    last = dict.fromkeys(hosts, 0)
+    for first, frames in ((0, 48), (48, 33)):
+        for host in hosts.values():
+            host.start()
+        began = time.monotonic()
+        pulse(first, frames)
+        for name, host in hosts.items():
+            packets = host.record()
+            assert payload(packets) == host.pattern(first, frames)
+            assert [len(p) for p in packets[:-1]] == [1466] * (len(packets) - 1)
+            assert len(packets[-1]) == 10 + frames * FRAME % 1456
+            assert sequences(packets) == list(range(last[name] + 1, last[name] + len(packets) + 1))
+            last[name] += len(packets)
+        assert time.monotonic() - began >= 2.0 / TIME_SCALE
+
+
+def test_no_data_before_record_start_and_other_lines_start_no_frame(start: Start, pulse: Callable[..., None]) -> None:
+    host = start(boards="RH")["RH"]
+    pulse(0, 16)
+    host.start()
+    pulse(100, 5, line=23)
+    pulse(16, 4)
+    assert payload(host.record()) == host.pattern(16, 4)
+
+
+def test_record_stop_sends_the_rest_at_once(start: Start, pulse: Callable[..., None]) -> None:
+    host = start(boards="RH")["RH"]
+    host.start()
+    pulse(0, 3)
+    first = host.data.recv(2000)
+    assert host.request(0x06) == bytes.fromhex("5aa506000000aaee")
+    assert payload([first, *host.record()]) == host.pattern(0, 3)
+
+
+def test_a_record_goes_on_while_the_stage_moves_or_owes_a_burst(
+    start: Start, pulse: Callable[..., None], tmp_path: Path
+) -> None:
+    host = start(boards="RH")["RH"]
+    host.start()
+    stage = WireClient(tmp_path / "w.sock")
+    stage.send(WireMotion(0, 0, 0, 20_000), WireEdge(0, 26, 1))
+    pulse(1, 2)
+    host.commands.settimeout(0.4)  # four times the 2 s of wire time after which the record would be over
+    with pytest.raises(TimeoutError):
+        host.message()
+    stage.send(WireEdge(10 * PERIOD_NS, 26, 1), WireMotion(20 * PERIOD_NS, 0, 0, 0))
+    with pytest.raises(TimeoutError):
+        host.message()
+    host.commands.settimeout(5.0)
+    pulse(11, 2)
+    assert payload(host.record()) == host.pattern(0, 4)
+    stage.close()
+
+
+def test_a_missed_pulse_leaves_one_frame_out(start: Start, pulse: Callable[..., None]) -> None:
+    hosts = start("--fault", "RH.miss_pulses=[3]")
+    for host in hosts.values():
+        host.start()
+    pulse(0, 16)
+    rh, rv = hosts["RH"], hosts["RV"]
+    assert payload(rh.record()) == rh.pattern(0, 3) + rh.pattern(4, 12)
+    assert payload(rv.record()) == rv.pattern(0, 16)
+
+
+def test_faults_of_the_network_are_those_of_the_seed(start: Start, pulse: Callable[..., None]) -> None:
+    host = start("--fault", "loss=0.1", "--seed", "7", "--fault", "first_sequence=4294967290", boards="RH")["RH"]
+    host.start()
+    pulse(0, 64)
+    numbers = np.arange(-(-64 * FRAME // 1456), dtype=np.uint8)
+    kept = np.concatenate(NetworkFaults(Faults(loss=0.1), 7, "RH").carry(numbers[:, None]))[:, 0]
+    assert 0 < len(kept) < len(numbers)
+    assert sequences(host.record()) == [(4294967290 + int(i)) % 2**32 for i in kept]
+
+
+def test_a_mute_card_answers_nothing_and_its_neighbour_does(start: Start) -> None:
+    hosts = start("--fault", "RV.mute=true")
+    assert hosts["RH"].request(0x09) == bytes.fromhex("5aa509000000aaee")
+    hosts["RV"].commands.settimeout(0.2)
+    with pytest.raises(TimeoutError):
+        hosts["RV"].request(0x09)
+
+
+def test_the_report_tells_what_happened_and_a_power_cycle_moves_the_card(
+    rig: Instrument, start: Start, pulse: Callable[..., None], tmp_path: Path
+) -> None:
+    report = tmp_path / "report.json"
+    host = start("--fault", "lose_packets=[1, 2]", "--fault", "miss_pulses=[0]", "--report", str(report), boards="RH")[
+        "RH"
+    ]
+    host.start()
+    pulse(0, 16)
+    assert len(host.record()) == -(-15 * FRAME // 1456) - 2
+    moved = rig.boards[1].card_address.rpartition(".")[0] + ".190"
+    addresses = [bytes(map(int, a.split(".")))[::-1] for a in (host.board.host_address, moved)]
+    ports = struct.pack("<HH", host.board.command_port, host.board.data_port)
+    assert host.request(0x04, b"".join(addresses) + bytes(6) + ports) == bytes.fromhex("5aa504000000aaee")
+    cards = start.processes[-1]  # type: ignore[attr-defined]
+    cards.send_signal(signal.SIGUSR1)
+    host.commands.settimeout(0.2)
+    for _ in range(50):  # until it has moved
+        host.commands.sendto(bytes.fromhex("5aa509000000aaee"), (moved, host.board.command_port))
+        try:
+            _, source = host.commands.recvfrom(100)
+        except TimeoutError:
+            continue
+        assert source == (moved, 1024)
+        break
+    else:
+        pytest.fail("the card does not answer at its new address")
+    cards.send_signal(signal.SIGTERM)
+    assert cards.wait(5) == 0
+    told = json.loads(report.read_text())
+    assert told["simulated"] is True
+    counts = told["boards"]["RH"]
+    assert {"pulses": 16, "missed": 1, "frames": 15, "lost": 2, "lost_bytes": 2 * 1456, "records": 1}.items() <= (
+        counts.items()
+    )
+    assert counts["packets_sent"] == counts["packets_made"] - 2
+    assert counts["power_cycles"] == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--pattern", "--boards", "XX"], "no such board"),
+        (["--boards", "RH"], "neither --scene nor --pattern"),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_message(
+    rig: Instrument, tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    config = tmp_path / "rig.toml"
+    config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
+    command = [sys.executable, "-m", "simulators.cards", "--config", str(config), "--wires", str(tmp_path / "w.sock")]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_rig_on_its_own_subnet_keeps_ports_and_last_bytes(rig: Instrument) -> None:
+    moved = on_subnet(rig, "127.1.2")
+    assert [b.card_address for b in moved.boards] == ["127.1.2.180", "127.1.2.181", "127.1.2.182"]
+    assert {b.host_address for b in moved.boards} == {"127.1.2.30"}
+    assert [b.command_port for b in moved.boards] == [b.command_port for b in rig.boards]
+    assert is_free(rig)
+    board = rig.boards[1]
+    with bound_udp(board.card_address, board.command_port):
+        assert not is_free(rig)
+
+
+def test_the_receivers_queue_is_seen(rig: Instrument) -> None:
+    board = rig.boards[0]
+    queue = ReceiveQueue(board.host_address, board.data_port)
+    if not Path("/proc/net/udp").exists():
+        pytest.skip("this system does not show its sockets in /proc/net/udp")
+    assert queue.look() is None
+    with bound_udp(board.host_address, board.data_port) as receiver, bound_udp(board.card_address, 1024) as sender:
+        assert queue.look() == (0, 0)
+        sender.sendto(bytes(1000), (board.host_address, board.data_port))
+        seen = queue.look()
+        assert seen is not None
+        assert seen[0] >= 1000
+        receiver.recv(2000)
+        assert queue.look() == (0, 0)
+    queue.close()
+    assert re.fullmatch(r"127\.\d+\.\d+\.30", board.host_address)

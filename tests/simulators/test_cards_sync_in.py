@@ -1,0 +1,132 @@
+"""Laws of SYNC_IN: which pulses start frames, and where the stage is at each."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.config import Instrument, load_instrument
+from shared.errors import ConfigError
+from shared.raster import plan_raster
+from shared.wires import WireMotion
+from simulators.sync_in import Pulse, StageTrack, SyncInput, sync_line
+
+RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+DEAD_NS = 278_500  # ramp end 128.5 us + 150 us
+
+
+def pulses(times: list[int]) -> list[Pulse]:
+    return [Pulse(i, t) for i, t in enumerate(times)]
+
+
+@given(st.lists(st.integers(0, 600_000), max_size=40))
+def test_frames_never_start_closer_than_the_radar_can_and_every_other_pulse_is_counted(gaps: list[int]) -> None:
+    times = list(np.cumsum(gaps, dtype=int))
+    sync = SyncInput(RIG)
+    started = sync.frames(pulses(times))
+    assert all(b.t_ns - a.t_ns >= DEAD_NS for a, b in pairwise(started))
+    assert len(started) + sync.too_soon == len(times)
+
+
+def test_a_burst_of_the_rig_file_starts_a_frame_each_and_a_pulse_too_soon_does_not_shift_the_next() -> None:
+    sync = SyncInput(RIG)
+    burst = [k * 1_500_000 for k in range(16)]
+    assert len(sync.frames(pulses(burst))) == 16
+    sync = SyncInput(RIG)
+    started = sync.frames(pulses([0, DEAD_NS - 1, DEAD_NS, 1_500_000]))
+    assert [p.number for p in started] == [0, 2, 3]
+    assert sync.too_soon == 1
+
+
+def test_a_wire_clock_that_starts_anew_does_not_silence_the_radar() -> None:
+    sync = SyncInput(RIG)
+    assert len(sync.frames(pulses([10**12, 0, 1_500_000]))) == 3
+
+
+def test_the_stage_is_where_its_last_motion_line_before_the_pulse_puts_it() -> None:
+    track = StageTrack(RIG)
+    track.add(WireMotion(1_000_000_000, 100_000, 250_000, 20_000))
+    track.add(WireMotion(3_000_000_000, 140_000, 252_000, 0))
+    assert not track.moving
+    x, y = track.offsets_mm([1_000_000_000, 2_000_000_000, 2_999_999_999, 4_000_000_000])
+    assert x == pytest.approx([-300.0, -280.0, -260.0, -260.0], abs=1e-6)
+    assert y == pytest.approx([0.0, 0.0, 0.0, 2.0])
+
+
+def test_an_unknown_stage_stands_in_the_middle_of_the_grid() -> None:
+    x, y = StageTrack(RIG).offsets_mm([5])
+    assert (x[0], y[0]) == (0.0, 0.0)
+
+
+def test_motion_lines_are_kept_long_enough_and_not_for_ever() -> None:
+    track = StageTrack(RIG)
+    for k in range(20_000):
+        track.add(WireMotion(k * 1000, k, 250_000, 0))
+    x, _ = track.offsets_mm([19_999_000, 17_000_000])
+    assert x == pytest.approx([19.999 - 400.0, 17.0 - 400.0])
+
+
+def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
+    moving, frozen = StageTrack(RIG), StageTrack(RIG, burst_motion=False)
+    trigger = 1_000_000_000
+    times = [trigger + k * 1_500_000 for k in range(16)]
+    for track in (moving, frozen):
+        track.add(WireMotion(0, 400_000, 250_000, 20_000))
+        track.trigger(trigger)
+        track.trigger(trigger + 100_000_000)  # the next trigger may be known already
+    x, _ = moving.offsets_mm(times)
+    held, _ = frozen.offsets_mm(times)
+    assert np.ptp(x) == pytest.approx(0.45)
+    assert np.ptp(held) == 0.0
+    assert held[0] == pytest.approx(np.mean(x))
+
+
+def test_every_board_hangs_on_the_fan_out_or_on_its_own_line() -> None:
+    assert {sync_line(RIG, b) for b in RIG.boards} == {22}
+
+    def with_lines(*lines: int) -> Instrument:
+        return msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, wiring="lines", sync_out=lines))
+
+    rig = with_lines(22, 23, 24)
+    assert [sync_line(rig, b) for b in rig.boards] == [22, 23, 24]
+    short = with_lines(22, 23)
+    with pytest.raises(ConfigError, match="2 lines for 3 boards"):
+        sync_line(short, short.boards[0])
+
+
+def at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:
+    """The stage raises its trigger at a point of the plan; the pulses of its burst, with numbers of no meaning."""
+    plan, centre = plan_raster(RIG.grid), (RIG.stage.centre_x_mm, RIG.stage.centre_y_mm)
+    x = (column - (plan.columns - 1) / 2) * plan.step_x_mm + centre[0]
+    y = plan.row(row).y_mm + centre[1]
+    track.add(WireMotion(t_ns, round(1000 * x), round(1000 * y), plan.row(row).direction * 20_000))
+    track.trigger(t_ns)
+    return [Pulse(10**6 + k, t_ns + 200_000 + k * 1_500_000) for k in range(RIG.burst.pulses)]
+
+
+@given(st.integers(0, RIG.grid.rows - 1), st.integers(0, RIG.grid.columns - 1), st.integers(0, 10**12))
+def test_a_pulse_has_the_number_of_its_place_whenever_it_comes(row: int, column: int, t_ns: int) -> None:
+    point = column if row % 2 == 0 else RIG.grid.columns - 1 - column
+    first = (row * RIG.grid.columns + point) * RIG.burst.pulses
+    track = StageTrack(RIG)
+    for again in (0, 10**11):
+        found = track.places(at_point(track, row, column, t_ns + again))
+        assert [p.number for p in found] == list(range(first, first + RIG.burst.pulses))
+
+
+def test_a_pulse_of_no_point_keeps_its_number() -> None:
+    track = StageTrack(RIG)
+    assert track.places([Pulse(7, 5)]) == [Pulse(7, 5)]
+    burst = at_point(track, 0, 0, 10**9)
+    late = Pulse(8, burst[-1].t_ns + 1_500_000)
+    assert track.places([*burst, late])[-1] == late
+    track.add(WireMotion(2 * 10**9, 0, 0, 20_000))
+    track.trigger(2 * 10**9)
+    outside = Pulse(9, 2 * 10**9 + 200_000)
+    assert track.places([outside]) == [outside]

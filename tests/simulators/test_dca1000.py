@@ -1,0 +1,237 @@
+"""Laws of the simulated DCA1000: packets carry the LVDS stream, counters count, replies are the real card's."""
+
+from __future__ import annotations
+
+import struct
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from simulators.dca1000 import TAIL_S, Card, Code, Message, Network, Output, Packetiser, Packets
+
+HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
+CONFIGURE = bytes.fromhex("5aa5 0300 0600 01010102031e aaee")
+PACKET = bytes.fromhex("5aa5 0b00 0600 be05350c0000 aaee")
+START = bytes.fromhex("5aa5 0500 0000 aaee")
+STOP = bytes.fromhex("5aa5 0600 0000 aaee")
+COMPLETED = bytes.fromhex("5aa5 0a00 0001 aaee")
+
+
+def parse(packet: bytes) -> tuple[int, int, bytes]:
+    sequence, low, high = struct.unpack_from("<IIH", packet)
+    return sequence, low | high << 32, packet[10:]
+
+
+def packets(outputs: list[Output]) -> list[bytes]:
+    return [row.tobytes() for o in outputs if isinstance(o, Packets) for row in o.rows]
+
+
+def messages(outputs: list[Output]) -> list[bytes]:
+    return [o.payload for o in outputs if isinstance(o, Message)]
+
+
+def stream(n: int, seed: int = 0) -> NDArray[np.uint8]:
+    return np.random.default_rng(seed).integers(0, 256, n, dtype=np.uint8)
+
+
+def ready_card(sequence: int = 1, byte_count: int = 0, discards: bool = False) -> Card:
+    card = Card(HOME, sequence, byte_count, stop_discards=discards)
+    card.command(CONFIGURE, 0.0)
+    card.command(PACKET, 0.0)
+    return card
+
+
+chunks = st.lists(st.integers(0, 9000), min_size=1, max_size=8)
+
+
+@given(chunks, st.integers(1, 1456), st.integers(0, 2**32 - 1), st.integers(0, 2**48 - 1))
+def test_payloads_joined_are_the_stream_and_the_counters_count_it(
+    sizes: list[int], payload: int, sequence: int, byte_count: int
+) -> None:
+    packetiser = Packetiser(payload, sequence, byte_count)
+    data = stream(sum(sizes))
+    out, at = [], 0
+    for size in sizes:
+        rows = packetiser.feed(data[at : at + size])
+        assert rows.shape[1] == 10 + payload
+        out += [r.tobytes() for r in rows]
+        at += size
+    out += [r.tobytes() for r in packetiser.flush()]
+    assert b"".join(parse(p)[2] for p in out) == data.tobytes()
+    before = 0
+    for i, packet in enumerate(out):
+        got_sequence, got_count, part = parse(packet)
+        assert got_sequence == (sequence + i) % 2**32
+        assert got_count == (byte_count + before) % 2**48
+        before += len(part)
+
+
+@given(st.lists(chunks, min_size=1, max_size=4))
+def test_records_follow_each_other_without_resetting_the_counters(records: list[list[int]]) -> None:
+    card, now, seen = ready_card(), 0.0, []
+    for number, sizes in enumerate(records):
+        data = stream(sum(sizes), number)
+        outputs = card.command(START, now)
+        at = 0
+        for size in sizes:
+            outputs += card.lvds(data[at : at + size], now)
+            at, now = at + size, now + 0.1
+        now += TAIL_S
+        outputs += card.tick(now)
+        record = packets(outputs)
+        assert b"".join(parse(p)[2] for p in record) == data.tobytes()
+        assert [len(p) for p in record[:-1]] == [1466] * (len(record) - 1)
+        assert messages(outputs)[-1] == COMPLETED
+        seen += record
+    counters = [parse(p) for p in seen]
+    assert [c[0] for c in counters] == list(range(1, len(seen) + 1))
+    assert all(b[1] - a[1] == len(a[2]) for a, b in pairwise(counters))
+    assert not counters or counters[0][1] == 0
+
+
+def test_the_tail_comes_two_seconds_after_the_last_data_and_the_status_right_behind_it() -> None:
+    card = ready_card()
+    card.command(START, 10.0)
+    card.lvds(stream(4096), 11.0)
+    assert card.deadline_s == 13.0
+    assert card.tick(12.999) == []
+    tail, status = card.tick(13.0)
+    assert isinstance(tail, Packets)
+    assert tail.rows.shape == (1, 10 + 4096 - 2 * 1456)
+    assert status == Message(COMPLETED)
+    assert not card.recording
+    assert card.tick(99.0) == []
+    assert card.lvds(stream(4096), 100.0) == []
+
+
+def test_a_record_of_whole_packets_has_no_tail_but_its_status() -> None:
+    card = ready_card()
+    card.command(START, 0.0)
+    assert len(packets(card.lvds(stream(2 * 1456), 0.0))) == 2
+    assert card.tick(TAIL_S) == [Message(COMPLETED)]
+
+
+def test_nothing_is_sent_before_record_start_and_after_record_stop() -> None:
+    card = ready_card()
+    assert card.lvds(stream(5000), 0.0) == []
+    card.command(START, 0.0)
+    card.lvds(stream(2000), 0.1)
+    reply, tail, status = card.command(STOP, 0.2)
+    assert reply == Message(bytes.fromhex("5aa5 0600 0000 aaee"))
+    assert isinstance(tail, Packets)
+    assert tail.rows.shape[1] == 10 + 2000 - 1456
+    assert status == Message(COMPLETED)
+    assert card.lvds(stream(5000), 0.3) == []
+    assert messages(card.command(STOP, 0.4)) == [bytes.fromhex("5aa5 0600 0000 aaee")]
+
+
+def test_a_card_that_discards_at_stop_loses_only_what_fills_no_packet() -> None:
+    card = ready_card(discards=True)
+    card.command(START, 0.0)
+    card.lvds(stream(2000), 0.1)
+    assert packets(card.command(STOP, 0.2)) == []
+    card.command(START, 1.0)
+    (packet,) = packets(card.lvds(stream(1456), 1.1))
+    assert parse(packet)[:2] == (2, 1456)
+
+
+def test_counters_wrap_and_only_reset_fpga_sets_them_back() -> None:
+    card = ready_card(2**32 - 1, 2**48 - 1456)
+    card.command(START, 0.0)
+    first, second = packets(card.lvds(stream(2 * 1456), 0.0))
+    assert parse(first)[:2] == (2**32 - 1, 2**48 - 1456)
+    assert parse(second)[:2] == (0, 0)
+    assert messages(card.command(bytes.fromhex("5aa5 0100 0000 aaee"), 0.0)) == [bytes.fromhex("5aa5 0100 0000 aaee")]
+    card.command(START, 1.0)
+    assert parse(packets(card.lvds(stream(1456), 1.0))[0])[:2] == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("request_hex", "reply_hex"),
+    [
+        ("5aa5 0100 0000 aaee", "5aa5 0100 0000 aaee"),
+        ("5aa5 0200 0000 aaee", "5aa5 0200 0000 aaee"),
+        ("5aa5 0300 0600 01010102031e aaee", "5aa5 0300 0000 aaee"),
+        ("5aa5 0500 0000 aaee", "5aa5 0500 0000 aaee"),
+        ("5aa5 0600 0000 aaee", "5aa5 0600 0000 aaee"),
+        ("5aa5 0900 0000 aaee", "5aa5 0900 0000 aaee"),
+        ("5aa5 0a00 0000 aaee", "5aa5 0a00 0000 aaee"),
+        ("5aa5 0b00 0600 be05350c0000 aaee", "5aa5 0b00 0000 aaee"),
+        ("5aa5 0e00 0000 aaee", "5aa5 0e00 0204 aaee"),
+        ("5aa5 0400 1200 1e21a8c0 b421a8c0 129078563412 0010 0210 aaee", "5aa5 0400 0000 aaee"),
+        ("5aa5 0400 0300 010203 aaee", "5aa5 0400 0100 aaee"),  # EEPROM of the wrong length
+        ("5aa5 0300 0200 0101 aaee", "5aa5 0300 0000 aaee"),  # malformed, answered all the same
+        ("5aa5 0b00 ff00 be05 aaee", "5aa5 0b00 0000 aaee"),
+        ("5aa5 0b00 0600 000035 0c0000 aaee", "5aa5 0b00 0100 aaee"),  # packets of no size
+        ("5aa5 7700 0000 aaee", "5aa5 7700 0100 aaee"),
+    ],
+)
+def test_requests_and_replies_byte_for_byte(request_hex: str, reply_hex: str) -> None:
+    assert messages(Card(HOME).command(bytes.fromhex(request_hex), 0.0)) == [bytes.fromhex(reply_hex)]
+
+
+@pytest.mark.parametrize("junk", [b"", b"\x5a\xa5\x09\x00", bytes(8), bytes.fromhex("a55a 0900 0000 eeaa")])
+def test_what_is_no_request_gets_no_answer(junk: bytes) -> None:
+    assert Card(HOME).command(junk, 0.0) == []
+
+
+@given(st.binary(max_size=600))
+def test_no_bytes_break_the_card(junk: bytes) -> None:
+    card = Card(HOME)
+    for datagram in (junk, b"\x5a\xa5" + junk):
+        assert len(card.command(datagram, 0.0)) <= 2
+
+
+def test_packet_size_and_delay_are_taken_from_the_packet_configuration() -> None:
+    card = ready_card()
+    assert card.packet_bytes == 1466
+    assert card.packet_delay_s == pytest.approx(25e-6)
+    card.command(bytes.fromhex("5aa5 0b00 0600") + struct.pack("<HHH", 1014, 125 * 5, 0) + b"\xaa\xee", 0.0)
+    assert card.packet_delay_s == pytest.approx(5e-6)
+    card.command(START, 0.0)
+    assert [len(p) for p in packets(card.lvds(stream(3000), 0.0))] == [1010] * 3
+
+
+def test_what_most_clients_ask_for_is_done_with_1456_bytes_a_packet_and_nonsense_changes_nothing() -> None:
+    card = Card(HOME)
+    for request in (
+        "5aa5 0300 0600 c005350c0000 aaee",
+        "5aa5 0b00 0600 c005350c0000 aaee",
+        "5aa5 0b00 0400 35020000 aaee",
+    ):
+        (reply,) = messages(card.command(bytes.fromhex(request), 0.0))
+        assert reply[4:6] == b"\0\0"
+    assert card.packet_delay_s == pytest.approx(25e-6)
+    card.command(START, 0.0)
+    assert [len(p) for p in packets(card.lvds(stream(3000), 0.0))] == [1466] * 2
+
+
+def test_a_configuration_that_does_not_suit_the_radar_records_nothing_and_the_card_says_so() -> None:
+    card = Card(HOME)
+    card.command(bytes.fromhex("5aa5 0300 0600 01020102031e aaee"), 0.0)  # 2-lane
+    card.command(START, 0.0)
+    assert card.lvds(stream(5000), 1.0) == []
+    assert card.tick(29.9) == []
+    assert card.tick(30.0) == [Message(bytes.fromhex("5aa5 0a00 0100 aaee"))]
+    assert not card.recording
+
+
+def test_the_eeprom_is_taken_at_the_next_power_cycle() -> None:
+    card = Card(HOME)
+    body = bytes.fromhex("1e21a8c0 b521a8c0 139078563412 6810 6910")
+    assert messages(card.command(bytes.fromhex("5aa5 0400 1200") + body + b"\xaa\xee", 0.0))[0][4] == 0
+    assert card.network == HOME
+    card.power_cycle()
+    assert card.network == Network("192.168.33.30", "192.168.33.181", bytes.fromhex("123456789013"), 4200, 4201)
+
+
+def test_an_overflow_is_told_only_while_recording() -> None:
+    card = ready_card()
+    assert card.overflow() == []
+    card.command(START, 0.0)
+    assert card.overflow() == [Message(bytes.fromhex("5aa5 0a00 0002 aaee"))]
+    assert Code.STATUS == 0x0A

@@ -1,0 +1,128 @@
+"""Laws of the card's faults: seeded, the same however packets are grouped, and exactly what was asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.errors import ConfigError
+from simulators.card_faults import Faults, read_faults
+from simulators.dca1000 import Status
+from simulators.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
+from simulators.sync_in import Pulse
+
+EVERYTHING = Faults(loss=0.1, duplicate=0.1, reorder=0.1, late=0.1, late_packets=7, truncate=0.1, lose_packets=(3, 50))
+
+
+def rows(n: int) -> np.ndarray:
+    """Packets of four bytes whose bytes are their number."""
+    return np.repeat(np.arange(n, dtype=np.uint8)[:, None], 4, axis=1)
+
+
+def arrivals(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH") -> list[bytes]:
+    network, data, at, out = NetworkFaults(faults, seed, board), rows(sum(sizes)), 0, []
+    for size in sizes:
+        out += [r.tobytes() for part in network.carry(data[at : at + size]) for r in part]
+        at += size
+    return out + [r.tobytes() for part in network.drain() for r in part]
+
+
+@given(st.lists(st.integers(0, 60), min_size=1, max_size=4), st.integers(0, 99))
+def test_faults_do_not_depend_on_how_packets_are_grouped(sizes: list[int], seed: int) -> None:
+    assert arrivals(EVERYTHING, sizes, seed) == arrivals(EVERYTHING, [sum(sizes)], seed)
+
+
+@given(st.lists(st.integers(0, 60), min_size=1, max_size=4), st.integers(0, 99))
+def test_turned_bits_do_not_depend_on_how_packets_are_grouped(sizes: list[int], seed: int) -> None:
+    faults = Faults(corrupt=0.2, corrupt_header=0.2, loss=0.2)
+    data = np.zeros((sum(sizes), 20), np.uint8)
+
+    def turned(groups: list[int]) -> bytes:
+        network, at, out = NetworkFaults(faults, seed, "RH"), 0, b""
+        for size in groups:
+            out += b"".join(part.tobytes() for part in network.carry(data[at : at + size]))
+            at += size
+        return out
+
+    assert turned(sizes) == turned([sum(sizes)])
+    assert not data.any()
+
+
+def test_the_same_seed_gives_the_same_faults_and_boards_differ() -> None:
+    assert arrivals(EVERYTHING, [200]) == arrivals(EVERYTHING, [200])
+    assert arrivals(EVERYTHING, [200]) != arrivals(EVERYTHING, [200], seed=2)
+    assert arrivals(EVERYTHING, [200]) != arrivals(EVERYTHING, [200], board="RV")
+
+
+def test_without_faults_everything_arrives_in_order() -> None:
+    assert arrivals(Faults(), [100, 50]) == [r.tobytes() for r in rows(150)]
+
+
+@pytest.mark.parametrize(
+    ("faults", "numbers"),
+    [
+        (Faults(lose_packets=(1, 3)), [0, 2, 4, 5]),
+        (Faults(loss=1.0), []),
+        (Faults(duplicate=1.0), [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]),
+        (Faults(stop_after_packets=4), [0, 1, 2, 3]),
+        (Faults(late=1.0, late_packets=3), [0, 1, 2, 3, 4, 5]),
+    ],
+)
+def test_each_fault_alone(faults: Faults, numbers: list[int]) -> None:
+    assert arrivals(faults, [6]) == [bytes([n] * 4) for n in numbers]
+
+
+def test_reordered_and_late_packets_all_arrive() -> None:
+    got = arrivals(Faults(reorder=0.2, late=0.1, late_packets=9), [200])
+    assert got != [r.tobytes() for r in rows(200)]
+    assert sorted(got) == sorted(r.tobytes() for r in rows(200))
+
+
+def test_truncated_packets_are_half() -> None:
+    assert arrivals(Faults(truncate=1.0), [2]) == [bytes([0, 0]), bytes([1, 1])]
+
+
+def test_overflow_takes_the_second_half_of_single_frames() -> None:
+    frames = np.arange(100 * 8, dtype=np.int16).reshape(100, 2, 4)
+    runs = OverflowFaults(Faults(overflow=0.3), 5, "RH").split(frames)
+    assert {run.status for run in runs} <= {None, Status.LVDS_BUFFER_FULL}
+    lost = sum(run.status is not None for run in runs)
+    assert 10 < lost < 60
+    assert sum(run.lost_bytes for run in runs) == lost * 8
+    joined = np.concatenate([run.data.reshape(-1) for run in runs])
+    assert len(joined) == 100 * 8 - lost * 4
+    assert np.all(np.diff(joined) > 0)
+
+
+def test_missed_pulses_are_those_named() -> None:
+    pulses = [Pulse(i, 1000 * i) for i in range(10)]
+    faults = PulseFaults(Faults(miss_pulses=(0, 4)), 0, "RH")
+    seen = faults.seen(pulses[:5]) + faults.seen(pulses[5:])
+    assert [p.number for p in seen] == [1, 2, 3, 5, 6, 7, 8, 9]
+    assert faults.missed == 2
+
+
+def test_faults_come_from_the_file_and_the_command_line(tmp_path: Path) -> None:
+    path = tmp_path / "faults.toml"
+    path.write_text("[faults]\nloss = 0.01\n[faults.RH]\nmute = true\n")
+    faults = read_faults(path, ["loss=0.02", "RV.miss_pulses=[3, 4]"], ("LS", "RH", "RV"), {"late": 0.5})
+    assert faults["LS"] == Faults(loss=0.02, late=0.5)
+    assert faults["RH"] == Faults(loss=0.02, late=0.5, mute=True)
+    assert faults["RV"] == Faults(loss=0.02, late=0.5, miss_pulses=(3, 4))
+
+
+@pytest.mark.parametrize("setting", ["los=0.1", "loss=2", "XX.mute=true", "mute", "loss='a'"])
+def test_a_fault_that_does_not_exist_is_refused(setting: str) -> None:
+    with pytest.raises(ConfigError):
+        read_faults(None, [setting], ("RH",))
+
+
+def test_a_fault_file_holds_faults_only(tmp_path: Path) -> None:
+    path = tmp_path / "faults.toml"
+    path.write_text("loss = 0.1\n")
+    with pytest.raises(ConfigError, match="holds"):
+        read_faults(path, [], ("RH",))

@@ -1,0 +1,158 @@
+"""The fast field equals the direct sum, and physical optics of a large mirror equals its image."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shared.config import Instrument, load_instrument
+from shared.errors import DataError
+from shared.units import SPEED_OF_LIGHT_M_S
+from simulators.field import ObjectField, build_field, node_matrix
+from simulators.optics import antennas, direct_factor, field_exact
+from simulators.radar import sample_frequencies_hz
+from simulators.scene import Scene, apply_scene, decode_scene
+
+ROOT = Path(__file__).parents[2]
+GRID = {"columns": 29, "rows": 21, "step_x_mm": 10.0, "step_y_mm": 10.0}
+MIXED = [
+    {"name": "metal", "centre_mm": [0.0, 0.0], "size_mm": [45.0, 45.0], "metal": True},
+    {"name": "acrylic", "centre_mm": [60.3, 57.1], "size_mm": [45.0, 31.0], "permittivity": [4.0, 0.4]},
+    {
+        "name": "slab",
+        "centre_mm": [-60.0, 61.0],
+        "size_mm": [45.0, 45.0],
+        "permittivity": [3.78, 0.7],
+        "thickness_mm": 3.0,
+    },
+    {"name": "wood", "centre_mm": [-58.7, -60.0], "size_mm": [20.0, 45.0], "permittivity": [2.61, 0.01]},
+]
+POINT = {"position_mm": [55.0, -60.0], "amplitude": [0.3, 0.2]}
+
+
+def setup(**tables: Any) -> tuple[Instrument, Scene]:
+    scene = decode_scene({"name": "t", "object_distance_mm": 499.0, "grid": GRID, **tables}, "t")
+    return apply_scene(load_instrument(ROOT / "instrument.toml"), scene), scene
+
+
+def read(field: ObjectField, offsets_m: np.ndarray, f: np.ndarray, rx: int, samples: np.ndarray) -> np.ndarray:
+    values, _ = node_matrix(field, samples)
+    picked = values[:, np.searchsorted(samples, f)]
+    carrier = np.exp(2j * np.pi * f * field.centre_path_m / SPEED_OF_LIGHT_M_S)
+    return field.at(offsets_m[:, 0], offsets_m[:, 1])[:, rx] @ picked * carrier
+
+
+@pytest.mark.parametrize("role", ["receive_h", "receive_v"])
+def test_the_fast_field_equals_the_direct_sum(role: str) -> None:
+    rig, scene = setup(plates=MIXED, points=[POINT])
+    board, samples = rig.by_role(role), sample_frequencies_hz(rig)
+    field = build_field(rig, scene, board, samples)
+    rng = np.random.default_rng(0)
+    offsets = np.vstack([[0.0, 0.0], [0.1405, 0.1], [-0.1405, -0.1], rng.uniform(-0.1, 0.1, (5, 2))])
+    f = samples[[0, 37, 128, 200, 255]]
+    for rx in (0, 3):
+        exact = field_exact(rig, scene, board, offsets, f, rx)
+        assert np.abs(read(field, offsets, f, rx, samples) - exact).max() < 5e-4 * np.abs(exact).max()
+
+
+def test_between_the_few_frequencies_nothing_is_lost() -> None:
+    rig, scene = setup(plates=MIXED[:1])
+    board, samples = rig.receivers[0], sample_frequencies_hz(rig)
+    field = build_field(rig, scene, board, samples)
+    offset = np.array([[0.021, -0.033]])
+    assert len(field.nodes_hz) < 16
+    everywhere = read(field, offset, samples, 0, samples)
+    exact = field_exact(rig, scene, board, offset, samples)
+    # What a common factor cannot explain is the interpolation over frequency alone.
+    common = np.vdot(everywhere, exact) / np.vdot(everywhere, everywhere)
+    assert np.abs(everywhere * common - exact).max() < 1e-4 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("role", ["receive_h", "receive_v"])
+def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
+    size = [600.0, 500.0]
+    rig, scene = setup(plates=[{"name": "m", "centre_mm": [0.0, 0.0], "size_mm": size, "metal": True}], object_gain=1.0)
+    scene = scene.with_disturbances(leakage_h="off", leakage_v="off")
+    board = rig.by_role(role)
+    ant = antennas(rig, board)
+    rng = np.random.default_rng(1)
+    offsets = rng.uniform(-0.06, 0.06, (200, 2))
+    samples = sample_frequencies_hz(rig)
+    f = samples[[128]]
+    field = build_field(rig, scene, board, samples)
+    got = read(field, offsets, f, 0, samples)[:, 0]
+    image = ant.rx_m[0] * [1, 1, -1] + [0, 0, 2 * ant.plane_z_m]
+    path = float(np.linalg.norm(image - ant.tx_m))
+    expected = -ant.direct_m[0] / path * np.exp(2j * np.pi * f[0] * path / SPEED_OF_LIGHT_M_S)
+    # The plate's edges still ring by some percent at each offset; their mean does not.
+    assert abs(np.mean(got) / expected - 1) < 0.03
+    assert np.abs(np.abs(got) / abs(expected) - 1).max() < 0.25
+
+
+def test_a_metal_plate_in_the_middle_is_within_a_factor_of_1_5_of_the_direct_path() -> None:
+    rig, scene = setup(plates=MIXED[:1])
+    for board in rig.receivers:
+        # V's midpoint lies 15 mm above H's: it sees the plate in the middle when the stage is as much lower.
+        offsets = np.array([[0.0, 0.0], [0.0, -0.015]])
+        field = np.abs(field_exact(rig, scene, board, offsets, np.array([78.5e9])))
+        assert 1 / 1.5 < field.max() < 1.5
+
+
+def test_echoes_add_up() -> None:
+    rig, both = setup(plates=MIXED[:2])
+    parts = [setup(plates=[p])[1] for p in MIXED[:2]]
+    offsets, f = np.array([[0.01, 0.02]]), np.array([77e9, 80e9])
+    for board in rig.receivers:
+        total = field_exact(rig, both, board, offsets, f)
+        assert np.allclose(total, sum(field_exact(rig, s, board, offsets, f) for s in parts), atol=1e-12)
+
+
+def test_leakage_mixes_the_two_polarisations() -> None:
+    rig, scene = setup(plates=MIXED[1:2])
+    offsets, f = np.array([[0.05, 0.05]]), np.array([78e9])
+    h, v = rig.receivers
+
+    def at(board: Any, **d: Any) -> complex:
+        return complex(field_exact(rig, scene.with_disturbances(ideal=True, **d), board, offsets, f)[0, 0])
+
+    # From no leakage to full leakage H gains all of p: linear in between.
+    s_only, s_and_p = at(h), at(h, leakage_h=[1.0, 0.0])
+    assert np.isclose(at(h, leakage_h=[0.05, 0.02]), s_only + (0.05 + 0.02j) * (s_and_p - s_only))
+    assert np.isclose(at(h, leakage_v=[0.1, 0.0]), s_only)
+    assert not np.isclose(at(v, leakage_v=[0.1, 0.0]), at(v))
+    leaky = scene.with_disturbances(leakage_v=[0.0, 0.1])
+    assert direct_factor(v, leaky) == 1 + 0.1j
+
+
+def test_a_point_at_the_specular_midpoint_equals_its_amplitude() -> None:
+    rig, scene = setup(points=[{"position_mm": [0.0, 0.0], "amplitude": [0.6, 0.0]}])
+    ideal = scene.with_disturbances(ideal=True)
+    got = field_exact(rig, ideal, rig.receivers[0], np.zeros((1, 2)), np.array([78e9]))
+    assert np.isclose(abs(got[0, 0]), 0.6)
+
+
+def test_an_empty_scene_echoes_nothing_and_offsets_outside_are_refused() -> None:
+    rig, scene = setup()
+    field = build_field(rig, scene, rig.receivers[0], sample_frequencies_hz(rig))
+    assert np.all(field.at(np.array([0.0]), np.array([0.0])) == 0)
+    assert field.covers(np.array([0.14, 0.3]), np.array([0.1, 0.0])).tolist() == [True, False]
+    with pytest.raises(DataError, match="outside the simulated aperture"):
+        field.at(np.array([0.3]), np.array([0.0]))
+
+
+def test_a_cached_field_is_the_same_field(tmp_path: Path) -> None:
+    rig, scene = setup(plates=MIXED[:1])
+    board, samples = rig.receivers[0], sample_frequencies_hz(rig)
+    first = build_field(rig, scene, board, samples, tmp_path)
+    second = build_field(rig, scene, board, samples, tmp_path)
+    assert len(list(tmp_path.iterdir())) == 1
+    assert np.array_equal(first.values, second.values)
+    assert first.start_m == second.start_m
+    assert first.step_m == second.step_m
+    other = build_field(rig, scene.with_disturbances(leakage_h=[0.2, 0.0]), board, samples, tmp_path)
+    assert not np.array_equal(first.values, other.values)
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"torn")
+    with pytest.raises(DataError, match="not a field"):
+        build_field(rig, scene, board, samples, tmp_path)

@@ -1,0 +1,348 @@
+"""The simulated radars: exact when nothing disturbs, and each disturbance does what it says, alone."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from shared.config import load_instrument
+from shared.units import SPEED_OF_LIGHT_M_S
+from simulators.optics import antennas, field_exact
+from simulators.radar import SimulatedRig, reference_cube, sample_frequencies_hz
+from simulators.receiver import high_pass, power_on, pulse_uniform, sync_delay_s
+from simulators.scene import decode_scene
+
+ROOT = Path(__file__).parents[2]
+RIG = load_instrument(ROOT / "instrument.toml")
+GRID = {"columns": 9, "rows": 6, "step_x_mm": 10.0, "step_y_mm": 10.0}
+PLATE = {"name": "m", "centre_mm": [0.0, 0.0], "size_mm": [45.0, 45.0], "metal": True}
+POINT = {"position_mm": [12.0, -9.0], "amplitude": [0.5, 0.0]}
+
+
+def radar(seed: int = 1, tables: dict[str, Any] | None = None, **disturbances: Any) -> SimulatedRig:
+    """A rig with only the given disturbances on."""
+    raw = {"name": "t", "grid": GRID, **(tables or {}), "disturbances": {"ideal": True, **disturbances}}
+    return SimulatedRig(RIG, decode_scene(raw, "t"), seed)
+
+
+def default_radar(seed: int = 1, **disturbances: Any) -> SimulatedRig:
+    """A rig with the published disturbances, except as given."""
+    raw = {"name": "t", "grid": GRID, "plates": [PLATE], "disturbances": disturbances}
+    return SimulatedRig(RIG, decode_scene(raw, "t"), seed)
+
+
+ZERO = np.zeros(1)
+
+
+# --- ideal -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("board", ["RH", "RV"])
+def test_a_point_target_alone_has_phase_2_pi_f_tau(board: str) -> None:
+    with_point, without = radar(tables={"points": [POINT]}), radar()
+    x, y = np.array([0.0, 33.3, -41.7]), np.array([0.0, 20.0, -24.9])
+    echo = with_point.signals(board, x, y) - without.signals(board, x, y)
+    ant = antennas(with_point.rig, with_point.rig.by_name(board))
+    target = ant.centre_m + np.array([*POINT["position_mm"], 0.0]) / 1e3
+    f = sample_frequencies_hz(with_point.rig)
+    for n in range(3):
+        stage = np.array([x[n], y[n], 0.0]) / 1e3
+        for rx in range(4):
+            path = np.linalg.norm(target - ant.tx_m - stage) + np.linalg.norm(target - ant.rx_m[rx] - stage)
+            expected = np.exp(2j * np.pi * f * path / SPEED_OF_LIGHT_M_S)
+            assert np.abs(np.angle(echo[n, rx] * expected.conj())).max() < 1e-3
+
+
+@pytest.mark.parametrize("board", ["RH", "RV"])
+def test_the_direct_path_alone_is_a_pure_tone(board: str) -> None:
+    rig = radar()
+    ant = antennas(rig.rig, rig.rig.by_name(board))
+    f = sample_frequencies_hz(rig.rig)
+    expected = (
+        np.exp(2j * np.pi * np.outer(ant.direct_m, f) / SPEED_OF_LIGHT_M_S) * (ant.direct_m[0] / ant.direct_m)[:, None]
+    )
+    assert np.abs(rig.signals(board, ZERO, ZERO)[0] - expected).max() < 1e-4
+
+
+def test_the_reference_cube_is_the_ideal_signal_less_the_direct_path() -> None:
+    tables = {"plates": [PLATE], "points": [POINT]}
+    rig, empty = radar(tables=tables), radar()
+    cube = reference_cube(RIG, rig.scene, remove_direct=False)["RV"]
+    travel = rig.burst_mm(-1)[0]
+    x = np.array([rig.rig.grid.step_x_mm * (8 - 4) + travel])  # odd rows start at the largest x
+    y = np.array([rig.rig.grid.step_y_mm * (1 - 2.5)])
+    echo = rig.signals("RV", x, y) - empty.signals("RV", x, y)
+    assert cube.shape == (4, 6, 9, 256)
+    assert np.abs(cube[:, 1, 8] - echo[0]).max() < 1e-3 * np.abs(echo).max()
+    # Disturbances of the scene do not reach it, and taking the direct path away is a phase.
+    same = reference_cube(RIG, default_radar().scene.with_disturbances(hpf=True), remove_direct=True)["RH"]
+    plain = reference_cube(RIG, radar(tables={"plates": [PLATE]}).scene, remove_direct=False)["RH"]
+    tau = antennas(rig.rig, rig.rig.by_name("RH")).direct_m / SPEED_OF_LIGHT_M_S
+    turn = np.exp(-2j * np.pi * np.outer(tau, sample_frequencies_hz(rig.rig)))
+    assert np.abs(same - plain * turn[:, None, None]).max() < 1e-4
+
+
+def test_an_undisturbed_chirp_repeats() -> None:
+    signal = radar(tables={"plates": [PLATE]}).signals("RH", np.zeros(3), np.zeros(3))
+    assert np.array_equal(signal[0], signal[2])
+
+
+# --- determinism -----------------------------------------------------------------------------------------------------
+
+
+def test_pulses_are_the_same_however_they_are_batched() -> None:
+    x, y = np.linspace(-30, 30, 70), np.full(70, 5.0)
+    whole = default_radar().chirps("RH", x, y)
+    other = default_radar()
+    parts = [other.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
+    assert np.abs(whole.astype(int) - np.concatenate(parts)).max() <= 1  # a rounding of float32
+    late = default_radar().chirps("RH", x[40:], y[40:], first_pulse=40)
+    assert np.abs(whole[40:].astype(int) - late).max() <= 1
+
+
+def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
+    x, y = np.zeros(4), np.zeros(4)
+    first = default_radar(seed=5).chirps("RV", x, y, 0)
+    assert np.array_equal(first, default_radar(seed=5).chirps("RV", x, y, 0))
+    for other in (default_radar(seed=6).chirps("RV", x, y, 0), default_radar(seed=5).chirps("RV", x, y, 4)):
+        assert np.mean(first == other) < 0.1
+
+
+def test_pulse_numbers_are_uniform_and_do_not_depend_on_company() -> None:
+    u = pulse_uniform(1234, np.arange(100_000))
+    assert abs(u.mean() - 0.5) < 0.005
+    assert abs(u.var() - 1 / 12) < 0.002
+    assert abs(np.corrcoef(u[:-1], u[1:])[0, 1]) < 0.02
+    assert pulse_uniform(1234, np.array([777]))[0] == u[777]
+    assert not np.any(pulse_uniform(1235, np.arange(1000)) == u[:1000])
+
+
+# --- one disturbance at a time ---------------------------------------------------------------------------------------
+
+
+def test_timing_shifts_the_if_by_slope_times_delay_and_turns_the_phase() -> None:
+    on, off = radar(sync_uncertainty_ns=5.0), radar()
+    n = 40
+    ratio = on.signals("RH", np.zeros(n), np.zeros(n)) / off.signals("RH", np.zeros(n), np.zeros(n))
+    h, tx = on.rig.by_name("RH"), on.rig.transmitter
+    pulses = np.arange(n)
+    d = on.scene.disturbances
+    delay = sync_delay_s(d, 1, h, pulses) - sync_delay_s(d, 1, tx, pulses)
+    assert 1e-9 < np.ptp(delay) < 10e-9
+    expected = np.exp(-2j * np.pi * np.outer(delay, sample_frequencies_hz(on.rig)))
+    assert np.abs(ratio[:, 0] - expected).max() < 1e-4
+    if_hz = np.angle(ratio[:, 0, 1:] / ratio[:, 0, :-1]).mean(axis=1) / 2 / np.pi * on.rig.chirp.sample_rate_hz
+    assert np.allclose(if_hz, -on.rig.chirp.slope_hz_per_s * delay, atol=1.0)
+
+
+def test_a_common_latency_cancels() -> None:
+    a, b = radar(sync_latency_ns=160.0).signals("RH", ZERO, ZERO), radar().signals("RH", ZERO, ZERO)
+    assert np.abs(a - b).max() < 1e-5
+
+
+def test_h_and_v_draw_their_own_timing_against_one_transmitter() -> None:
+    rig = radar(sync_uncertainty_ns=5.0)
+    n = 2000
+    d, pulses = rig.scene.disturbances, np.arange(n)
+    tx, h, v = (sync_delay_s(d, 1, rig.rig.by_name(b), pulses) for b in ("LS", "RH", "RV"))
+    correlation = np.corrcoef(h - tx, v - tx)[0, 1]
+    assert abs(correlation - 0.5) < 0.06  # the transmitter's share is common
+
+
+def test_one_ppm_of_crystal_is_76_khz_and_a_slope_error() -> None:
+    on, off = radar(crystal_ppm={"receive_h": 1.0}), radar()
+    turn = np.angle(on.signals("RH", ZERO, ZERO)[0, 0] / off.signals("RH", ZERO, ZERO)[0, 0])
+    t = np.arange(256) / on.rig.chirp.sample_rate_hz
+    c2, c1, _ = np.polyfit(t, np.unwrap(turn) / 2 / np.pi, 2)
+    assert abs(c1 - 1e-6 * on.rig.chirp.first_sample_hz) < 10
+    assert abs(2 * c2 / (2e-6 * on.rig.chirp.slope_hz_per_s) - 1) < 0.01
+    assert np.array_equal(on.signals("RV", ZERO, ZERO), off.signals("RV", ZERO, ZERO))
+
+
+def test_the_direct_path_sits_near_1_05_mhz_and_inside_the_band() -> None:
+    rig = default_radar(direct_snr_db="off")
+    for board in ("RH", "RV"):
+        signal = rig.signals(board, np.full(200, 40.0), np.full(200, 25.0))[:, 0, :192]
+        spectrum = np.abs(np.fft.fft(signal * np.hanning(192), 2048, axis=1))
+        peak = spectrum.argmax(axis=1) / 2048 * rig.rig.chirp.sample_rate_hz
+        assert 0.9e6 < peak.mean() < 1.2e6
+        assert peak.min() > 0.6e6
+        assert peak.max() < 0.9 * rig.rig.chirp.sample_rate_hz
+        assert np.ptp(peak) > 150e3
+
+
+def test_start_offset_of_a_board_moves_its_if() -> None:
+    moved = msgspec.structs.replace(
+        RIG,
+        boards=tuple(msgspec.structs.replace(b, start_offset_hz=5e5 if b.name == "RV" else 0.0) for b in RIG.boards),
+    )
+    scene = radar().scene
+    ratio = SimulatedRig(moved, scene).signals("RV", ZERO, ZERO) / SimulatedRig(RIG, scene).signals("RV", ZERO, ZERO)
+    step = np.angle(ratio[0, 0, 1:] / ratio[0, 0, :-1]) / 2 / np.pi * RIG.chirp.sample_rate_hz
+    assert np.allclose(step, 5e5, atol=50)
+
+
+def test_phase_is_uniform_from_chirp_to_chirp() -> None:
+    rig = radar(random_phase=True)
+    phase = np.angle(rig.signals("RH", np.zeros(4000), np.zeros(4000))[:, 0, 0])
+    counts, _ = np.histogram(phase, 8, (-np.pi, np.pi))
+    assert counts.min() > 400
+    assert counts.max() < 600
+
+
+@pytest.mark.parametrize("board", ["RH", "RV"])
+def test_the_chirp_bends_late_and_is_clean_in_the_linear_samples(board: str) -> None:
+    for seed in range(3):
+        on, off = radar(seed, bend_hz=300e3, ripple_hz=3e3), radar(seed)
+        turn = np.unwrap(np.angle(on.signals(board, ZERO, ZERO)[0, 0] / off.signals(board, ZERO, ZERO)[0, 0]))
+        k = np.arange(192)
+        rest = turn[:192] - np.polyval(np.polyfit(k, turn[:192], 1), k)
+        assert 1e-4 < np.abs(rest).max() < 0.1
+        last_hz = np.diff(turn)[-3:] / 2 / np.pi * on.rig.chirp.sample_rate_hz
+        assert np.all((np.abs(last_hz) > 150e3) & (np.abs(last_hz) < 400e3))
+
+
+def test_the_filter_has_3_db_at_each_corner() -> None:
+    for corner, other in ((175e3, 350e3), (350e3, 175e3)):
+        h, _ = high_pass(np.array(corner), RIG.chirp)
+        section = h * (1 - 1j * other / corner)
+        assert abs(abs(section) ** 2 - 0.5) < 1e-12
+    far, _ = high_pass(np.array(1e9), RIG.chirp)
+    assert abs(far - 1) < 1e-3
+    zero, _ = high_pass(np.array(0.0), RIG.chirp)
+    assert abs(zero) < 1e-6
+    step = 1.0
+    f = np.linspace(1e5, 2e6, 50)
+    slope = (high_pass(f + step, RIG.chirp)[0] - high_pass(f - step, RIG.chirp)[0]) / (2 * step)
+    assert np.allclose(high_pass(f, RIG.chirp)[1], slope, rtol=1e-4)
+
+
+def test_each_path_goes_through_the_filter_at_its_own_if() -> None:
+    on = radar(tables={"points": [POINT]}, hpf=True, if_offset_hz=870e3)
+    off = radar(tables={"points": [POINT]}, if_offset_hz=870e3)
+    direct = radar(if_offset_hz=870e3).signals("RH", ZERO, ZERO)[0, 0]
+    echo = off.signals("RH", ZERO, ZERO)[0, 0] - direct
+    ant = antennas(on.rig, on.rig.by_name("RH"))
+    target = ant.centre_m + np.array([*POINT["position_mm"], 0.0]) / 1e3
+    path = np.linalg.norm(target - ant.tx_m) + np.linalg.norm(target - ant.rx_m[0])
+    k = on.rig.chirp.slope_hz_per_s / SPEED_OF_LIGHT_M_S
+    h_direct, _ = high_pass(np.array(870e3 + k * ant.direct_m[0]), on.rig.chirp)
+    h_echo, _ = high_pass(np.array(870e3 + k * path), on.rig.chirp)
+    expected = h_direct * direct + h_echo * echo
+    assert 0.9 < abs(h_direct) < 0.96
+    assert np.abs(on.signals("RH", ZERO, ZERO)[0, 0] - expected).max() < 1e-3
+
+
+def test_gains_are_within_their_spread_fixed_for_a_power_cycle_and_new_in_the_next() -> None:
+    on, off = radar(3, rx_gain_spread_db=1.0, rx_phase_spread_deg=20.0), radar(3)
+    gain = on.signals("RV", np.zeros(2), np.zeros(2)) / off.signals("RV", np.zeros(2), np.zeros(2))
+    assert np.allclose(gain, gain[:1, :, :1], atol=1e-5)
+    per_rx = gain[0, :, 0]
+    assert np.abs(20 * np.log10(np.abs(per_rx))).max() <= 1.0
+    assert np.abs(np.degrees(np.angle(per_rx))).max() <= 20.0
+    assert np.ptp(np.abs(per_rx)) > 0.01
+    set_gains = power_on(on.rig, on.scene, on.rig.by_name("RV"), 3).gains
+    assert np.allclose(per_rx, set_gains, atol=1e-5)
+    assert not np.allclose(set_gains, power_on(on.rig, on.scene, on.rig.by_name("RV"), 4).gains)
+
+
+def test_h_and_v_differ_by_the_set_gain() -> None:
+    on = radar(hv_gain_db=1.5)
+    h, v = (np.abs(on.signals(b, ZERO, ZERO)[0, 0]).mean() for b in ("RH", "RV"))
+    assert abs(20 * np.log10(h / v) - 1.5) < 1e-3
+
+
+def test_leakage_reaches_direct_path_and_object() -> None:
+    tables = {"plates": [{**PLATE, "metal": False, "permittivity": [4.0, 0.4]}]}
+    leak = [0.06, -0.03]
+    on, off = radar(tables=tables, leakage_v=leak), radar(tables=tables)
+    empty_on, empty_off = radar(leakage_v=leak), radar()
+    ratio = empty_on.signals("RV", ZERO, ZERO) / empty_off.signals("RV", ZERO, ZERO)
+    assert np.allclose(ratio, 1.06 - 0.03j, atol=1e-5)
+    f = sample_frequencies_hz(on.rig)[[100]]
+    echo = (on.signals("RV", ZERO, ZERO) - empty_on.signals("RV", ZERO, ZERO))[0, 0, 100]
+    exact = field_exact(on.rig, on.scene, on.rig.by_name("RV"), np.zeros((1, 2)), f)[0, 0]
+    assert abs(echo - exact) < 2e-3 * abs(exact)
+    plain = (off.signals("RV", ZERO, ZERO) - empty_off.signals("RV", ZERO, ZERO))[0, 0, 100]
+    assert abs(echo / plain - 1) > 0.05
+    assert np.array_equal(on.signals("RH", ZERO, ZERO), off.signals("RH", ZERO, ZERO))
+
+
+def test_noise_has_the_set_ratio_on_every_channel_and_averages_down() -> None:
+    on, off = radar(direct_snr_db=5.5, rx_gain_spread_db=1.0), radar(rx_gain_spread_db=1.0)
+    n = 160
+    clean = off.signals("RH", ZERO, ZERO)
+    noise = on.signals("RH", np.zeros(n), np.zeros(n)) - clean
+    snr = 10 * np.log10(np.mean(np.abs(clean) ** 2, axis=(0, 2)) / np.mean(np.abs(noise) ** 2, axis=(0, 2)))
+    assert np.allclose(snr, 5.5, atol=0.15)
+    mean = noise.reshape(-1, 16, 4, 256).mean(axis=1)
+    gained = 10 * np.log10(np.mean(np.abs(clean) ** 2) / np.mean(np.abs(mean) ** 2))
+    assert abs(gained - 17.5) < 0.2
+    assert abs(np.mean(noise.real * noise.imag)) < 0.01 * np.mean(np.abs(noise) ** 2)
+
+
+# --- bytes -----------------------------------------------------------------------------------------------------------
+
+
+def test_frames_hold_i_of_the_four_rx_then_q() -> None:
+    rig = radar(tables={"plates": [PLATE]}, adc_full_scale=4.0)
+    signal = rig.signals("RH", np.zeros(2), np.zeros(2))
+    frames = rig.chirps("RH", np.zeros(2), np.zeros(2))
+    assert frames.shape == (2, 256, 8)
+    assert frames.dtype == np.int16
+    counts = signal * 32767 / 4.0
+    for rx in range(4):
+        assert np.abs(frames[:, :, rx] - counts[:, rx].real).max() <= 0.51
+        assert np.abs(frames[:, :, 4 + rx] - counts[:, rx].imag).max() <= 0.51
+
+
+def test_clipping_is_bounded_and_counted() -> None:
+    loud, quiet = radar(adc_full_scale=0.5), radar(adc_full_scale=2.0)
+    frames = loud.chirps("RH", ZERO, ZERO)
+    wanted = quiet.signals("RH", ZERO, ZERO).view(np.float32)
+    assert frames.max() == 32767
+    assert frames.min() == -32768
+    assert loud.clipped["RH"] == int(np.sum(np.rint(np.abs(wanted) * np.float32(32767 / 0.5)) > 32767))
+    assert loud.clipped["RH"] > 0
+    quiet.chirps("RH", ZERO, ZERO)
+    assert quiet.clipped == {"LS": 0, "RH": 0, "RV": 0}
+
+
+def test_defaults_clip_nothing_and_use_more_than_a_few_counts() -> None:
+    rig = default_radar()
+    frames = rig.chirps("RH", np.zeros(64), np.zeros(64))
+    assert rig.clipped["RH"] == 0
+    assert frames.std() > 100
+
+
+def test_the_transmitting_board_sends_its_leakage_and_noise() -> None:
+    rig = default_radar()
+    frames = rig.chirps("LS", np.zeros(8), np.zeros(8))
+    assert frames.shape == (8, 256, 8)
+    assert frames.std() > 50
+    assert not np.array_equal(frames[0], frames[1])
+
+
+def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
+    moving, still = radar(burst_motion=True), radar()
+    assert np.allclose(moving.burst_mm(1), 20.0 * np.arange(16) * 1.5e-3)
+    assert np.allclose(still.burst_mm(-1), -0.225)
+    for direction in (1, -1):
+        assert np.isclose(moving.burst_mm(direction).mean(), still.burst_mm(direction).mean())
+
+
+def test_outside_the_aperture_only_the_direct_path_is_left_and_counted() -> None:
+    rig, empty = radar(tables={"plates": [PLATE]}), radar()
+    far = np.array([0.0, -400.0])
+    signal = rig.signals("RH", far, np.zeros(2))
+    direct = empty.signals("RH", far[:1], np.zeros(1))
+    assert rig.outside["RH"] == 1
+    assert np.abs(signal[1] - direct[0]).max() < 1e-5
+    assert np.abs(signal[0] - direct[0]).max() > 0.1
+
+
+def test_an_unknown_board_is_a_key_error() -> None:
+    with pytest.raises(KeyError):
+        radar().chirps("XX", ZERO, ZERO)

@@ -1,0 +1,218 @@
+"""The card that plays recordings, and clients of other people's making that record from it.
+
+The byte sequences are those that public DCA1000 clients send, wrong bodies included; a small client sends them here.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from itertools import repeat
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from simulators.card_endpoint import CardEndpoint
+from simulators.card_faults import Faults
+from simulators.card_sender import Pace, bound_udp
+from simulators.dca1000 import Network
+from simulators.replay import Player, Recording, scan_rows
+from simulators.simulated_card import MAC
+
+OK = {code: bytes.fromhex(f"5aa5{code:02x}000000aaee") for code in range(1, 15)}
+START, STOP = "5aa505000000aaee", "5aa506000000aaee"
+ALIVE, VERSION = "5aa509000000aaee", "5aa50e000000aaee"
+# What they send before record start; every one of them works with real cards.
+CLIENTS = {
+    "configuration body in both commands, packets of 1472": [
+        *(ALIVE, VERSION, "5aa503000600c005350c0000aaee", "5aa50b000600c005350c0000aaee")
+    ],
+    "two lanes, packet configuration without its size": [
+        *(ALIVE, "5aa503000600010201 02031eaaee", "5aa50b0004007102 0000aaee", VERSION)
+    ],
+    "reset first, four lanes, delay not in ticks": [
+        *("5aa501000000aaee", "5aa502000000aaee", ALIVE, VERSION, "5aa503000600010101 02031eaaee"),
+        "5aa50b000600c00537000000aaee",
+    ],
+    "packet configuration first, alive after the configuration": [
+        *(ALIVE, VERSION, "5aa50b000600be0571020000aaee", "5aa503000600010201 02031eaaee", ALIVE)
+    ],
+    "no configuration at all": [],
+}
+Play = Callable[..., "Client"]
+
+
+class Client:
+    """Binds 4096 and 4098 at the host's address, as they all do."""
+
+    def __init__(self, subnet: str, sockets: ExitStack) -> None:
+        self.card = (f"{subnet}.180", 4096)
+        self.commands = sockets.enter_context(bound_udp(f"{subnet}.30", 4096))
+        self.data = sockets.enter_context(bound_udp(f"{subnet}.30", 4098))
+        self.data.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        for s in (self.commands, self.data):
+            s.settimeout(5.0)
+
+    def send(self, request: str) -> bytes:
+        self.commands.sendto(bytes.fromhex(request), self.card)
+        return self.commands.recv(4096)
+
+    def packets(self, payload_bytes: int) -> bytes:
+        """Payload in order of arrival, until there is so much of it."""
+        got = b""
+        while len(got) < payload_bytes:
+            packet, source = self.data.recvfrom(4096)
+            sequence, low, high = struct.unpack_from("<IIH", packet)
+            assert source == (self.card[0], 1024)
+            assert low | high << 32 == len(got)
+            assert sequence == len(got) // 1456 + 1
+            got += packet[10:]
+        return got
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "recording.bin"
+    path.write_bytes(np.random.default_rng(3).integers(0, 256, 10 * 4096 + 18, dtype=np.uint8).tobytes())
+    return path
+
+
+@pytest.fixture
+def play() -> Iterator[Play]:
+    with ExitStack() as sockets:
+        players: list[subprocess.Popen[str]] = []
+
+        def begin(source: Path, *arguments: str) -> Client:
+            subnet = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}"
+            addresses = ("--card-address", f"{subnet}.180", "--host-address", f"{subnet}.30")
+            command = [sys.executable, "-m", "simulators.replay", str(source), *addresses, *arguments]
+            player = sockets.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            sockets.callback(player.kill)
+            players.append(player)
+            assert player.stdout is not None
+            assert player.stdout.readline().startswith("ready")
+            return Client(subnet, sockets)
+
+        yield begin
+        for player in players:
+            player.send_signal(signal.SIGTERM)
+            assert player.wait(5) == 0
+
+
+@pytest.mark.parametrize("requests", CLIENTS.values(), ids=CLIENTS.keys())
+def test_clients_of_other_people_get_their_answers_and_their_data(
+    play: Play, recording: Path, requests: list[str]
+) -> None:
+    client = play(recording, "--rate-mbit", "100", "--time-scale", "10")
+    for request in requests:
+        code = bytes.fromhex(request)[2]
+        assert client.send(request) == (bytes.fromhex("5aa50e000204aaee") if code == 0x0E else OK[code])
+    assert client.send(START) == OK[5]
+    assert client.packets(recording.stat().st_size) == recording.read_bytes()
+    assert client.commands.recv(100) == bytes.fromhex("5aa50a000001aaee")
+    assert client.send(STOP) == OK[6]
+
+
+def test_a_connected_socket_hears_nothing_because_replies_come_from_port_1024(play: Play, recording: Path) -> None:
+    client = play(recording)
+    client.commands.connect(client.card)
+    client.commands.settimeout(0.3)
+    client.commands.send(bytes.fromhex(ALIVE))
+    with pytest.raises(TimeoutError):
+        client.commands.recv(100)
+
+
+def test_each_record_plays_it_again_and_stop_ends_a_loop(play: Play, recording: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    client = play(recording, "--loop", "--rate-mbit", "80", "--report", str(report))
+    whole = recording.read_bytes() * 3
+    assert client.send(START) == OK[5]
+    n = (2 * len(recording.read_bytes())) // 1456 * 1456
+    assert client.packets(n) == whole[:n]
+    assert client.send(STOP) == OK[6]
+    assert client.commands.recv(100) == bytes.fromhex("5aa50a000001aaee")
+
+
+def test_frames_end_the_record_and_faults_are_counted(play: Play, recording: Path, tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    arguments = ("--frames", "4", "--time-scale", "10", "--fault", "lose_packets=[1, 2]", "--report", str(report))
+    client = play(recording, *arguments)
+    assert client.send(START) == OK[5]
+    sizes = [len(client.data.recv(4096)) - 10 for _ in range(10)]
+    assert sum(sizes) == 4 * 4096 - 2 * 1456
+    assert client.commands.recv(100) == bytes.fromhex("5aa50a000001aaee")
+    client.send(STOP)
+
+
+@pytest.mark.parametrize("bytes_per_s", [1e5, 7e6])
+def test_it_plays_at_the_rate_that_was_set(recording: Path, bytes_per_s: float) -> None:
+    """By a clock of the test's own, so that it says the same on any machine."""
+    now_s = 50.0
+    subnet = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}"
+    network = Network(f"{subnet}.30", f"{subnet}.180", MAC, 4096, 4098)
+    with closing(CardEndpoint("card", network, Faults(), 0, 1.0, lambda: now_s, Pace(), lanes=None)) as endpoint:
+        player = Player(endpoint, repeat(Recording(recording, loop=True)), bytes_per_s, lambda: now_s)
+        endpoint.card.command(bytes.fromhex(START), now_s)
+        player.turn()
+        for k in range(1, 41):
+            now_s = 50.0 + 0.01 * k
+            player.turn()
+            assert abs(endpoint.counts["lvds_bytes"] - 0.01 * k * bytes_per_s) <= 2
+
+
+def test_a_recording_is_read_in_pieces_whole_looped_and_cut(recording: Path) -> None:
+    data = recording.read_bytes()
+
+    def all_of(source: Recording, most: int) -> bytes:
+        got = b""
+        while len(got) < most and not source.ended:
+            got += source.read(1000).tobytes()
+        return got
+
+    assert all_of(Recording(recording), 10**9) == data
+    assert all_of(Recording(recording, 5000), 10**9) == data[:5000]
+    assert all_of(Recording(recording, 10**9), 10**9) == data
+    assert all_of(Recording(recording, 100_000, loop=True), 10**9) == (data * 3)[:100_000]
+    assert all_of(Recording(recording, loop=True), 200_000)[:200_000] == (data * 5)[:200_000]
+
+
+def test_rows_of_a_scan_folder_are_those_committed_last(tmp_path: Path) -> None:
+    facts = [
+        {"fact": "scan_started"},
+        {"fact": "row_committed", "row": 1, "boards": {"RH": {"file": "raw/RH/0001.bin"}}},
+        {"fact": "row_committed", "row": 0, "boards": {"RH": {"file": "raw/RH/0000.bin"}}},
+        {"fact": "row_committed", "row": 1, "boards": {"RH": {"file": "raw/RH/0001-2.bin"}}},
+    ]
+    (tmp_path / "manifest.jsonl").write_text("\n".join(map(json.dumps, facts)) + '\n{"fact": "row_comm')
+    assert scan_rows(tmp_path, "RH", None) == [tmp_path / "raw/RH/0000.bin", tmp_path / "raw/RH/0001-2.bin"]
+    assert scan_rows(tmp_path, "RH", 0) == [tmp_path / "raw/RH/0000.bin"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words", "status"),
+    [
+        (["nowhere.bin"], "nothing to play", 3),
+        (["{folder}"], "no --board", 2),
+        (["{folder}", "--board", "RH"], "not a scan folder", 3),
+        (["{file}", "--row", "3"], "--row without", 2),
+        (["{file}", "--rate-mbit", "0"], "--rate-mbit 0", 2),
+        (["{file}", "--fault", "overflow=0.1"], "no SYNC_IN pulses", 2),
+        (["{file}", "--card-address", "203.0.113.9"], "cannot take", 5),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_message(
+    recording: Path, arguments: list[str], words: str, status: int
+) -> None:
+    filled = [a.format(folder=recording.parent, file=recording) for a in arguments]
+    command = [sys.executable, "-m", "simulators.replay", *filled]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    assert (done.returncode, "Traceback" in done.stderr) == (status, False)
+    assert words in done.stderr

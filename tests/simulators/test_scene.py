@@ -1,0 +1,121 @@
+"""Laws of the scene file: unknown keys refused, switches switch, overrides merge and are checked."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from shared.config import Instrument, load_instrument
+from shared.errors import ConfigError
+from simulators.scene import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def rig() -> Instrument:
+    return load_instrument(ROOT / "instrument.toml")
+
+
+def scene(**tables: Any) -> Scene:
+    return decode_scene({"name": "t", **tables}, "t.toml")
+
+
+PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [10.0, 10.0]}
+
+
+@pytest.mark.parametrize(
+    ("raw", "named"),
+    [
+        ({"name": "t", "plate": []}, "plate"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "colour": "red"}]}, "colour"),
+        ({"name": "t", "plates": [PLATE]}, "permittivity"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "permittivity": [3.0, 0.1]}]}, "one of"),
+        (
+            {
+                "name": "t",
+                "plates": [{**PLATE, "layers": [{"permittivity": [3.0, 0.1]}, {"permittivity": [2.0, 0.1]}]}],
+            },
+            "only the last",
+        ),
+        ({"name": "t", "plates": [{**PLATE, "permittivity": [0.5, 0.1]}]}, "at least 1"),
+        ({"name": "t", "plates": [{**PLATE, "permittivity": [3.0, -0.1]}]}, "eps''"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "thickness_mm": 1.0}]}, "thickness_mm"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "size_mm": [0.0, 1.0]}]}, "size_mm"),
+        ({"name": "t", "grid": {"columns": 3, "colums": 4}}, "colums"),
+        ({"name": "t", "disturbances": {"nois": 1.0}}, "nois"),
+        ({"name": "t", "disturbances": {"ideal": 3}}, "ideal"),
+        ({"name": "t", "disturbances": {"bend_us": "off"}}, "bend_us"),
+        ({"name": "t", "disturbances": {"packet_loss": 0.9}}, "packet_loss"),
+        ({"name": "t", "disturbances": {"crystal_ppm": {"RH": 1.0}}}, "RH"),
+        ({"plates": []}, "name"),
+    ],
+)
+def test_a_wrong_key_or_value_is_refused_by_name(raw: dict[str, Any], named: str) -> None:
+    with pytest.raises(ConfigError, match=named) as e:
+        decode_scene(raw, "t.toml")
+    assert "t.toml" in str(e.value)
+
+
+def test_every_disturbance_has_an_off_value_and_ideal_uses_them_all() -> None:
+    shaping = {"bend_us", "ripple_us"}
+    assert set(OFF) | shaping == set(Disturbances.__struct_fields__)
+    ideal = msgspec.to_builtins(scene(disturbances={"ideal": True}).disturbances)
+    expected = msgspec.to_builtins(msgspec.convert(OFF, Disturbances))
+    assert ideal == expected
+
+
+@pytest.mark.parametrize("key", sorted(OFF))
+@pytest.mark.parametrize("word", ["off", False])
+def test_each_disturbance_can_be_switched_off_alone(key: str, word: object) -> None:
+    got = msgspec.to_builtins(scene(disturbances={key: word}).disturbances)
+    expected = {
+        **msgspec.to_builtins(Disturbances()),
+        key: msgspec.to_builtins(msgspec.convert(OFF, Disturbances))[key],
+    }
+    assert got == expected
+
+
+def test_one_disturbance_can_be_switched_on_in_an_ideal_rig() -> None:
+    d = scene(disturbances={"ideal": True, "hpf": True, "direct_snr_db": 3.0}).disturbances
+    assert (d.hpf, d.direct_snr_db, d.random_phase, d.if_offset_hz) == (True, 3.0, False, 0.0)
+    again = scene().with_disturbances(ideal=True, hpf=True, direct_snr_db=3.0).disturbances
+    assert again == d
+
+
+def test_overrides_merge_with_the_rig_and_twice_is_once(rig: Instrument) -> None:
+    s = scene(object_distance_mm=450.0, grid={"columns": 11}, burst={"pulses": 4}, stage={"speed_mm_s": 10.0})
+    once = apply_scene(rig, s)
+    assert (once.grid.columns, once.grid.rows) == (11, rig.grid.rows)
+    assert (once.burst.pulses, once.burst.period_us) == (4, rig.burst.period_us)
+    assert (once.stage.speed_mm_s, once.geometry.object_distance_mm) == (10.0, 450.0)
+    assert apply_scene(once, s) == once
+    assert apply_scene(rig, scene()) == rig
+
+
+@pytest.mark.parametrize("grid", [{"columns": "many"}, {"columns": 9000}, {"step_x_mm": -1.0}])
+def test_an_override_must_keep_the_rules_of_the_rig_file(rig: Instrument, grid: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="grid"):
+        apply_scene(rig, scene(grid=grid))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").rglob("*.toml")), ids=lambda p: p.stem)
+def test_every_example_fits_the_published_rig(rig: Instrument, path: Path) -> None:
+    s = load_scene(path)
+    assert apply_scene(rig, s).grid.columns > 0
+    boxes = [(*p.centre_mm, *p.size_mm) for p in s.plates]
+    for i, a in enumerate(boxes):
+        for b in boxes[:i]:
+            assert max(abs(a[0] - b[0]) - (a[2] + b[2]) / 2, abs(a[1] - b[1]) - (a[3] + b[3]) / 2) > 0, "plates overlap"
+
+
+def test_the_library_never_holds_the_demo_scan() -> None:
+    demo = load_scene(ROOT / "examples" / "nine-materials.toml")
+    library = [load_scene(p) for p in sorted((ROOT / "examples" / "library").glob("*.toml"))]
+    assert len(library) >= 4
+    assert len({s.seed for s in [demo, *library]}) == len(library) + 1
+    materials = {p.name: (p.permittivity, p.metal) for p in demo.plates}
+    for s in library:
+        assert {p.name: (p.permittivity, p.metal) for p in s.plates} == materials
+        assert not {p.centre_mm for p in s.plates} & {p.centre_mm for p in demo.plates}

@@ -1,0 +1,164 @@
+"""Laws of the wires hub: per-sender order, nothing lost, nothing sent back, nothing unasked for."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from shared.errors import ConfigError, DeviceError
+from shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
+from simulators.wires import WireHub
+
+Serve = Callable[..., Path]
+Join = Callable[..., WireClient]
+
+
+@pytest.fixture
+def join() -> Iterator[Join]:
+    """Joins the wires; leaves them after the test."""
+    clients: list[WireClient] = []
+
+    def connect(path: Path, listen: tuple[int, ...] = (), motion: bool = False) -> WireClient:
+        clients.append(WireClient(path, listen, motion))
+        return clients[-1]
+
+    yield connect
+    for client in clients:
+        client.close()
+
+
+@pytest.fixture
+def reports() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def serve(tmp_path: Path, reports: list[str]) -> Iterator[Serve]:
+    stop = threading.Event()
+    threads: list[tuple[threading.Thread, WireHub]] = []
+
+    def start(**options: int) -> Path:
+        hub = WireHub(tmp_path / "w.sock", reports.append, **options)
+        thread = threading.Thread(target=hub.serve, args=(stop, 0.01))
+        thread.start()
+        threads.append((thread, hub))
+        return tmp_path / "w.sock"
+
+    yield start
+    stop.set()
+    for thread, hub in threads:
+        thread.join(5)
+        hub.close()
+
+
+def take(client: WireClient, n: int) -> list[WireMessage]:
+    """The next n messages, as they come; fewer when 5 s pass without one."""
+    got: list[WireMessage] = []
+    while len(got) < n and (message := client.receive(5.0)) is not None:
+        got.append(message)
+    return got
+
+
+def test_ten_thousand_edges_of_two_senders_reach_the_listener_in_each_senders_order(serve: Serve, join: Join) -> None:
+    path = serve()
+    listener, stage, pi = join(path, (22, 26), motion=True), join(path), join(path)
+    n = 5000
+    triggers = [WireEdge(1000 * k, 26, k % 2) for k in range(n)]
+    pulses = [WireEdge(1000 * k + 7, 22, k % 2) for k in range(n)]
+
+    def send(client: WireClient, edges: list[WireEdge]) -> None:
+        for i in range(0, n, 37):
+            client.send(*edges[i : i + 37])
+
+    senders = [threading.Thread(target=send, args=job) for job in ((stage, triggers), (pi, pulses))]
+    for thread in senders:
+        thread.start()
+    got = take(listener, 2 * n)
+    for thread in senders:
+        thread.join()
+    assert [m for m in got if isinstance(m, WireEdge) and m.line == 26] == triggers
+    assert [m for m in got if isinstance(m, WireEdge) and m.line == 22] == pulses
+    assert listener.receive(0.05) is None
+
+
+def test_only_what_was_asked_for_arrives_and_never_ones_own(serve: Serve, join: Join) -> None:
+    path = serve()
+    pi = join(path, (26,))
+    cards = join(path, (22,), motion=True)
+    stage = join(path)
+    pi.send(WireEdge(1, 26, 1))  # its own line: must not come back
+    stage.send(WireMotion(2, 0, 0, 5), WireEdge(3, 26, 1), WireEdge(4, 27, 1))
+    assert take(pi, 1) == [WireEdge(3, 26, 1)]
+    pi.send(WireEdge(5, 22, 1))
+    assert take(cards, 2) == [WireMotion(2, 0, 0, 5), WireEdge(5, 22, 1)]
+    assert pi.receive(0.05) is None
+    assert cards.receive(0.05) is None
+
+
+def test_who_joins_late_learns_where_the_stage_stands(serve: Serve, join: Join) -> None:
+    path = serve()
+    stage, early = join(path), join(path, motion=True)
+    stage.send(WireMotion(1, 10, 20, 0), WireMotion(2, 30, 40, 50))
+    assert len(take(early, 2)) == 2
+    late = join(path, motion=True)
+    assert take(late, 1) == [WireMotion(2, 30, 40, 50)]
+    assert late.receive(0.05) is None
+
+
+def test_a_party_that_does_not_read_holds_nobody_up_and_loses_nothing(serve: Serve, join: Join) -> None:
+    path = serve()
+    slow, fast, stage = join(path, (26,)), join(path, (26,)), join(path)
+    edges = [WireEdge(k, 26, k % 2) for k in range(50_000)]
+    stage.send(*edges)
+    assert take(fast, len(edges)) == edges
+    assert take(slow, len(edges)) == edges
+
+
+def test_beyond_the_bound_the_slow_party_is_cut_off_with_a_message_and_the_others_go_on(
+    serve: Serve, join: Join, reports: list[str]
+) -> None:
+    path = serve(max_pending_bytes=10_000)
+    slow, fast, stage = join(path, (26,)), join(path, (26,)), join(path)
+    edges = [WireEdge(k, 26, k % 2) for k in range(50_000)]
+    for i in range(0, len(edges), 100):
+        stage.send(*edges[i : i + 100])
+        assert len(take(fast, 100)) == 100
+    with pytest.raises(DeviceError, match=r"closed|broke"):
+        take(slow, len(edges))
+    assert len(reports) == 1
+    assert "26" in reports[0]
+
+
+@pytest.mark.parametrize("line", [b"S 1 26\n", b"X\n", b"L a\n", b"M 1 2 3\n", b"M 1 2 3 x\n", b"S" * 1000])
+def test_a_party_that_writes_something_else_is_cut_off_with_a_message(
+    serve: Serve, join: Join, reports: list[str], line: bytes
+) -> None:
+    path = serve()
+    listener = join(path, (26,))
+    with socket.socket(socket.AF_UNIX) as bad:
+        bad.settimeout(5)
+        bad.connect(str(path))
+        bad.sendall(encode(WireEdge(1, 26, 1)) + line)
+        assert bad.recv(1) == b""
+    assert take(listener, 1) == [WireEdge(1, 26, 1)]
+    assert "cut off" in reports[0]
+
+
+def test_two_hubs_do_not_share_a_socket_but_a_dead_hubs_file_is_replaced(serve: Serve, tmp_path: Path) -> None:
+    path = serve()
+    with pytest.raises(DeviceError, match="another hub"):
+        WireHub(path, str)
+    left_over = tmp_path / "old.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(left_over))
+    WireHub(left_over, str).close()
+    assert not left_over.exists()
+
+
+def test_a_path_too_long_for_a_unix_socket_says_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="too long"):
+        WireHub(tmp_path / ("x" * 120), str)

@@ -1,0 +1,186 @@
+"""Fixtures: stages to talk to. `stage` is one in virtual time with simulated wires, `talker` any of them."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from shared.errors import DeviceError
+from shared.wires import WireEdge, WireMessage, WireMotion
+from simulators.stage import SKETCH_DIR, build, compiler
+from simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
+
+
+def _module(name: str) -> ModuleType:
+    """A module beside this file, by its path: test folders are no packages here."""
+    spec = importlib.util.spec_from_file_location(f"stage_{name}", Path(__file__).with_name(f"{name}.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[f"stage_{name}"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+drivers, conversations, uno_hosts = _module("drivers"), _module("conversation"), _module("uno_host")
+Driver, FirmwareDriver, PythonDriver = drivers.Driver, drivers.FirmwareDriver, drivers.PythonDriver
+_SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
+
+
+def edges(wires: list[WireMessage]) -> list[WireEdge]:
+    return [w for w in wires if isinstance(w, WireEdge)]
+
+
+def motions(wires: list[WireMessage]) -> list[WireMotion]:
+    return [w for w in wires if isinstance(w, WireMotion)]
+
+
+@pytest.fixture(scope="session")
+def firmware_program() -> Path:
+    """The sketch compiled for this machine."""
+    gxx = compiler()
+    if gxx is None:
+        pytest.skip("no C++ compiler: `apt-get install g++` runs these tests too")
+    return build(gxx)
+
+
+@pytest.fixture(scope="session")
+def sanitized_program() -> Path:
+    """The same with address and undefined-behaviour sanitizers; whatever they find ends the program."""
+    gxx = compiler()
+    if gxx is None:
+        pytest.skip("no C++ compiler: `apt-get install g++` runs these tests too")
+    try:
+        return build(gxx, ("-std=gnu++11", "-Wall", "-Wextra", "-fno-exceptions", *_SANITIZE))
+    except DeviceError as e:
+        if "san" in str(e) and "cannot find" in str(e):
+            pytest.skip(
+                "no sanitizer libraries: `apt-get install libgcc-12-dev` (or that of your g++) runs these tests too"
+            )
+        raise
+
+
+@pytest.fixture(scope="session")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """`make firmware` in a folder, and what it said."""
+    if lacking := [p for p in missing() if p not in ("libsimavr-dev", "libelf-dev")]:
+        pytest.skip(f"no firmware without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
+    folder = tmp_path_factory.mktemp("firmware")
+    command = ["make", "-C", str(SKETCH_DIR), "firmware", f"AVR_B={folder}"]
+    made = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    return folder, made.stdout
+
+
+@pytest.fixture(scope="session")
+def uno_programs() -> tuple[Path, Path]:
+    """The emulator and the machine code."""
+    if lacking := missing():
+        pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
+    return emulator(), firmware()
+
+
+@pytest.fixture
+def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., EmulatedUno]]:
+    """Makes emulated boards; takes the further arguments of EmulatedUno."""
+    made: list[EmulatedUno] = []
+
+    def make(**arguments: object) -> EmulatedUno:
+        made.append(EmulatedUno(*uno_programs, **arguments))
+        return made[-1]
+
+    yield make
+    for uno in made:
+        uno.close()
+
+
+@pytest.fixture
+def host(make_uno: Callable[..., EmulatedUno]) -> object:
+    """A host at the serial line of an emulated board; greeted, switched on and homed."""
+    return uno_hosts.Host(make_uno(start=(300, 250))).ready()
+
+
+@pytest.fixture
+def conversation() -> ModuleType:
+    """Plays dialogue files."""
+    return conversations
+
+
+@pytest.fixture
+def port_driver() -> type[Driver]:
+    """What talks to a stage through a serial port, as --stage-port does."""
+    return drivers.PortDriver
+
+
+@pytest.fixture(params=["pc", "sanitized", "python", "uno", "port"])
+def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
+    """Any stage, just switched on."""
+    kind = request.param
+    if kind == "pc":
+        driver = FirmwareDriver(request.getfixturevalue("firmware_program"))
+    elif kind == "sanitized":
+        environment = {**os.environ, "ASAN_OPTIONS": "detect_leaks=0"}
+        driver = FirmwareDriver(request.getfixturevalue("sanitized_program"), environment=environment)
+    elif kind == "python":
+        driver = PythonDriver()
+    elif kind == "uno":
+        driver = drivers.UnoDriver(*request.getfixturevalue("uno_programs"), tmp_path)
+    else:
+        port = request.config.getoption("--stage-port")
+        if not port:
+            pytest.skip("no real stage: pytest tests/stage --stage-port /dev/ttyACM0 (it homes and moves)")
+        driver = drivers.PortDriver(port)
+    yield driver
+    driver.close()
+
+
+@pytest.fixture(params=["firmware", "python"])
+def stage(request: pytest.FixtureRequest) -> Iterator[Driver]:
+    """A stage just switched on."""
+    if request.param == "firmware":
+        driver: Driver = FirmwareDriver(request.getfixturevalue("firmware_program"))
+    else:
+        driver = PythonDriver()
+    yield driver
+    driver.close()
+
+
+@pytest.fixture
+def both(firmware_program: Path) -> Iterator[tuple[Driver, Driver]]:
+    """The firmware and the stand-in side by side."""
+    drivers = FirmwareDriver(firmware_program), PythonDriver()
+    yield drivers
+    for driver in drivers:
+        driver.close()
+
+
+@pytest.fixture
+def driver_pair(firmware_program: Path) -> Iterator[Callable[[float], tuple[Driver, Driver]]]:
+    """Makes the two with other steps per millimetre."""
+    made: list[Driver] = []
+
+    def make(steps_per_mm: float) -> tuple[Driver, Driver]:
+        made.extend([FirmwareDriver(firmware_program, steps_per_mm), PythonDriver(steps_per_mm)])
+        return made[-2], made[-1]
+
+    yield make
+    for driver in made:
+        driver.close()
+
+
+@pytest.fixture
+def only_edges() -> object:
+    """Picks the S lines."""
+    return edges
+
+
+@pytest.fixture
+def only_motions() -> object:
+    """Picks the M lines."""
+    return motions

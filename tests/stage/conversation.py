@@ -1,0 +1,80 @@
+"""Plays a written conversation (the form is told in test_dialogues.py) with a stage."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from shared.stage_line import Command, Immediate, crc16, unseal
+
+PRESSED = {"X": 1, "Y": 2, "E": 4, "nothing": 0}
+
+
+class Conversation:
+    def __init__(self, stage) -> None:
+        self.stage = stage
+        self.sequence = 0
+        self.by_verb: dict[str, int] = {}
+        self.last = b""
+
+    def send(self, text: str) -> None:
+        if text == "again":
+            self.stage.rx(self.last)
+        elif text.startswith("<"):
+            self.stage.rx(bytes([Immediate[text.strip("<>")]]))
+        elif text.startswith("sealed "):
+            body = ast.literal_eval("b" + text.removeprefix("sealed "))
+            self.stage.rx(body + b"*%04X\n" % crc16(body))
+        elif text.startswith('"'):
+            self.stage.rx(ast.literal_eval("b" + text))
+        else:
+            words = text.split()
+            self.sequence = int(words.pop(0)[1:]) if re.fullmatch(r"N\d+", words[0]) else self.sequence + 1
+            verb, args = words[0], tuple(map(int, words[1:]))
+            self.by_verb[verb] = self.sequence
+            self.last = Command(self.sequence, verb, args).encode()
+            self.stage.rx(self.last)
+
+    def expect(self, text: str) -> None:
+        if text == "silence":
+            assert self.stage.received == b""
+            return
+        line, newline, self.stage.received = self.stage.received.partition(b"\n")
+        assert newline, f"expected {text!r}, nothing came"
+        text = re.sub(r"#([A-Z]+)", lambda m: str(self.by_verb[m[1]]), text).replace("#", str(self.sequence))
+        assert re.fullmatch(re.escape(text).replace(r"\?", r"[-+.:A-Za-z0-9]+"), unseal(line + newline)), (
+            f"expected {text!r}, got {line!r}"
+        )
+
+    def act(self, text: str) -> None:
+        words = text.split()
+        if words[-1] == "ms":
+            self.stage.run_ms(float(words[0]))
+        elif words[0] == "rest":
+            self.stage.rest()
+        elif words[0] == "press":
+            self.stage.press(PRESSED[words[1]])
+        elif words[0] == "slip":
+            self.stage.slip(int(words[1]), int(words[2]))
+        elif words[0] == "reset":
+            self.stage.reset()
+        else:
+            raise ValueError(text)
+
+
+def play(stage, path: Path) -> None:
+    """Every line of the file in turn; fails at the first that does not hold."""
+    talk = Conversation(stage)
+    steps = {"->": talk.send, "<-": talk.expect, "..": talk.act}
+    for number, line in enumerate(path.read_text(encoding="ascii").splitlines(), 1):
+        line = line.partition(" //")[0].strip()
+        if not line or line.startswith("//"):
+            continue
+        try:
+            steps[line[:2]](line[3:].strip())
+        except AssertionError as e:
+            pytest.fail(f"{path.name}:{number}: {line}: {e}")
+    assert stage.received == b"", f"{path.name}: not expected"

@@ -1,0 +1,330 @@
+"""Stages with one face: the sketch on this machine, its Python stand-in, machine code on an emulated UNO, a port."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import serial
+
+from shared.errors import ProtocolError
+from shared.stage_line import Command, Immediate, Reply
+from shared.wires import WireMessage, parse
+from simulators.stage_motion import NS_PER_TICK, TICK_HZ
+from simulators.stage_python import PythonStage, Rig
+from simulators.uno import HZ, EmulatedUno
+
+LIMIT_TICKS = 600 * TICK_HZ
+TICKS_PER_MS = TICK_HZ // 1000
+
+
+class Driver:
+    """Sends lines, lets time go on, and collects what comes back."""
+
+    def __init__(self) -> None:
+        self.wires: list[WireMessage] = []
+        self.received = b""
+        self.t_ns = 0
+        self.sequence = 0
+
+    def rx(self, data: bytes) -> None:
+        raise NotImplementedError
+
+    def run(self, ticks: int) -> None:
+        raise NotImplementedError
+
+    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+        raise NotImplementedError
+
+    def press(self, mask: int) -> None:
+        raise NotImplementedError
+
+    def slip(self, dx: int, dy: int) -> None:
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        return
+
+    def still(self) -> bool:
+        """Whether nothing has moved and no trigger was given since the last call."""
+        quiet = not self.wires
+        self.wires.clear()
+        return quiet
+
+    def run_ms(self, ms: float) -> None:
+        self.run(round(ms * TICKS_PER_MS))
+
+    def replies(self) -> list[Reply]:
+        """Everything received since the last call."""
+        lines, self.received = self.received.splitlines(keepends=True), b""
+        return [Reply.decode(line) for line in lines]
+
+    def command(self, verb: str, *args: int) -> Reply:
+        """Send the next command and return its only answer."""
+        self.sequence = (self.sequence + 1) % 65536
+        self.rx(Command(self.sequence, verb, args).encode())
+        (reply,) = self.replies()
+        assert reply.sequence == self.sequence
+        return reply
+
+    def motion(self, verb: str, *args: int) -> tuple[Reply, list[WireMessage]]:
+        """Send a motion command that is accepted, wait for its end; the last reply and what was on the wires."""
+        self.wires.clear()
+        reply = self.command(verb, *args)
+        assert reply.kind == "ok", reply
+        self.rest()
+        *_, last = self.replies()
+        return last, list(self.wires)
+
+    def status(self) -> Reply:
+        self.rx(bytes([Immediate.STATUS]))
+        *_, last = self.replies()
+        assert last.kind == "status"
+        return last
+
+    def ready(self, heartbeat_ms: int = 60_000) -> Driver:
+        """Greeted, switched on and homed."""
+        self.replies()
+        answers = [self.command("HELLO"), self.command("SET", 1, heartbeat_ms), self.command("ENABLE", 1)]
+        assert [r.kind for r in answers] == ["ok"] * 3
+        last, _ = self.motion("HOME")
+        assert last.kind == "done"
+        return self
+
+
+class FirmwareDriver(Driver):
+    """The sketch's own C++ compiled for this machine, in virtual time."""
+
+    def __init__(self, program: Path, steps_per_mm: float = 200.0, environment: dict[str, str] | None = None) -> None:
+        super().__init__()
+        arguments = [str(program), "--lockstep", "--steps-per-mm", repr(steps_per_mm)]
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(arguments, stdin=pipe, stdout=pipe, text=True, env=environment)
+        self._collect()
+
+    def _collect(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            tag, _, rest = line.strip().partition(" ")
+            if tag == "R":
+                self.t_ns = int(rest)
+                return
+            if tag == "T":
+                self.received += bytes.fromhex(rest)
+            else:
+                self.wires.append(parse(line))
+        raise ProtocolError(f"the stage program ended with status {self._process.wait(10)}")
+
+    def _do(self, line: str) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+        self._collect()
+
+    def rx(self, data: bytes) -> None:
+        for i in range(0, len(data), 1024):
+            self._do(f"rx {data[i : i + 1024].hex()}")
+
+    def run(self, ticks: int) -> None:
+        self._do(f"run {ticks}")
+
+    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+        self._do(f"rest {limit_ticks}")
+
+    def press(self, mask: int) -> None:
+        self._do(f"inputs {mask}")
+
+    def slip(self, dx: int, dy: int) -> None:
+        self._do(f"slip {dx} {dy}")
+
+    def reset(self) -> None:
+        self._do("reset")
+
+    def close(self) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        status = self._process.wait(10)
+        self._process.stdout.close()
+        assert status == 0, "a sanitizer has found something, or the program crashed: see its standard error"
+
+
+class PythonDriver(Driver):
+    """The Python stand-in, in virtual time."""
+
+    def __init__(self, steps_per_mm: float = 200.0) -> None:
+        super().__init__()
+        self._stage = PythonStage(Rig(steps_per_mm))
+        self.reset()
+
+    def _collect(self) -> None:
+        self.wires += self._stage.wires
+        self._stage.wires.clear()
+        self.received += bytes(self._stage.replies)
+        self._stage.replies.clear()
+        self.t_ns = self._stage.tick * NS_PER_TICK
+
+    def rx(self, data: bytes) -> None:
+        self._stage.receive(data)
+        self._collect()
+
+    def run(self, ticks: int) -> None:
+        self._run(ticks, until_rest=False)
+
+    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+        self._run(limit_ticks, until_rest=True)
+
+    def _run(self, ticks: int, until_rest: bool) -> None:
+        end = self._stage.tick + ticks
+        while self._stage.tick < end and not (until_rest and self._stage.at_rest):
+            tick = min(self._stage.tick + TICKS_PER_MS, end)
+            self._stage.advance(tick, tick // TICKS_PER_MS)
+        self._collect()
+
+    def press(self, mask: int) -> None:
+        self._stage.press(mask)
+
+    def slip(self, dx: int, dy: int) -> None:
+        self._stage.slip(dx, dy)
+
+    def reset(self) -> None:
+        self._stage.reset(self._stage.tick // TICKS_PER_MS)
+        self._collect()
+
+
+class UnoDriver(Driver):
+    """The compiled sketch on an emulated UNO, its serial line through a pseudo terminal, in the board's own time."""
+
+    def __init__(self, program: Path, image: Path, folder: Path) -> None:
+        super().__init__()
+        link = folder / "ttyUNO"
+        self.uno = EmulatedUno(program, image, pty=link)
+        self._port = serial.Serial(str(link), 115200, timeout=10)
+        self._written = self._read = 0
+        self._stood = self.uno.motors
+        self._collect()
+
+    def _collect(self) -> None:
+        self.uno.settle(self._written)
+        data = self._port.read(self.uno.sent - self._read)
+        self._read += len(data)
+        assert self._read == self.uno.sent, "bytes got lost in the pseudo terminal"
+        assert not [t for t in self.uno.troubles if t != "reset"], self.uno.troubles
+        self.received += data
+        self.t_ns = self.uno.cycle * 125 // 2
+
+    def rx(self, data: bytes) -> None:
+        for i in range(0, len(data), 1024):
+            self._written += self._port.write(data[i : i + 1024]) or 0
+            self._collect()
+
+    def run(self, ticks: int) -> None:
+        self.uno.run(ticks * HZ // TICK_HZ)
+        self._collect()
+
+    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+        self.uno.rest(limit_ticks / TICK_HZ)
+        self._collect()
+
+    def press(self, mask: int) -> None:
+        self.uno.press(mask)
+
+    def slip(self, dx: int, dy: int) -> None:
+        self.uno.slip(dx, dy)
+
+    def reset(self) -> None:
+        self.uno.reset()
+        self._collect()
+
+    def still(self) -> bool:
+        quiet = not self.uno.edges and self.uno.motors == self._stood
+        self.uno.edges.clear()
+        self._stood = self.uno.motors
+        return quiet
+
+    def close(self) -> None:
+        self._port.close()
+        self.uno.close()
+
+
+class PortDriver(Driver):
+    """A stage behind a real serial port, in its own time.
+
+    `speed`: how many times the wall clock the stage's time runs; 1 for a real one. What needs hands on switches is
+    skipped. The heartbeat is kept up only as far as the conversation does it.
+    """
+
+    def __init__(self, port: str, speed: float = 1.0) -> None:
+        super().__init__()
+        self._speed = speed
+        self._port = serial.Serial(port, 115200, timeout=0.02)
+        self._partial = b""
+        self._listen_for_banner()
+
+    def _listen(self, seconds: float) -> None:
+        limit = time.monotonic() + seconds
+        while True:
+            self._partial += self._port.read(256)
+            complete, newline, self._partial = self._partial.rpartition(b"\n")
+            self.received += complete + newline
+            if time.monotonic() >= limit:
+                return
+
+    def _listen_for_banner(self, seconds: float = 10.0) -> None:
+        """Opening resets the board; what it was saying meanwhile is dropped."""
+        limit = time.monotonic() + seconds
+        while time.monotonic() < limit:
+            self._listen(0)
+            _, banner, rest = self.received.partition(b"polysight-stage")
+            if banner:
+                self.received = banner + rest
+                return
+        raise ProtocolError(f"no banner within {seconds} s; received {self.received!r}")
+
+    def rx(self, data: bytes) -> None:
+        """A line or a STATUS byte has an answer; what else comes, comes soon after."""
+        complete = self.received.count(b"\n")
+        self._port.write(data)
+        limit = time.monotonic() + 3.0
+        answered = data.strip(b"\n") and (data.endswith(b"\n") or data == bytes([Immediate.STATUS]))
+        while answered and self.received.count(b"\n") == complete and time.monotonic() < limit:
+            self._listen(0)
+        self._listen(0.15 / self._speed)
+
+    def run(self, ticks: int) -> None:
+        self._listen(ticks / TICK_HZ / self._speed)
+
+    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+        """Ask for the status until it is not one of motion; those answers are not part of the conversation."""
+        limit = time.monotonic() + min(limit_ticks / TICK_HZ / self._speed, 100.0)
+        while time.monotonic() < limit:
+            before, self.received = self.received, b""
+            self._port.write(bytes([Immediate.STATUS]))
+            self._listen(0.15 / self._speed)
+            lines = self.received.splitlines(keepends=True)
+            states = [Reply.decode(line).fields["state"] for line in lines if line.startswith(b"status")]
+            self.received = before + b"".join(line for line in lines if not line.startswith(b"status"))
+            if states and states[-1] in ("idle", "alarm", "hold"):
+                return
+        raise ProtocolError("the stage does not come to rest")
+
+    def press(self, mask: int) -> None:
+        pytest.skip(f"a hand on the switches is needed (mask {mask})")
+
+    def slip(self, dx: int, dy: int) -> None:
+        pytest.skip(f"a hand on the motors is needed ({dx}, {dy} steps)")
+
+    def reset(self) -> None:
+        self.received = b""
+        self._port.dtr = False
+        self._listen(0.1)
+        self._port.dtr = True
+        self._listen_for_banner()
+
+    def close(self) -> None:
+        self._port.close()

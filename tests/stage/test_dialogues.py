@@ -1,0 +1,29 @@
+"""Whole conversations, written down in dialogues/*.txt, with every kind of stage.
+
+`-> VERB ARGS`       send a command with the next sequence number and its checksum
+`-> N7 VERB ARGS`    ... with this number
+`-> again`           send the last command's bytes again
+`-> <HOLD>`          an immediate byte
+`-> "bytes"`         exactly these bytes
+`-> sealed "body"`   this body with its checksum and line end
+`<- REPLY`           the next reply; # is the number of the last command, #ROW that of the last ROW, ? any value
+`<- silence`         nothing has come
+`.. 100 ms`          let time go on; also `rest`, `press X|Y|E|nothing`, `slip DX DY`, `reset`
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+DIALOGUES = sorted((Path(__file__).parent / "dialogues").glob("*.txt"))
+
+
+@pytest.mark.parametrize("path", DIALOGUES, ids=lambda p: p.stem)
+def test_dialogue(talker, conversation, path: Path):
+    conversation.play(talker, path)
+
+
+def test_there_are_dialogues():
+    assert len(DIALOGUES) >= 9

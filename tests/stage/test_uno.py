@@ -1,0 +1,188 @@
+"""Laws of the compiled sketch on an emulated UNO, in lockstep: counts and times are exact on any machine."""
+
+from __future__ import annotations
+
+import itertools
+import random
+
+import pytest
+
+from shared.stage_line import Command, Immediate, Parameter
+from simulators.stage_logic import homing_zero
+from simulators.uno import HZ
+
+US, MS = HZ // 1_000_000, HZ // 1000
+TRIGGER, X_PUL, RIGHT_PUL = 2, 5, 4  # the left motor steps just before the right one
+BATCH = 20  # rows
+TOP_RATE = 20_000  # steps/s
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "batch" in metafunc.fixturenames:
+        metafunc.parametrize("batch", range(500 if metafunc.config.getoption("--long") else 4))
+
+
+def test_random_rows(host, batch: int):
+    """Pulses = points, each at its exact step count, both ways, held or not; evenly in time unless held; no step lost.
+
+    A quarter of the rows is held and resumed once or twice at any moment: in travel, in a ramp, between the triggers.
+    """
+    rng = random.Random(batch)
+    host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
+    steps_to_trigger = set()
+    x, y = 0, 0
+    for _ in range(BATCH):
+        accel = rng.choice([200_000, 400_000, 1_000_000])
+        rate = rng.choice([4000, TOP_RATE, rng.randint(3000, TOP_RATE)])
+        pitch = rng.choice([-1, 1]) * rng.randint(-(-rate // 800), 240)
+        points = rng.randint(1, 14)
+        width_us = rng.choice([1, 20, rng.randint(1, 500)])
+        backlash = rng.choice([0, 0, 300])
+        reach = abs(pitch) * points + rate * rate // (2 * accel) + 301
+        x0 = min(max(x + rng.randint(-3000, 3000), reach), 160_000 - reach)
+        y = min(max(y + rng.randint(-1000, 1000), backlash), 100_000)
+        for parameter, value in (
+            (Parameter.ACCEL, accel),
+            (Parameter.TRIGGER, width_us),
+            (Parameter.BACKLASH, backlash),
+        ):
+            host.set(parameter, value)
+        host.uno.edges.clear()
+        host.obeyed("ROW", x0, pitch, points, y, rate)
+        holds = rng.choice([0, 0, 0, 0, 0, 0, 1, 2])
+        for _ in range(holds):
+            host.uno.run_ms(rng.uniform(0, 500))
+            host.uno.feed(bytes([Immediate.HOLD]))
+            host.uno.run_ms(rng.uniform(0, 150))
+            host.uno.feed(bytes([Immediate.RESUME]))
+        host.uno.rest()
+        (done,) = host.replies()
+        x, held = done.integer("x"), done.integer("held")
+        assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
+        assert held <= holds
+        rising, falling = host.uno.edges[::2], host.uno.edges[1::2]
+        assert [e.value for e in host.uno.edges] == [1, 0] * points
+        assert [host.at(e) for e in rising] == [(x0 + i * pitch, y) for i in range(points)]
+        steps_to_trigger |= {e.cycle - e.step_cycle for e in rising}
+        # A step waits at most for another interrupt to end, and lateness never adds up.
+        spacing = abs(pitch) * HZ / rate
+        late = [e.cycle - i * spacing for i, e in enumerate(rising)]
+        assert held or max(late) - min(late) <= 16 * US
+        widths = [f.cycle - r.cycle for r, f in zip(rising, falling, strict=True)]
+        assert all(-2 * US <= w - width_us * US <= 60 * US for w in widths)
+        assert host.uno.motors == (host.zero[0] + x, host.zero[1] + y, host.zero[1] + y)
+    assert max(steps_to_trigger) - min(steps_to_trigger) <= 4 * US
+    assert max(steps_to_trigger) <= 4 * US
+    host.motion("MOVE", 0, 0, TOP_RATE)
+    assert host.uno.motors == (host.zero[0], host.zero[1], host.zero[1])
+    assert [t for t in host.uno.troubles if t != "reset"] == []
+
+
+@pytest.mark.parametrize("accel", [2_000, 40_000, 400_000])
+def test_homing_finds_the_same_zero(host, accel: int):
+    """From anywhere, and where the simulated rig expects it."""
+    host.set(Parameter.ACCEL, accel)
+    for x, y in ((900, 700), (377, 1111)):
+        host.motion("MOVE", x, y, 2000)
+        host.motion("HOME")
+        assert host.uno.motors == (homing_zero(accel),) * 3
+
+
+def test_backlash_comes_from_below_and_runs_up(host):
+    host.set(Parameter.BACKLASH, 700)
+    host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
+    host.uno.watch(TRIGGER, RIGHT_PUL, X_PUL)
+    for y, pitch in ((3000, 100), (2500, -100), (2500, 100), (4000, -100)):
+        host.motion("ROW", 9000, pitch, 5, y, 4000)
+        ys = [host.at(e)[1] for e in host.uno.edges if e.pin == RIGHT_PUL and e.value]
+        assert len(ys) >= 700
+        assert ys[-700:] == list(range(y - 699, y + 1))  # the last of y's steps go upwards
+        xs = [host.at(e)[0] for e in host.uno.edges if e.pin == X_PUL and e.value]
+        first = xs.index(9000) if pitch > 0 else len(xs) - 1 - xs[::-1].index(9000)
+        before = xs[first - 700 : first]
+        assert len({b - a for a, b in itertools.pairwise(before)}) == 1  # so do those of x in the row's direction
+
+
+def test_a_short_hold_is_told_and_costs_no_step(host):
+    """HOLD and RESUME at once: whether or not the main program saw the hold, the row does not pass for undisturbed."""
+    host.uno.edges.clear()
+    host.obeyed("ROW", 3000, 100, 60, 0, 4000)
+    while not host.uno.edges:
+        host.uno.run_ms(20)
+    for _ in range(5):
+        host.uno.run_ms(83)
+        host.uno.feed(bytes([Immediate.HOLD, Immediate.RESUME]))
+    host.uno.rest()
+    (done,) = host.replies()
+    assert [done.integer(k) for k in ("points", "pulses", "held")] == [60, 60, 1]
+    assert [host.at(e) for e in host.uno.edges if e.value] == [(3000 + 100 * i, 0) for i in range(60)]
+
+
+@pytest.mark.parametrize("chatty", [False, True])
+def test_no_command_is_lost_silently(host, chatty: bool):
+    """A host that does not wait for answers: every line is answered, or the host hears that something was lost."""
+    lines = [host.line("MOVE", 10 + i, 0, 4000) if i % 7 == 0 else host.line("CLEAR") for i in range(100)]
+    gap = b"?\n" * 12 if chatty else b""  # six times as many bytes of answer: the board is kept busy writing
+    host.uno.feed(b"".join(gap + line for line in lines))
+    host.uno.settle()
+    host.uno.rest()
+    host.uno.run_ms(300)
+    replies = host.replies()
+    answered = {r.sequence for r in replies if r.kind in ("ok", "error") and r.sequence is not None}
+    unread = [r for r in replies if r.kind == "error" and r.sequence is None]
+    wanted = set(range(host.sequence - 99, host.sequence + 1))
+    assert answered <= wanted
+    assert answered == wanted or any(r.number == 3 for r in unread)
+    assert (answered == wanted) != chatty  # this was a test of the loss
+    # The conversation goes on: greet, then any number may follow.
+    host.uno.feed(b"\n")
+    host.replies()
+    assert host.command("HELLO").kind == "ok"
+    host.obeyed("CLEAR")
+
+
+def test_a_second_command_on_its_way_is_answered(host):
+    host.uno.feed(host.line("MOVE", 400, 0, 4000) + host.line("MOVE", 0, 0, 4000) + host.line("CLEAR"))
+    host.uno.rest()
+    kinds = [(r.kind, r.number) for r in host.replies()]
+    assert kinds == [("ok", 0), ("error", 7), ("error", 7), ("done", 0)]
+    assert host.status().integer("x") == 400
+
+
+@pytest.mark.parametrize(("mask", "number"), [(1, 12), (2, 12), (4, 14)])
+def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest, mask: int, number: int):
+    """The main program looks at the interrupt's findings in a loop; whenever the switch comes, it is never `done`."""
+    rng = random.Random(mask)
+    host.obeyed("MOVE", 200, 200, 4000)
+    host.uno.rest()
+    host.replies()
+    for _ in range(100 if request.config.getoption("--long") else 6):
+        host.obeyed("MOVE", 900, 900, 2000)
+        host.uno.run(rng.randint(20 * MS, 200 * MS))
+        host.uno.press(mask)
+        host.uno.run_ms(60)
+        assert [(r.kind, r.number) for r in host.replies()] == [("alarm", number)]
+        host.uno.press(0)
+        host.obeyed("CLEAR")
+        assert host.command("MOVE", 0, 0, 4000).number == 8
+        host.motion("HOME")
+
+
+def test_damaged_lines_do_not_disturb_a_row(host):
+    """Every single flipped bit of a line, one after another, while a row is under way."""
+    line = Command(host.sequence + 2, "MOVE", (0, 0, 4000)).encode()
+    host.uno.edges.clear()
+    host.obeyed("ROW", 4000, 200, 60, 500, 4000)
+    for bit in range(8 * len(line)):
+        damaged = bytearray(line)
+        damaged[bit // 8] ^= 1 << bit % 8
+        if any(byte in list(Immediate) for byte in damaged):
+            continue
+        host.uno.feed(bytes(damaged) + b"\n")
+        host.uno.run_ms(10)
+    host.uno.rest()
+    replies = host.replies()
+    assert replies[-1].kind == "done"
+    assert all(r.kind == "error" and r.sequence is None for r in replies[:-1])
+    rising = [e for e in host.uno.edges if e.value]
+    assert [host.at(e) for e in rising] == [(4000 + 200 * i, 500) for i in range(60)]

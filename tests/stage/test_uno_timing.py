@@ -1,0 +1,134 @@
+"""How fast and how soon the compiled sketch is, on an emulated UNO, in lockstep: exact on any machine."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from shared.stage_line import Immediate, Parameter
+from simulators.uno import HZ
+
+SKETCH = Path(__file__).parents[2] / "arduino_stage"
+US, MS = HZ // 1_000_000, HZ // 1000
+TRIGGER, X_PUL = 2, 5
+STEP_VECTOR = 11
+TOP_RATE = 20_000  # steps/s
+
+
+def documented_cycles() -> int:
+    found = re.search(r"// Measured worst case: (\d+) cycles", (SKETCH / "hal_uno.cpp").read_text(encoding="ascii"))
+    assert found is not None
+    return int(found[1])
+
+
+def test_interrupt_cost(host):
+    """The step interrupt fits between two steps at the highest rate, and the comment above it tells the truth."""
+    host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
+    host.set(Parameter.TRIGGER, 1)
+    most = 0
+    for accel in (40_000, 400_000, 1_000_000):
+        host.set(Parameter.ACCEL, accel)
+        for verb, args in (
+            ("MOVE", (30_000, 29_000, TOP_RATE)),
+            ("MOVE", (100, 8_000, TOP_RATE)),
+            ("ROW", (12_000, 20, 300, 20_000, TOP_RATE)),
+            ("ROW", (18_000, -40, 100, 0, TOP_RATE)),
+        ):
+            host.obeyed(verb, *args)
+            for byte in (Immediate.STATUS, Immediate.HOLD, Immediate.RESUME) * 12:
+                host.uno.feed(bytes([byte]) * 4)
+                host.uno.run_ms(30)
+            host.uno.rest()
+            assert host.replies()[-1].kind == "done"
+        cost = host.uno.cost()
+        assert max(v for k, v in cost.interrupts.items() if k != STEP_VECTOR) <= 128  # 8 us: what a step may wait
+        most = max(most, cost.interrupts[STEP_VECTOR])
+        assert cost.step_pulse >= 4 * US
+        assert cost.direction_setup >= 20 * US
+        assert cost.direction_hold >= 20 * US
+    assert most <= documented_cycles() < HZ // TOP_RATE
+    assert most >= documented_cycles() - 60
+
+
+def test_top_rate_is_kept(host):
+    """20,000 steps/s over thousands of steps, while the host asks for the status all the time."""
+    host.set(Parameter.ACCEL, 400_000)
+    host.uno.watch(X_PUL)
+    host.uno.edges.clear()
+    host.obeyed("MOVE", 20_000, 0, TOP_RATE)
+    for _ in range(120):
+        host.uno.feed(bytes([Immediate.STATUS]))
+        host.uno.run_ms(8)
+    host.uno.rest()
+    times = [e.cycle for e in host.uno.edges if e.value]
+    assert len(times) == 20_000
+    cruise = times[2000:18_000]
+    late = [t - i * HZ / TOP_RATE for i, t in enumerate(cruise)]
+    assert max(late) - min(late) <= 30 * US
+    assert host.replies()[-1].kind == "done"
+
+
+@pytest.mark.parametrize("byte", [Immediate.HOLD, Immediate.STOP])
+@pytest.mark.parametrize("rate", [500, 4000, TOP_RATE])
+def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
+    accel = 40_000
+    host.uno.watch(X_PUL)
+    host.uno.edges.clear()
+    host.obeyed("MOVE", 40_000, 0, rate)
+    host.uno.run_ms(900.7)
+    host.uno.feed(bytes([byte]))
+    sent = host.uno.cycle
+    host.uno.rest()
+    times = [e.cycle for e in host.uno.edges if e.value]
+    ramp = -(-rate * rate // (2 * accel))  # steps in which the stage slows down
+    begins = times[-ramp - 1]
+    assert sent <= begins <= sent + 20 * MS
+    # Seen from outside: 20 ms after the byte the steps come slower, and they stop after the time of the ramp.
+    after = [t for t in times if t >= sent + 20 * MS]
+    paces = [(b - a) / 20 for a, b in zip(after, after[20:], strict=False)]
+    assert not paces or min(paces) > 1.01 * HZ / rate
+    assert times[-1] <= sent + 20 * MS + 1.1 * HZ * rate / accel
+    assert [r.number for r in host.replies()] == ([15] if byte == Immediate.STOP else [])
+
+
+def test_silence_stops_the_stage(host):
+    """The serial peer dies in the middle of a row: at rest with alarm 11 after the heartbeat's time and the ramp."""
+    host.set(Parameter.HEARTBEAT, 500)
+    host.uno.watch(TRIGGER, X_PUL)
+    host.obeyed("ROW", 2000, 100, 200, 0, 4000)
+    for _ in range(14):
+        host.uno.run_ms(100)
+        host.uno.feed(bytes([Immediate.STATUS]))
+    host.uno.settle()
+    assert host.status().fields["state"] == "row"
+    silent_from = host.uno.cycle
+    host.uno.edges.clear()
+    host.uno.run_ms(500 + 100 + 5)  # heartbeat, 4000 / 40,000 s of ramp
+    *_, last = host.replies()
+    assert (last.kind, last.number) == ("alarm", 11)
+    steps = [e.cycle for e in host.uno.edges if e.pin == X_PUL and e.value]
+    assert silent_from + 480 * MS < steps[-1] <= silent_from + 605 * MS
+    host.uno.edges.clear()
+    host.uno.run_ms(500)
+    assert host.uno.edges == []
+    host.obeyed("CLEAR")
+    assert host.command("MOVE", 0, 0, 4000).number == 8  # home first
+
+
+def test_half_a_second_of_silence_is_the_default(host):
+    """A board just reset, told nothing about heartbeats: the first motion is a homing."""
+    host.motion("MOVE", 20_000, 0, 8000)
+    host.uno.reset()
+    host.uno.run_ms(5)
+    assert [r.kind for r in host.replies()] == ["banner"]
+    host.obeyed("HELLO")
+    host.obeyed("ENABLE", 1)
+    host.uno.watch(X_PUL)
+    silent_from = host.uno.cycle
+    host.obeyed("HOME")
+    host.uno.rest()
+    assert [(r.kind, r.number) for r in host.replies()] == [("alarm", 11)]
+    steps = [e.cycle for e in host.uno.edges if e.value]
+    assert silent_from + 500 * MS < steps[-1] <= silent_from + (500 + 100 + 15) * MS  # with the command's own time

@@ -1,0 +1,58 @@
+"""A small scan, done once without any fault, to compare others with."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from small_scan import Samples, SmallScan
+
+T = TypeVar("T")
+
+
+@pytest.fixture
+def sample(request: pytest.FixtureRequest) -> Callable[[Sequence[T], int], list[T]]:
+    """`sample(cases, n)`: the first, the last and some n others, the same in every run; with --long up to 2000."""
+
+    def draw(cases: Sequence[T], n: int) -> list[T]:
+        n = 2000 if request.config.getoption("--long") else n
+        if len(cases) <= n:
+            return list(cases)
+        chosen = random.Random(request.node.name).sample(range(len(cases)), n)
+        return [cases[i] for i in sorted({0, len(cases) - 1, *chosen})]
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
+    return Samples(tmp_path_factory.mktemp("scene"))
+
+
+class Undisturbed(SmallScan):
+    """A finished scan; :meth:`copy` gives another one to damage."""
+
+    def __init__(self, samples: Samples, folder: Path) -> None:
+        super().__init__(samples, folder)
+        self._of, self._folder = samples, folder
+        assert self.run().exit_status == "success"
+        self.digests, self.final_image = self.rows(), self.image()
+
+    def copy(self, folder: Path) -> SmallScan:
+        """The same scan and journal in another folder, replaced if it is there."""
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(self._folder, folder)
+        return SmallScan(self._of, folder)
+
+
+@pytest.fixture(scope="session")
+def undisturbed(samples: Samples, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    return Undisturbed(samples, tmp_path_factory.mktemp("undisturbed"))

@@ -1,0 +1,205 @@
+"""A disk that fails, or a program that is killed, at the n-th thing that is done to one folder.
+
+Only what Python does in this process is seen: every write, fsync, reservation, truncation, and every name made, moved
+or removed below the folder. So a test can count them once and then fail each of them.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import pytest
+
+Fault = Literal["full", "short", "killed", "killed within", "power cut"]
+SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "unlink", "ftruncate", "posix_fallocate")
+REAL = SimpleNamespace(**{name: getattr(os, name) for name in SEEN})
+GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsync")
+
+
+class Killed(BaseException):
+    """The program ends here: nothing catches this, and whatever runs on its way out reaches the disk no more."""
+
+
+class FaultyDisk:
+    """Counts what is done below `folder`; with a fault, the `at`-th is hit (from 1).
+
+    full
+        It and all that need space after it fail with ENOSPC, until :meth:`free_space`.
+    short
+        As full, but a write that is hit writes half of its bytes first, as a disk does whose last block is taken.
+    killed, killed within
+        The program ends before it, or in the middle of it.
+    power cut
+        The same, and what was not synced may be lost: contents may be the old ones, the new ones, or zeros; names made
+        or moved may not be there.
+    """
+
+    def __init__(self, folder: Path, fault: Fault | None = None, at: int = 0, seed: int = 0) -> None:
+        self._folder, self._fault, self.at = str(folder), fault, at
+        self._random = random.Random(seed)
+        self._dead = self._space = False
+        self.done: list[str] = []
+        self._durable: dict[Path, bytes] = {}  # what of a touched file is on the disk for certain
+        # Names that are not synced yet: their folder, and how to lose them.
+        self._undo: list[tuple[Path, Callable[[], object]]] = []
+
+    def free_space(self) -> None:
+        """The disk takes writes again."""
+        self._space = True
+
+    def _hit(self, what: str, path: Path, half: Callable[[], object] = lambda: None) -> None:
+        """Count one operation, and fail it when it is its turn."""
+        if not str(path).startswith(self._folder):
+            return
+        if self._dead:
+            raise Killed
+        self.done.append(f"{what} {path.name}")
+        n = len(self.done)
+        if self._fault in ("full", "short") and n >= self.at and not self._space and what in GROWS:
+            if n == self.at and self._fault == "short":
+                half()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        if self._fault in ("killed", "killed within", "power cut") and n == self.at:
+            if self._fault != "killed":
+                half()
+            self._dead = True
+            raise Killed
+
+    # --- what a power cut leaves ---
+
+    def _touch(self, path: Path) -> None:
+        if str(path).startswith(self._folder):
+            self._durable.setdefault(path, path.read_bytes() if path.exists() else b"")
+
+    def _synced(self, path: Path) -> None:
+        if path.is_dir():
+            self._undo = [(folder, back) for folder, back in self._undo if folder != path]
+        elif path in self._durable:
+            del self._durable[path]
+
+    def lose_power(self) -> None:
+        """Draw what of the unsynced is left. Names are lost from the newest on: file systems keep their order."""
+        for path, durable in self._durable.items():
+            if path.exists():
+                now = path.read_bytes()
+                torn = durable + bytes(max(0, len(now) - len(durable)))
+                path.write_bytes(self._random.choice([durable, now, torn, now[: self._random.randint(0, len(now))]]))
+        for _, back in reversed(self._undo[self._random.randint(0, len(self._undo)) :]):
+            back()
+
+    # --- the operations ---
+
+    @contextmanager
+    def __call__(self) -> Iterator[FaultyDisk]:
+        """Within the block everything goes through here."""
+        real_open = io.open
+        disk = self
+
+        class File(io.FileIO):
+            """A file whose writes are seen."""
+
+            def write(self, data: Any) -> int:
+                path, start = Path(str(self.name)), self.tell()
+                disk._touch(path)
+                disk._hit("write", path, lambda: REAL.pwrite(self.fileno(), bytes(data)[: len(data) // 2], start))
+                return super().write(data)
+
+            def truncate(self, size: int | None = None) -> int:
+                disk._touch(Path(str(self.name)))
+                disk._hit("truncate", Path(str(self.name)))
+                return super().truncate(size)
+
+        def opened(file: Any, mode: str = "r", buffering: int = -1, *more: Any, **named: Any) -> Any:
+            path = Path(str(file))
+            if isinstance(file, int) or not str(path).startswith(disk._folder) or not set(mode) & set("wxa+"):
+                return real_open(file, mode, buffering, *more, **named)
+            new = not path.exists()
+            if new:
+                disk._hit("create", path)
+            disk._touch(path)
+            raw = File(str(path), mode.replace("b", ""))
+            if new:
+                disk._undo.append((path.parent, lambda: path.unlink(missing_ok=True)))
+            if buffering == 0:
+                return raw
+            return io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
+
+        def path_of(fd: int) -> Path:
+            return Path(f"/proc/self/fd/{fd}").readlink()
+
+        def os_open(path: Any, flags: int, *more: Any, **named: Any) -> int:
+            new = flags & os.O_CREAT and not Path(path).exists()
+            if new:
+                disk._hit("create", Path(path))
+            fd = REAL.open(path, flags, *more, **named)
+            if new and str(path).startswith(disk._folder):
+                disk._durable.setdefault(Path(path), b"")
+                disk._undo.append((Path(path).parent, lambda: Path(path).unlink(missing_ok=True)))
+            return fd
+
+        def pwrite(fd: int, data: Any, offset: int) -> int:
+            path = path_of(fd)
+            disk._touch(path)
+            disk._hit("pwrite", path, lambda: REAL.pwrite(fd, bytes(data)[: len(data) // 2], offset))
+            return REAL.pwrite(fd, data, offset)
+
+        def on_file(name: str) -> Callable[..., Any]:
+            def call(fd: int, *more: Any) -> Any:
+                disk._touch(path_of(fd))
+                disk._hit(name, path_of(fd))
+                return getattr(REAL, name)(fd, *more)
+
+            return call
+
+        def fsync(fd: int) -> None:
+            disk._hit("fsync", path_of(fd))
+            disk._synced(path_of(fd))  # not the real one: this machine's disk need not wait
+
+        def mkdir(path: Any, *more: Any, **named: Any) -> None:
+            disk._hit("mkdir", Path(path))
+            REAL.mkdir(path, *more, **named)
+            if str(path).startswith(disk._folder):
+                disk._undo.append((Path(path).parent, Path(path).rmdir))
+
+        def rename(a: Any, b: Any, **named: Any) -> None:
+            a, b = Path(a), Path(b)
+            disk._hit("rename", b)
+            before = b.read_bytes() if b.exists() else None
+            REAL.rename(a, b, **named)
+            disk._durable.pop(b, None)
+            if a in disk._durable:
+                disk._durable[b] = disk._durable.pop(a)
+
+            def back() -> None:
+                if b.exists():
+                    REAL.rename(b, a)
+                if before is not None:
+                    b.write_bytes(before)
+
+            disk._undo.append((b.parent, back))
+
+        def unlink(path: Any, **named: Any) -> None:
+            disk._hit("unlink", Path(path))
+            REAL.unlink(path, **named)
+            disk._durable.pop(Path(path), None)
+
+        with pytest.MonkeyPatch.context() as patch:
+            calls = {"open": os_open, "pwrite": pwrite, "fsync": fsync, "mkdir": mkdir, "rename": rename}
+            calls |= {"unlink": unlink} | {n: on_file(n) for n in ("ftruncate", "posix_fallocate")}
+            for name, call in calls.items():
+                patch.setattr(os, name, call)
+            patch.setattr(io, "open", opened)
+            try:
+                yield self
+            finally:
+                killed = self._dead
+        if killed and self._fault == "power cut":
+            self.lose_power()

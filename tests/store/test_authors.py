@@ -1,0 +1,220 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.store.authors import AuthorsCube, AuthorsScan, open_scan
+from shared.config import load_instrument
+from shared.errors import DataError
+from shared.geometry import rx_positions_m, tx_position_m
+
+ROOT = Path(__file__).parents[2]
+COLUMNS, ROWS, PULSES, SAMPLES = 7, 4, 4, 256
+BURST = PULSES * SAMPLES * 16
+PACKET = 1456
+
+
+@pytest.fixture(scope="module")
+def base():
+    return load_instrument(ROOT / "instrument.toml")
+
+
+def _settings(**changes):
+    chirp = {
+        "f0": 76.01e9,
+        "slope": 38.816929e12,
+        "ramp_time": 128.5e-6,
+        "adc_start_time": 7e-6,
+        "num_adc": SAMPLES,
+        "Fs": 2.15e6,
+    }
+    return {
+        "dx": 2,
+        "dy": 3.0,
+        "total_x": COLUMNS,
+        "total_y": ROWS,
+        "moving_direction": "row",
+        "num_trigger": PULSES,
+        "period_frame": 1.5,
+        "num_frame": PULSES,
+        "num_chirp": 1,
+        "num_config": 1,
+        "num_adc": SAMPLES,
+        "num_ch": 4,
+        "object_distance": 430,
+        "board_dist": 1.5175,
+        "chirp_configs": [chirp],
+        **changes,
+    }
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Write a scan; `lost` maps (board, row) to packets that never arrived, `skipped` to positions without a burst."""
+
+    def make(lost=None, skipped=None, zero_filling=True, header="", first_sequence=1, **changes):
+        folder = tmp_path / "unsynced" / "scan1"
+        folder.mkdir(parents=True)
+        settings = _settings(packet_zero_filling=zero_filling, **changes)
+        (folder / "data_collection_cfg.json").write_text(json.dumps(settings))
+        truth = {}
+        for b, board in enumerate(("RH", "RV")):
+            (folder / board).mkdir()
+            for row in range(ROWS):
+                rng = np.random.default_rng([b, row])
+                full = rng.integers(1, 256, COLUMNS * BURST).astype(np.uint8)
+                truth[board, row] = full
+                gone = (skipped or {}).get((board, row), ())
+                kept = [i for i in range(COLUMNS) if i not in gone]
+                sent = np.concatenate([full[i * BURST : (i + 1) * BURST] for i in kept])
+                lines, pieces = [header] if header else [], []
+                for k, start in enumerate(range(0, sent.size, PACKET)):
+                    piece = sent[start : start + PACKET]
+                    if k in (lost or {}).get((board, row), ()):
+                        if zero_filling:
+                            pieces.append(np.zeros_like(piece))
+                        continue
+                    pieces.append(piece)
+                    position, inside = divmod(start + piece.size - 1, BURST)
+                    at = 1.7e9 + 0.09 * kept[position] + 0.003 * inside / BURST
+                    lines.append(f"{k + first_sequence},{piece.size},{at:.6f}")
+                name = f"{0 if row % 2 == 0 else COLUMNS - 1}_{row}"
+                (folder / board / f"{name}.bin").write_bytes(np.concatenate(pieces).tobytes())
+                (folder / board / f"{name}_log.csv").write_text("\n".join(lines) + "\n")
+        return folder, truth
+
+    return make
+
+
+def _whole(row, truth, missing_bytes=()):
+    expected, mask = truth.copy(), np.zeros(truth.size, bool)
+    for start, stop in missing_bytes:
+        expected[start:stop] = 0
+        mask[start:stop] = True
+    np.testing.assert_array_equal(row.payload, expected)
+    assert row.frames_expected == COLUMNS * PULSES
+    assert row.missing == [tuple(m) for m in missing_bytes]
+    assert row.missing_bytes == mask.sum()
+
+
+def test_complete_rows_come_back_byte_for_byte(write, base):
+    folder, truth = write()
+    scan = open_scan(folder, base)
+    assert isinstance(scan, AuthorsScan)
+    assert list(scan.rows()) == [0, 1, 2, 3]
+    for (board, row), full in truth.items():
+        _whole(scan.read_row(board, row), full)
+
+
+def test_settings_make_the_rig(write, base):
+    folder, _ = write(board_dist=1.6)
+    scan = open_scan(folder, base)
+    rig = scan.instrument
+    assert (rig.grid.columns, rig.grid.rows, rig.grid.step_x_mm, rig.grid.step_y_mm) == (COLUMNS, ROWS, 2, 3)
+    assert rig.burst.pulses == PULSES
+    assert rig.burst.period_us == 1500
+    assert rig.chirp.samples == SAMPLES
+    assert rig.chirp.linear_samples == (0, 192)
+    assert rig.chirp.ramp_end_us == pytest.approx(128.5)
+    assert rig.chirp.first_sample_hz == pytest.approx(base.chirp.first_sample_hz)
+    assert rig.geometry.object_distance_mm == 430
+    assert scan.plan.row(1).direction == -1
+    assert scan.scan_id == "scan1"
+    assert not scan.simulated
+    wider = 1.6 - 1.5175
+    assert tx_position_m(rig)[0] == pytest.approx(tx_position_m(base)[0] - wider / 2)
+    for old, new in zip(base.receivers, rig.receivers, strict=True):
+        assert rx_positions_m(rig, new)[0][0] == pytest.approx(rx_positions_m(base, old)[0][0] + wider / 2)
+
+
+def test_units_of_tis_tools_are_understood_too(write, base):
+    chirp = {"f0": 76.01, "slope": 38.816929, "ramp_time": 128.5, "adc_start_time": 7, "num_adc": SAMPLES, "Fs": 2150}
+    folder, _ = write(chirp_configs=[chirp])
+    got = open_scan(folder, base).instrument.chirp
+    for key in ("start_hz", "slope_hz_per_s", "ramp_end_us", "adc_start_us", "sample_rate_hz"):
+        assert getattr(got, key) == pytest.approx(getattr(base.chirp, key))
+
+
+@pytest.mark.parametrize("zero_filling", [True, False])
+@pytest.mark.parametrize("first_sequence", [1, 5000])
+@pytest.mark.parametrize("lost", [{3}, {0}, {4, 5}, {78}])
+def test_lost_packets_are_masked_where_they_were(write, base, zero_filling, first_sequence, lost):
+    folder, truth = write({("RV", 2): lost}, zero_filling=zero_filling, first_sequence=first_sequence)
+    packets = -(-COLUMNS * BURST // PACKET)
+    assert packets == 79
+    gaps = [(min(lost) * PACKET, min((max(lost) + 1) * PACKET, COLUMNS * BURST))]
+    scan = open_scan(folder, base)
+    _whole(scan.read_row("RV", 2), truth["RV", 2], gaps)
+    _whole(scan.read_row("RH", 2), truth["RH", 2])
+
+
+@pytest.mark.parametrize("skipped", [{3}, {2, 5}, {6}])
+def test_a_position_without_a_burst_is_found_by_its_time(write, base, skipped):
+    folder, truth = write(skipped={("RH", 1): skipped})
+    gaps = [(i * BURST, (i + 1) * BURST) for i in sorted(skipped)]
+    _whole(open_scan(folder, base).read_row("RH", 1), truth["RH", 1], gaps)
+
+
+def test_a_header_line_and_a_missing_log_are_put_up_with(write, base):
+    folder, truth = write(header="seq,bytes,time")
+    scan = open_scan(folder, base)
+    _whole(scan.read_row("RH", 0), truth["RH", 0])
+    (folder / "RH" / "0_0_log.csv").unlink()
+    _whole(scan.read_row("RH", 0), truth["RH", 0])
+
+
+def test_only_rows_that_both_boards_hold_count(write, base):
+    folder, _ = write()
+    (folder / "RV" / "6_3.bin").unlink()
+    scan = open_scan(folder, base)
+    assert list(scan.rows()) == [0, 1, 2]
+    with pytest.raises(DataError, match="no row 3 of board RV"):
+        scan.read_row("RV", 3)
+
+
+def test_contradictions_are_refused(write, base):
+    folder, _ = write(zero_filling=False)
+    file = folder / "RH" / "0_0.bin"
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(DataError, match="packet log says"):
+        open_scan(folder, base).read_row("RH", 0)
+    (folder / "RH" / "0_0_log.csv").write_text("1,1456,1.0\nnonsense\n")
+    with pytest.raises(DataError, match="line 2 is not a packet"):
+        open_scan(folder, base).read_row("RH", 0)
+    (folder / "RH" / "0_0.bin").rename(folder / "RH" / "6_0.bin")
+    with pytest.raises(DataError, match="starts at column 6"):
+        open_scan(folder, base)
+
+
+def test_columns_first_scans_and_other_folders_are_refused(write, base, tmp_path):
+    with pytest.raises(DataError, match="not a scan"):
+        open_scan(tmp_path, base)
+    folder, _ = write(moving_direction="col")
+    with pytest.raises(DataError, match="moving_direction 'col'"):
+        open_scan(folder, base)
+    with pytest.raises(DataError, match="geometry"):
+        open_scan(folder)
+    (folder / "data_collection_cfg.json").write_text("{")
+    with pytest.raises(DataError, match="not JSON"):
+        open_scan(folder, base)
+
+
+def test_synchronised_cubes_are_read(tmp_path, base):
+    folder = tmp_path / "raw" / "scan1"
+    folder.mkdir(parents=True)
+    (folder / "data_collection_cfg.json").write_text(json.dumps(_settings()))
+    rng = np.random.default_rng(0)
+    cube = (rng.standard_normal((4, ROWS, COLUMNS, SAMPLES)) * (1 + 1j)).astype(np.complex64)
+    for board in ("RH", "RV"):
+        np.save(folder / f"{board}_synced.npy", cube)
+    scan = open_scan(folder, base)
+    assert isinstance(scan, AuthorsCube)
+    assert list(scan.rows()) == list(range(ROWS))
+    np.testing.assert_array_equal(scan.read_synced("RV", 2), cube[:, 2])
+    np.save(folder / "RH_synced.npy", cube[:, :2])
+    with pytest.raises(DataError, match="its settings say"):
+        scan.read_synced("RH", 0)
+    np.save(folder / "RH_synced.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(DataError, match="not a cube"):
+        scan.read_synced("RH", 0)

@@ -1,0 +1,238 @@
+"""Manifest, event log, journal and rows are cut at every byte of their last record, or a bit of it is turned.
+
+Each time `validate` names what is wrong, or nothing is, and after `resume`, with at most one row taken again, every row
+and the image are those of the undisturbed scan.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgpack
+import pytest
+from small_scan import SmallScan
+
+from host.store.events import read_events
+from host.store.scanfolder import ScanFolder
+from host.store.validate import validate
+from pi_controller.journal import records
+from shared.errors import DataError
+from shared.messages import RowStarted
+
+pytestmark = pytest.mark.timeout(3600)  # with --long
+PAGE = bytes(4096)
+PACKET = 1456  # bytes of a row's last record
+
+
+def lines(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines(keepends=True)
+
+
+def journal_of(scan: SmallScan) -> Path:
+    return next(scan.journals.glob("*.journal"))
+
+
+def faults(scan: SmallScan, severity: str = "error") -> list[str]:
+    return [str(f) for f in validate(scan.path) if f.severity == severity]
+
+
+def resumed(scan: SmallScan, undisturbed, image: bool = False, damaged_lines: int = 0) -> set[int]:
+    """Resume; everything is as if nothing had been. Returns the rows that were taken again."""
+    assert scan.run().exit_status == "success"
+    notes = faults(scan, "note")
+    assert faults(scan) == []
+    assert len(notes) == damaged_lines, notes
+    assert scan.rows() == undisturbed.digests
+    if image:
+        assert scan.image() == undisturbed.final_image
+    facts = ScanFolder.load(scan.path).content.facts
+    since = max(i for i, f in enumerate(facts) if f["fact"] == "scan_resumed")
+    again = [f["row"] for f in facts[since:] if f["fact"] == "row_committed"]
+    assert len(again) == len(set(again))
+    started = [(e.row.index, e.take) for e in read_events(scan.path / "events.msgpack").events if is_row(e)]
+    assert len(set(started)) == len(started), "a take was used twice"
+    return set(again)
+
+
+def is_row(event: object) -> bool:
+    return isinstance(event, RowStarted)
+
+
+@pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
+@pytest.mark.parametrize("record", [-2, -1], ids=["row_committed", "scan_ended"])
+def test_manifest(undisturbed, tmp_path, sample, record, tail):
+    whole = lines(undisturbed.path / "manifest.jsonl")
+    before, last = b"".join(whole[: len(whole) + record]), whole[record]
+    for cut in sample(range(len(last)), 8):
+        scan = undisturbed.copy(tmp_path / "s")
+        (scan.path / "manifest.jsonl").write_bytes(before + last[:cut] + tail)
+        assert faults(scan) == []
+        torn = [n for n in faults(scan, "note") if "torn" in n]
+        assert len(torn) == bool(last[:cut] + tail)
+        assert resumed(scan, undisturbed, image=not cut) == ({2} if record == -2 else set())
+
+
+@pytest.mark.parametrize("record", [1, -2, -1], ids=["row 0", "row 2, the last", "scan_ended"])
+def test_bit_of_the_manifest(undisturbed, tmp_path, sample, record):
+    whole = lines(undisturbed.path / "manifest.jsonl")
+    at = len(b"".join(whole[:record]))
+    for bit in sample(range(8 * len(whole[record])), 8):
+        scan = undisturbed.copy(tmp_path / "s")
+        turn(scan.path / "manifest.jsonl", 8 * at + bit)
+        end = bit // 8 == len(whole[record]) - 1  # the line end: this line and the next are one
+        named = faults(scan) + [n for n in faults(scan, "note") if "torn" in n or "damaged" in n]
+        assert len(named) == 1
+        kept = record == -1 or (record == -2 and end)  # the last line is cut off, others stay where they are
+        again = resumed(scan, undisturbed, damaged_lines=0 if kept else 1)
+        assert again == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]
+
+
+def turn(path: Path, bit: int) -> None:
+    raw = bytearray(path.read_bytes())
+    raw[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(raw)
+
+
+def ends_of_events(raw: bytes) -> list[int]:
+    unpacker = msgpack.Unpacker()
+    unpacker.feed(raw)
+    return [0, *(unpacker.tell() for _ in unpacker)]
+
+
+@pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
+@pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
+def test_event_log(undisturbed, tmp_path, sample, record, tail):
+    """What the host has lost, the Pi's journal has; no row is taken again."""
+    raw = (undisturbed.path / "events.msgpack").read_bytes()
+    start, stop = ends_of_events(raw)[-1 - record], ends_of_events(raw)[-record]
+    for cut in sample(range(start, stop), 8):
+        scan = undisturbed.copy(tmp_path / "s")
+        (scan.path / "events.msgpack").write_bytes(raw[:cut] + tail)
+        if record == 1:
+            assert faults(scan) == []
+        else:
+            assert "resume fetches" in faults(scan)[0]
+        assert len([n for n in faults(scan, "note") if "torn" in n]) == (cut > start or bool(tail))
+        assert resumed(scan, undisturbed) == set()
+        assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
+
+
+def test_bit_of_the_event_log(undisturbed, tmp_path, sample):
+    """What validate cannot tell by the form, it tells by the digest; what is not readable comes from the journal."""
+    raw = (undisturbed.path / "events.msgpack").read_bytes()
+    committed = ScanFolder.load(undisturbed.path).facts("row_committed")[-1]["events"]["bytes"]
+    for bit in sample(range(8 * committed), 16):
+        scan = undisturbed.copy(tmp_path / "s")
+        turn(scan.path / "events.msgpack", bit)
+        readable = not read_events(scan.path / "events.msgpack").damage
+        assert any("events.msgpack" in f for f in faults(scan)), bit
+        if readable:
+            continue
+        assert resumed(scan, undisturbed) == set()
+        assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
+        kept = (scan.path / "events.msgpack.damaged").read_bytes()
+        assert len(kept) == len(raw)
+
+
+@pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
+@pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
+def test_journal_of_the_pi(undisturbed, tmp_path, sample, record, tail):
+    """The journal is shorter than the host's event log: the sequence goes on behind what the host has."""
+    path = journal_of(undisturbed)
+    with path.open("rb") as file:
+        starts = [offset for offset, _, _ in records(file)]
+    raw = path.read_bytes()
+    start, stop = starts[-record], [*starts, len(raw)][len(starts) - record + 1]
+    for cut in sample(range(start, stop), 8):
+        scan = undisturbed.copy(tmp_path / "s")
+        journal_of(scan).write_bytes(raw[:cut] + tail)
+        goes_on_behind(scan, undisturbed, lost=record)
+
+
+def test_bit_of_the_journal(undisturbed, tmp_path, sample):
+    path = journal_of(undisturbed)
+    with path.open("rb") as file:
+        starts = [offset for offset, _, _ in records(file)]
+    for bit in sample(range(8 * starts[0], 8 * path.stat().st_size), 16):
+        scan = undisturbed.copy(tmp_path / "s")
+        turn(journal_of(scan), bit)
+        goes_on_behind(scan, undisturbed, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
+
+
+@pytest.mark.parametrize("left", [b"", b"PSJR", PAGE, None], ids=["empty", "torn magic", "zeros", "removed"])
+def test_journal_that_is_lost_as_a_whole(undisturbed, tmp_path, left):
+    scan = undisturbed.copy(tmp_path / "s")
+    if left is None:
+        journal_of(scan).unlink()
+    else:
+        journal_of(scan).write_bytes(left)
+    manifest_path = scan.path / "manifest.jsonl"
+    manifest_path.write_bytes(b"".join(lines(manifest_path)[:-2]))  # row 2 is to be taken yet
+    events = len(read_events(scan.path / "events.msgpack").events)
+    goes_on_behind(scan, undisturbed, lost=events, rows={2})
+
+
+def goes_on_behind(scan: SmallScan, undisturbed, lost: int, rows: set[int] = frozenset()) -> None:
+    """Resume: the host is told how much the journal lost, and keeps all it had."""
+    before = (scan.path / "events.msgpack").read_bytes()
+    assert resumed(scan, undisturbed) == rows
+    assert any(f"ends {lost} events before" in text for text in scan.told)
+    after = (scan.path / "events.msgpack").read_bytes()
+    assert after.startswith(before)
+    assert len(after) > len(before)
+    with journal_of(scan).open("rb") as file:
+        seqs = [seq for _, seq, _ in records(file)]
+    assert seqs[-1] == read_events(scan.path / "events.msgpack").events[-1].seq
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".idx"])
+def test_committed_row_cut_short(undisturbed, tmp_path, sample, suffix):
+    """Never imaged in silence: validate names the file, reading it is refused, resume takes that row again."""
+    name = f"raw/RV/0001{suffix}"
+    raw = (undisturbed.path / name).read_bytes()
+    for cut in sample([*range(0, len(raw) - PACKET, 97), *range(max(0, len(raw) - PACKET), len(raw))], 6):
+        scan = undisturbed.copy(tmp_path / "s")
+        (scan.path / name).write_bytes(raw[:cut])
+        assert [name in f for f in faults(scan)] == [True]
+        if suffix == ".bin":
+            with pytest.raises(DataError, match="not the bytes that were committed"):
+                ScanFolder.load(scan.path).read_row("RV", 1)
+        assert resumed(scan, undisturbed, image=not cut) == {1}  # row 1 is taken last now
+        withdrawn = ScanFolder.load(scan.path).facts("row_withdrawn")
+        assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]
+        assert name in withdrawn[0]["reasons"][0]
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".idx"])
+def test_bit_of_a_committed_row(undisturbed, tmp_path, sample, suffix):
+    name = f"raw/RH/0002{suffix}"
+    for bit in sample(range(8 * (undisturbed.path / name).stat().st_size), 4):
+        scan = undisturbed.copy(tmp_path / "s")
+        turn(scan.path / name, bit)
+        assert [name in f for f in faults(scan)] == [True]
+        assert resumed(scan, undisturbed) == {2}
+
+
+@pytest.mark.parametrize("suffix", [".part", ".bin", ".idx"])
+def test_row_that_is_not_committed_may_be_anything(undisturbed, tmp_path, sample, suffix):
+    whole = lines(undisturbed.path / "manifest.jsonl")
+    raw = (undisturbed.path / f"raw/RV/0002{suffix.replace('part', 'bin')}").read_bytes()
+    for cut in sample(range(len(raw)), 4):
+        scan = undisturbed.copy(tmp_path / "s")
+        (scan.path / "manifest.jsonl").write_bytes(b"".join(whole[:-2]))
+        (scan.path / f"raw/RV/0002{suffix}").write_bytes(raw[:cut])
+        assert faults(scan) == []
+        assert resumed(scan, undisturbed) == {2}
+
+
+def test_withdrawn_row_counts_again_once_it_is_taken(undisturbed, tmp_path):
+    scan = undisturbed.copy(tmp_path / "s")
+    folder = ScanFolder.load(scan.path)
+    fact = folder.facts("row_committed")[1]
+    with folder.writer() as writer:
+        writer.append({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["test"]})
+        folder.reload()
+        assert list(folder.committed()) == [0, 2]
+        writer.append(fact)
+    folder.reload()
+    assert list(folder.committed()) == [0, 1, 2]

@@ -1,0 +1,106 @@
+"""The host and the Pi are killed, or lose their power, at everything they do to a disk; the scan goes on behind it.
+
+In one process, with the code that writes in the instrument; tests/e2e kills real ones.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from faulty_disk import FaultyDisk, Killed
+from small_scan import Samples, SmallScan
+
+from host.store.scanfolder import ScanFolder
+from host.store.validate import Finding, validate
+
+POWER_CUTS = 4  # draws of what is left, for each place
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # who is killed closes nothing
+    pytest.mark.timeout(3600),  # with --long
+]
+
+
+def errors(path: Path) -> list[Finding]:
+    return [f for f in validate(path) if f.severity == "error"]
+
+
+def retaken(path: Path) -> set[int]:
+    """Rows that were taken again since the last resume, by the manifest."""
+    facts = ScanFolder.load(path).content.facts
+    since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
+    return {f["row"] for f in facts[since:] if f["fact"] == "row_committed" and f["take"] > 1}
+
+
+def broken_off(scan: SmallScan, disk: FaultyDisk) -> bool:
+    """Run or resume until the disk's fault; what was committed then is safe. Whether the fault came at all."""
+    try:
+        with disk():
+            scan.run()
+    except Killed:
+        if scan.begun:
+            assert errors(scan.path) == []
+            assert scan.acknowledged <= set(ScanFolder.load(scan.path).committed())
+        return True
+    return False
+
+
+def goes_on(scan: SmallScan, undisturbed, where: str) -> None:
+    """The scan is finished as if nothing had been, with at most one row taken again."""
+    before = scan.rows() if scan.begun else {}
+    assert scan.run().exit_status == "success", where
+    assert validate(scan.path) == [], where
+    assert scan.rows() == undisturbed.digests, where
+    assert {name: undisturbed.digests[name] for name in before} == before, where
+    assert len(retaken(scan.path)) <= 1, where
+
+
+def operations(samples: Samples, folder: Path) -> list[str]:
+    """Everything an undisturbed scan does to the disk."""
+    folder.mkdir()
+    disk = FaultyDisk(folder)
+    with disk():
+        SmallScan(samples, folder).run()
+    return disk.done
+
+
+@pytest.mark.parametrize("fault", ["killed", "killed within", "power cut"])
+def test_scan_is_killed_at_every_operation(samples, undisturbed, tmp_path, fault, sample):
+    done = operations(samples, tmp_path / "count")
+    assert len(done) > 100
+    draws = POWER_CUTS if fault == "power cut" else 1
+    for at, seed in sample([(at, seed) for at in range(1, len(done) + 1) for seed in range(draws)], 12):
+        folder = tmp_path / f"{at}-{seed}"
+        scan = SmallScan(samples, folder)
+        folder.mkdir()
+        assert broken_off(scan, FaultyDisk(folder, fault, at, seed))
+        goes_on(scan, undisturbed, f"{fault} at {at} ({done[at - 1]}), seed {seed}")
+        shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("fault", ["killed within", "power cut"])
+def test_resume_is_killed_at_every_operation_too(samples, undisturbed, tmp_path, fault, sample):
+    done = operations(samples, tmp_path / "count")
+    first = next(i for i, what in enumerate(done, 1) if what == "write 0001.idx")  # within row 1
+    killed = 0
+    for at in sample(range(1, len(done)), 12):
+        folder = tmp_path / str(at)
+        folder.mkdir()
+        scan = SmallScan(samples, folder)
+        assert broken_off(scan, FaultyDisk(folder, "killed within", first))
+        killed += broken_off(scan, FaultyDisk(folder, fault, at, seed=at))
+        goes_on(scan, undisturbed, f"{fault} at {at} of the resume")
+        shutil.rmtree(folder)
+    assert killed > 4
+
+
+def test_image_of_a_killed_scan_is_that_of_the_undisturbed_one(samples, undisturbed, tmp_path):
+    done = operations(samples, tmp_path / "count")
+    for at in [i for i, what in enumerate(done, 1) if what.startswith("rename")]:
+        folder = tmp_path / str(at)
+        folder.mkdir()
+        scan = SmallScan(samples, folder)
+        broken_off(scan, FaultyDisk(folder, "killed within", at))
+        goes_on(scan, undisturbed, f"killed at {at}")
+        assert scan.image() == undisturbed.final_image

@@ -1,0 +1,216 @@
+"""Raw rows dropped by choice: only what saved products were made from, and each written down before it goes."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from host.dropping import drop_raw, processed_digests
+from host.live import resume
+from host.pipeline import Options
+from host.store.appending import AppendFile
+from host.store.raw import drop, droppable, dropped_files, require_raw
+from host.store.scanfolder import MANIFEST, ScanFolder
+from host.store.validate import damaged_rows, validate
+from shared.errors import ConfigError, DataError, DeviceError, ScanError
+
+REPO = Path(__file__).resolve().parents[2]
+ROWS, BOARDS = 4, 2
+SCENE = f"""name = "nothing"
+[grid]
+columns = 8
+rows = {ROWS}
+step_x_mm = 10.0
+step_y_mm = 10.0
+[burst]
+pulses = 2
+[image]
+columns = 20
+rows = 20
+pixel_mm = 8.0
+"""
+
+
+def polysight(*words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
+    command = [Path(sys.executable).parent / "polysight", *map(str, words)]
+    return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture(scope="module")
+def processed(tmp_path_factory) -> Path:
+    """A simulated scan with its images."""
+    folder = tmp_path_factory.mktemp("processed")
+    (folder / "scene.toml").write_text(SCENE)
+    simulate = [sys.executable, "-m", "simulators", "simulate", folder / "scene.toml"]
+    config = ["--config", REPO / "instrument.toml", "--out", folder / "scan"]
+    subprocess.run([*simulate, *config], check=True, capture_output=True)
+    assert polysight("image", folder / "scan", "--out", folder / "scan" / "products").returncode == 0
+    return folder / "scan"
+
+
+@pytest.fixture
+def scan(processed, tmp_path) -> Path:
+    """A copy of it, to be dropped from."""
+    return Path(shutil.copytree(processed, tmp_path / "scan"))
+
+
+def payloads(scan: Path) -> set[Path]:
+    return set(scan.glob("raw/*/*.bin"))
+
+
+def errors(scan: Path) -> list[str]:
+    return [str(f) for f in validate(scan) if f.severity == "error"]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+
+
+def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
+    products, digests = contents(scan / "products"), processed_digests(scan / "products")
+    assert len(payloads(scan)) == ROWS * BOARDS
+    done = polysight("drop-raw", scan, typed="drop\n")
+    assert done.returncode == 0, done.stderr
+    assert not payloads(scan)
+    assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)  # arrivals and gaps stay, where there were any
+    facts = ScanFolder.load(scan).facts("raw_dropped")
+    assert [f["row"] for f in facts] == list(range(ROWS))
+    said = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
+    assert said == {(name, row): crc for name, rows in digests.items() for row, crc in rows.items()}
+    done = polysight("validate", scan)
+    assert (done.returncode, done.stdout.count("note: raw: ")) == (0, 1)
+    assert f"the raw data of {ROWS} rows was dropped after processing into products" in done.stdout
+    done = polysight("process", scan, "--out", scan / "products")
+    assert (done.returncode, "it was dropped on" in done.stderr) == (3, True), done
+    with pytest.raises(DataError, match=f"raw data of {ROWS} rows"):
+        resume(scan, Options(), keep_incomplete=False, process=True)
+    assert contents(scan / "products") == products
+    assert drop_raw(scan, None, yes=True) == 0
+    assert "dropped already" in capsys.readouterr().out
+
+
+def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
+    before = payloads(scan)
+    for typed in ("", "yes\n"):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
+        with pytest.raises(ConfigError, match="nothing dropped"):
+            drop_raw(scan, None, yes=False)
+    with pytest.raises(DataError, match=r"image\.npz"):
+        drop_raw(scan, tmp_path / "none", yes=True)
+    quality = scan / "products" / "quality.json"
+    said = json.loads(quality.read_text())
+    for board in said["boards"].values():
+        board["raw_crc32"] = dict.fromkeys(board["raw_crc32"], "00000000")  # of another scan
+    quality.write_text(json.dumps(said))
+    capsys.readouterr()
+    with pytest.raises(DataError, match="nothing can be dropped"):
+        drop_raw(scan, None, yes=True)
+    assert capsys.readouterr().out.count("not the bytes the products were made from") == ROWS * BOARDS
+    quality.write_text("{}")
+    with pytest.raises(DataError, match="does not say what it was made from"):
+        drop_raw(scan, None, yes=True)
+    (scan / "products" / "image.npz").write_bytes(b"half of it")
+    with pytest.raises(DataError, match="not an image product"):
+        drop_raw(scan, None, yes=True)
+    assert payloads(scan) == before
+    assert not ScanFolder.load(scan).facts("raw_dropped")
+
+
+def test_only_rows_in_the_products_are_dropped(scan):
+    digests = processed_digests(scan / "products")
+    board = next(iter(digests))
+    del digests[board][2]
+    drop(ScanFolder.load(scan), digests, scan / "products")
+    assert payloads(scan) == {scan / "raw" / board / "0002.bin"}
+    assert errors(scan) == []
+    kept = scan / "raw" / board / "0002.bin"
+    kept.write_bytes(b"damaged")
+    assert any("0002.bin" in e for e in errors(scan))
+
+
+def test_an_unfinished_scan_keeps_its_rows(scan):
+    path = scan / MANIFEST
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(line for line in lines if b'"row":3' not in line))
+    with pytest.raises(ScanError, match="1 of 4 rows are not committed") as e:
+        droppable(ScanFolder.load(scan), processed_digests(scan / "products"))
+    assert "polysight resume" in e.value.remedy
+    with pytest.raises(ScanError):
+        drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+
+
+def test_a_scan_in_use_keeps_its_rows(scan):
+    with ScanFolder.load(scan).writer(), pytest.raises(DeviceError, match="another program"):
+        drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+    assert len(payloads(scan)) == ROWS * BOARDS
+
+
+class PowerCut(BaseException):
+    """The program ends here."""
+
+
+@pytest.mark.parametrize("cut_after", range(ROWS * (BOARDS + 1)))
+def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, monkeypatch, cut_after):
+    """The steps are a line in the manifest and a removal for each board, row after row; it ends before each of them."""
+    digests, steps = processed_digests(scan / "products"), iter(range(ROWS * (BOARDS + 1)))
+    unlink, append = Path.unlink, AppendFile.append
+
+    def before(step):
+        def call(*args, **kwargs):
+            if next(steps) == cut_after:
+                raise PowerCut
+            return step(*args, **kwargs)
+
+        return call
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", before(unlink))
+        patched.setattr(AppendFile, "append", before(append))
+        with pytest.raises(PowerCut):
+            drop(ScanFolder.load(scan), digests, scan / "products")
+    left = ScanFolder.load(scan)
+    gone = {str(b.file) for row in left.committed().values() for b in row.boards.values()} - {
+        str(path.relative_to(scan)) for path in payloads(scan)
+    }
+    assert gone <= set(dropped_files(left))
+    assert errors(scan) == []
+    assert damaged_rows(left) == {}
+    drop(ScanFolder.load(scan), digests, scan / "products")
+    assert not payloads(scan)
+    assert errors(scan) == []
+    assert [f["row"] for f in ScanFolder.load(scan).facts("raw_dropped")] == list(range(ROWS))
+
+
+def test_a_line_torn_anywhere_drops_nothing(scan):
+    """The last line is torn by a power cut: its files were not touched yet, and the row is as if never dropped."""
+    copy = scan.with_name("copy")
+    shutil.copytree(scan, copy)
+    drop(ScanFolder.load(copy), processed_digests(copy / "products"), copy / "products")
+    raw = (copy / MANIFEST).read_bytes()
+    line = raw.splitlines(keepends=True)[-1]
+    for name in ("0000.bin", "0001.bin", "0002.bin"):  # the rows before the last are gone
+        for board in ("RH", "RV"):
+            (scan / "raw" / board / name).unlink()
+    for length in range(0, len(line), 7):
+        (scan / MANIFEST).write_bytes(raw[: len(raw) - len(line) + length])
+        assert errors(scan) == []
+    assert len(payloads(scan)) == BOARDS
+
+
+def test_a_row_taken_again_is_there_again(scan):
+    drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
+    folder = ScanFolder.load(scan)
+    committed = folder.facts("row_committed")[1]
+    with folder.writer() as writer:
+        writer.append({**committed, "take": 2})
+    folder.reload()
+    assert {Path(file).name for file in dropped_files(folder)} == {"0000.bin", "0002.bin", "0003.bin"}
+    assert sum("0001.bin" in e for e in errors(scan)) == BOARDS
+    with pytest.raises(DataError, match="3 rows"):
+        require_raw(folder)

@@ -1,0 +1,80 @@
+"""Small test signals of known truth: direct path, echoes, per-chirp offsets, noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.capture.decode import raw_words
+from host.sync.align import AlignedRow, align_row
+from shared.config import Board, Instrument, load_instrument
+from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from shared.units import SPEED_OF_LIGHT_M_S
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def rig() -> Instrument:
+    return load_instrument(ROOT / "instrument.toml")
+
+
+def sweep_hz(rig: Instrument) -> np.ndarray:
+    return rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
+
+
+@pytest.fixture(scope="session")
+def paths(rig: Instrument) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """(ideal signal [position, rx, sample], direct path [rx]) with echoes around the mirror point."""
+
+    def make(
+        board: Board, positions: int, echo: float, rng: np.random.Generator, echoes: int = 1, spread_m: float = 0.1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+        direct = np.linalg.norm(rx - tx, axis=1)
+        f = sweep_hz(rig)
+        out = np.zeros((positions, len(rx), f.size), complex)
+        out += np.exp(2j * np.pi * f * direct[:, None] / SPEED_OF_LIGHT_M_S)
+        for _ in range(echoes):
+            aside = spread_m * rng.uniform(-1, 1, (positions, 2))
+            v = np.array(specular_midpoint_m(rig, board)) + np.column_stack([aside, np.zeros(positions)])
+            d = np.linalg.norm(v - tx, axis=1)[:, None] + np.linalg.norm(v[:, None] - rx, axis=2)
+            amplitude = echo / np.sqrt(echoes) * np.exp(2j * np.pi * rng.uniform(size=(positions, 1, 1)))
+            out += amplitude * np.exp(2j * np.pi * f * d[..., None] / SPEED_OF_LIGHT_M_S)
+        return out, direct
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def noise() -> Callable[..., np.ndarray]:
+    """Complex white noise of a power in dB."""
+
+    def make(shape: tuple[int, ...], power_db: float, rng: np.random.Generator) -> np.ndarray:
+        return 10 ** (power_db / 20) / np.sqrt(2) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def counts() -> Callable[..., np.ndarray]:
+    """int16 [position, chirp, sample, 2, rx] of bursts complex [rx, position, chirp, sample]; 1 is 1000 counts."""
+
+    def make(frames: np.ndarray) -> np.ndarray:
+        rx, positions, chirps, samples = frames.shape
+        return raw_words(1000 * frames.reshape(rx, -1, samples)).reshape(positions, chirps, samples, 2, rx)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def align_single(counts: Callable[..., np.ndarray]) -> Callable[..., AlignedRow]:
+    """Positions [position, rx, sample] of one chirp each, as burst alignment hands them on."""
+
+    def align(received: np.ndarray, usable: np.ndarray, linear: tuple[int, int] = (0, 192)) -> AlignedRow:
+        return align_row(counts(received.swapaxes(0, 1)[:, :, None]), usable[:, None], linear)
+
+    return align

@@ -1,0 +1,167 @@
+import numpy as np
+import pytest
+
+from host.sync.align import align_row
+
+LINEAR = (0, 192)
+CENTRE = 95.5
+CHIRPS = 16
+
+
+@pytest.fixture
+def burst(paths, noise, rig, counts):
+    """Raw words [position, chirp, sample, 2, rx], true frequency and phase of each chirp, the signal behind them."""
+
+    def make(positions, snr_db, echo=1.0, seed=0, chirps=CHIRPS):
+        rng = np.random.default_rng(seed)
+        signal, _ = paths(rig.receivers[0], positions, echo, rng)
+        n = np.arange(signal.shape[-1]) - CENTRE
+        df, phase = rng.uniform(-0.1, 0.1, (positions, chirps)), rng.uniform(-np.pi, np.pi, (positions, chirps))
+        turn = np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))
+        frames = signal[:, :, None] * turn[:, None]
+        frames = frames + noise(frames.shape, -snr_db, rng)
+        return counts(frames.swapaxes(0, 1)), df, phase, signal
+
+    return make
+
+
+def _errors(aligned, df, phase):
+    """Error of each chirp's frequency (cycles a sample) and phase against the others of its burst."""
+    f = aligned.frequency - df
+    turns = np.exp(1j * (aligned.phase - phase))
+    return f - f.mean(axis=1, keepdims=True), np.angle(turns / turns.mean(axis=1, keepdims=True))
+
+
+def _bound(signal, snr_db):
+    """Cramer-Rao bound of offsets of a known waveform in white noise: its energy and its energy's spread in time."""
+    inside = signal[..., slice(*LINEAR)]
+    n = np.arange(inside.shape[-1]) - CENTRE
+    energy = (np.abs(inside) ** 2).sum(axis=1)
+    power = 10 ** (-snr_db / 10)
+    centre = (energy * n).sum(axis=1) / energy.sum(axis=1)
+    spread = (energy * (n - centre[:, None]) ** 2).sum(axis=1)
+    frequency = np.sqrt((power / 2 / spread).mean()) / 2 / np.pi
+    phase = np.sqrt((power / 2 * (1 / energy.sum(axis=1) + centre**2 / spread)).mean())
+    return frequency, phase
+
+
+@pytest.mark.parametrize("echo", [0.0, 1.0])
+@pytest.mark.parametrize("snr_db", [10, 20])
+def test_offsets_are_at_the_cramer_rao_bound(burst, snr_db, echo):
+    frames, df, phase, signal = burst(120, snr_db, echo)
+    aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
+    assert aligned.good.all()
+    own = np.sqrt(CHIRPS / (CHIRPS - 1))  # the mean was taken out of the errors
+    for error, bound in zip(_errors(aligned, df, phase), _bound(signal, snr_db), strict=True):
+        assert error.std() * own < 1.1 * bound
+        assert error.std() * own > 0.9 * bound
+
+
+def _divided(words):
+    """Frequency of each chirp against the first, as the paper has it: division, long FFT, highest peak of all RX."""
+    frames = (words[..., 0, :] + 1j * words[..., 1, :])[:, :, slice(*LINEAR)]
+    ratio = frames / np.where(frames[:, :1] == 0, 1, frames[:, :1])
+    spectrum = np.abs(np.fft.fft(ratio, 4096, axis=2)).sum(axis=-1)
+    top = np.argmax(spectrum, axis=2)
+    return np.where(top < 2048, top, top - 4096) / 4096
+
+
+@pytest.mark.parametrize("snr_db", [0, 5])
+def test_at_low_snr_no_gross_errors_and_half_of_divisions_at_most(burst, snr_db):
+    frames, df, phase, signal = burst(30, snr_db)
+    f, _ = _errors(align_row(frames, np.ones(df.shape, bool), LINEAR), df, phase)
+    bin_ = 1 / 192
+    assert np.abs(f).max() < bin_ / 2
+    assert np.abs(f).max() < 8 * _bound(signal, snr_db)[0]
+    divided = _divided(frames) - df
+    divided -= np.median(divided, axis=1, keepdims=True)
+    small = np.abs(divided) < bin_ / 2  # its gross errors are left out
+    assert f.std() < 0.5 * divided[small].std()
+
+
+def test_average_is_the_signal_with_its_noise_reduced(burst):
+    frames, df, _, signal = burst(20, 10)
+    mean = align_row(frames, np.ones(df.shape, bool), LINEAR).mean / 1000
+    n = np.arange(signal.shape[-1])
+    for p in range(20):  # the average is in the frame of its reference chirp: one frequency and phase from the signal
+        z = (mean[p] * signal[p].conj()).sum(axis=0)[:192]
+        grid = np.fft.fft(z, 1 << 16)
+        f = np.argmax(np.abs(grid)) / (1 << 16)
+        back = mean[p] * np.exp(-1j * (2 * np.pi * f * n + np.angle(grid[np.argmax(np.abs(grid))])))
+        residual = (np.abs(back - signal[p])[:, :192] ** 2).mean()
+        assert residual < 1.5 * 0.1 / CHIRPS
+
+
+def test_frequency_and_phase_common_to_the_chirps_change_nothing_else(burst, counts):
+    frames, df, _, _ = burst(6, 15)
+    n = np.arange(frames.shape[2])
+    received = (frames[..., 0, :] + 1j * frames[..., 1, :]).transpose(3, 0, 1, 2) / 1000
+    shifted = counts(received * np.exp(1j * (2 * np.pi * 0.07 * n + 1.0)))
+    valid = np.ones(df.shape, bool)
+    one, other = align_row(frames, valid, LINEAR), align_row(shifted, valid, LINEAR)
+    relative = [a.frequency - a.frequency.mean(axis=1, keepdims=True) for a in (one, other)]
+    np.testing.assert_allclose(*relative, atol=1e-5)
+    np.testing.assert_allclose(np.abs(other.mean), np.abs(one.mean), atol=10)  # a hundredth of the direct path
+
+
+def test_residual_tells_the_true_error(burst):
+    frames, df, phase, _ = burst(60, 12)
+    aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
+    for k, error in enumerate(_errors(aligned, df, phase)):
+        assert aligned.error[k].std() == pytest.approx(error.std(), rel=0.15)
+
+
+@pytest.mark.parametrize("bad", [0, 7])
+def test_a_bad_chirp_does_not_spoil_its_burst(burst, noise, bad):
+    frames, df, _, _ = burst(12, 15)
+    rng = np.random.default_rng(5)
+    frames[:, bad] = np.rint(1000 * noise(frames[:, bad].shape, 3, rng).real)
+    aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
+    others = np.delete(np.arange(CHIRPS), bad)
+    assert not aligned.good[:, bad].any()
+    assert aligned.good[:, others].all()
+    f = aligned.frequency[:, others] - df[:, others]
+    assert (f - f.mean(axis=1, keepdims=True)).std() * 2.15e6 < 60  # Hz; a hundredth of an IF bin
+
+
+@pytest.mark.parametrize("how", ["saturated", "silent", "another signal"])
+@pytest.mark.parametrize("bad", [0, 9])
+def test_one_spoiled_chirp_of_16_changes_nothing(burst, how, bad):
+    """The average is that of the 15 others, whatever the bad one holds."""
+    frames, df, _, _ = burst(6, 15)
+    spoiled = frames.copy()
+    if how == "saturated":
+        spoiled[:, bad] = np.clip(60 * spoiled[:, bad].astype(np.int32), -32768, 32767)
+    elif how == "silent":
+        spoiled[:, bad] = 0
+    else:
+        n = np.arange(frames.shape[2])
+        spoiled[:, bad] = np.rint(3000 * np.cos(2 * np.pi * (0.0004 * n + 0.3) * n))[:, None, None]
+    without = np.ones(df.shape, bool)
+    without[:, bad] = False
+    got = align_row(spoiled, np.ones(df.shape, bool), LINEAR)
+    expected = align_row(frames, without, LINEAR)
+    np.testing.assert_array_equal(got.good, without)
+    # Averages have the frame of their own reference chirp: what is compared is what does not depend on it.
+    np.testing.assert_allclose(np.abs(got.mean), np.abs(expected.mean), atol=30)
+
+
+def test_missing_chirps_and_missing_positions(burst):
+    frames, df, _, _ = burst(10, 15)
+    valid = np.ones(df.shape, bool)
+    valid[3] = False
+    valid[5, [0, 4, 9]] = False
+    valid[6, 1:] = False
+    frames[~valid] = 0
+    aligned = align_row(frames, valid, LINEAR)
+    np.testing.assert_array_equal(aligned.good.sum(axis=1), [16, 16, 16, 0, 16, 13, 1, 16, 16, 16])
+    assert not aligned.mean[3].any()
+    assert np.isfinite(aligned.mean).all()
+    alone = frames[6, 0, :, 0] + 1j * frames[6, 0, :, 1]
+    np.testing.assert_allclose(np.abs(aligned.mean[6]), np.abs(alone.T), rtol=1e-4, atol=1e-2)
+
+
+def test_nothing_but_silence_gives_nothing():
+    aligned = align_row(np.zeros((3, 2, 256, 2, 4), np.int16), np.ones((3, 2), bool), LINEAR)
+    assert not aligned.good.any()
+    assert not aligned.mean.any()

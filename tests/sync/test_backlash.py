@@ -1,0 +1,49 @@
+"""Stage backlash between even and odd rows, recovered from simulated raw data."""
+
+import numpy as np
+import pytest
+
+from host.sync import BoardSetup, synchronise_row
+from host.sync.backlash import echo_of_row, estimate_backlash, object_filter
+from shared.raster import plan_raster
+from simulators.radar import SimulatedRig
+from simulators.scene import decode_scene
+from simulators.simulate import row_offsets_mm
+
+POINTS = [{"position_mm": p, "amplitude": [0.8, 0.0]} for p in ([0.0, 0.0], [25.0, 10.0], [-30.0, -8.0])]
+
+
+@pytest.fixture(scope="module")
+def echoes(rig):
+    """Echoes of a small scan of board H by row, and its rig."""
+
+    def scan(backlash_mm, points=POINTS, rows=20):
+        raw = {"name": "t", "points": points, "grid": {"columns": 64, "rows": rows, "step_x_mm": 2.0, "step_y_mm": 2.0}}
+        radar = SimulatedRig(rig, decode_scene(raw, "t").with_disturbances(backlash_mm=backlash_mm))
+        board = radar.rig.receivers[0]
+        setup, weights, out = BoardSetup.of(radar.rig, board), object_filter(radar.rig, board), {}
+        for row in plan_raster(radar.rig.grid):
+            x, y = row_offsets_mm(radar, row)
+            words = radar.chirps(board.name, x, y, row.index * len(x)).reshape(-1, 256, 2, 4)
+            out[row.index] = echo_of_row(synchronise_row(words, np.ones(len(words), bool), setup), weights)
+        return out, radar.rig
+
+    return scan
+
+
+@pytest.mark.parametrize("backlash_mm", [0.3, -0.3])
+def test_backlash_is_recovered_with_everything_else_disturbed(echoes, backlash_mm):
+    found = estimate_backlash(*echoes(backlash_mm))
+    assert found is not None
+    assert found.shift_mm == pytest.approx(backlash_mm, abs=0.05)
+    assert found.std_mm < 0.05
+
+
+def test_an_empty_plane_tells_nothing(echoes):
+    found = estimate_backlash(*echoes(0.3, points=[]))
+    assert found is None or found.std_mm > 0.1
+
+
+def test_a_few_rows_tell_nothing(echoes):
+    rows, rig = echoes(0.3, rows=20)
+    assert estimate_backlash({r: rows[r] for r in range(8)}, rig) is None

@@ -1,0 +1,137 @@
+import msgspec
+import numpy as np
+import pytest
+
+from host.sync import BoardSetup, synchronise_row
+from host.sync.hpf import high_pass
+from host.sync.tone import estimate_tone
+from shared.errors import DataError
+from shared.units import SPEED_OF_LIGHT_M_S
+
+POSITIONS, PULSES = 9, 6
+
+
+@pytest.fixture(scope="module")
+def small(rig):
+    return msgspec.structs.replace(rig, burst=msgspec.structs.replace(rig.burst, pulses=PULSES))
+
+
+@pytest.fixture(scope="module")
+def row(small, paths, noise):
+    """Frames of one row in ADC counts, disturbed or not, and the ideal referenced samples [rx, position, sample]."""
+    board = small.receivers[1]
+
+    def make(offsets=True, filtered=False, snr_db=12.0, seed=0):
+        signal, direct = paths(board, POSITIONS, 1.0, np.random.default_rng(8))
+        rng = np.random.default_rng(seed)
+        chirp = small.chirp
+        f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+        ideal = signal * np.exp(-2j * np.pi * f * direct[:, None] / SPEED_OF_LIGHT_M_S)
+        n = np.arange(chirp.samples)
+        shape = (POSITIONS, PULSES)
+        df = 0.35 + (rng.uniform(-0.08, 0.08, shape) if offsets else np.zeros(shape))
+        phase = rng.uniform(-np.pi, np.pi, shape) if offsets else np.zeros(shape)
+        frames = signal[:, None] * np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))[:, :, None]
+        if filtered:
+            # The analogue filter's steady state, tone by tone: no start-up inside the window.
+            spectrum = np.fft.fft(np.pad(frames, [(0, 0)] * 3 + [(1024, 0)], mode="constant"), axis=-1)
+            bins = np.fft.fftfreq(1280, 1 / chirp.sample_rate_hz) % chirp.sample_rate_hz
+            frames = np.fft.ifft(spectrum * high_pass(chirp).response(bins), axis=-1)[..., 1024:]
+        frames = frames + noise(frames.shape, -snr_db, rng)
+        counts = np.round(frames * 800).transpose(2, 0, 1, 3).reshape(4, -1, chirp.samples)
+        return counts.astype(np.complex64), np.ones(POSITIONS * PULSES, bool), ideal.swapaxes(0, 1)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def setup(small):
+    return BoardSetup.of(small, small.receivers[1], compensate_filter=False)
+
+
+def _relative_error(row, ideal, inside=slice(0, 192)):
+    scaled = row.samples / 800
+    return np.sqrt((np.abs(scaled - ideal)[..., inside] ** 2).mean() / (np.abs(ideal)[..., inside] ** 2).mean())
+
+
+def test_disturbed_row_comes_back_to_the_ideal(row, setup):
+    frames, valid, ideal = row()
+    done = synchronise_row(frames, valid, setup)
+    assert done.valid.all()
+    assert (done.chirps == PULSES).all()
+    noise_floor = 10 ** (-12 / 20) / np.sqrt(PULSES) / np.sqrt(2)
+    assert _relative_error(done, ideal) < 1.3 * noise_floor
+
+
+def test_offsets_change_nothing_but_noise(row, setup):
+    with_offsets = synchronise_row(*row(offsets=True, snr_db=30)[:2], setup)
+    without = synchronise_row(*row(offsets=False, snr_db=30)[:2], setup)
+    difference = np.abs(with_offsets.samples - without.samples)[..., :192]
+    assert np.sqrt((difference**2).mean()) < 0.04 * 800
+
+
+def test_the_high_pass_filter_is_undone(row, small, setup):
+    frames, valid, ideal = row(filtered=True, snr_db=30)
+    undone = synchronise_row(frames, valid, BoardSetup.of(small, small.receivers[1]))
+    left = synchronise_row(frames, valid, setup)
+    assert _relative_error(undone, ideal, slice(12, 192)) < 0.04
+    assert _relative_error(undone, ideal, slice(12, 192)) < 0.4 * _relative_error(left, ideal, slice(12, 192))
+
+
+def test_stages_shrink_from_received_to_averaged(row, setup):
+    done = synchronise_row(*row()[:2], setup)
+    assert list(done.stages) == ["received", "aligned", "averaged", "referenced"]
+    f, phase, amplitude = zip(*done.stages.values(), strict=True)
+    assert f[0] > 20 * f[1]
+    assert f[1] > 1.5 * f[2]
+    assert phase[0] > 1 > 20 * phase[1]
+    assert phase[1] > phase[2]
+    assert amplitude[1] > 1.5 * amplitude[2]
+    np.testing.assert_allclose(done.direct_amplitude, 800, rtol=0.05)
+
+
+def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
+    """The object and the direct path, known to be the same at every position: what scatters is the error."""
+    positions, snr_db, board = 400, 12.0, rig.receivers[1]
+    signal, _ = paths(board, 1, 1.0, np.random.default_rng(8))
+    rng = np.random.default_rng(3)
+    shape = (positions, PULSES)
+    n = np.arange(256)
+    df, phase = 0.35 + rng.uniform(-0.08, 0.08, shape), rng.uniform(-np.pi, np.pi, shape)
+    frames = signal[0][:, None, None] * np.exp(2j * np.pi * df[..., None] * n + 1j * phase[..., None])
+    frames = 800 * (frames + noise(frames.shape, -snr_db, rng))
+    done = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), setup)
+
+    echo = (done.samples[:, :, :192] / 800 - 1).astype(complex)
+    mean = echo.mean(axis=1, keepdims=True)
+    tone = estimate_tone((echo * mean.conj()).sum(axis=0).astype(np.complex64))
+    f_hz, rad, _ = done.stages["referenced"]
+    assert f_hz == pytest.approx(tone.frequency.std() * rig.chirp.sample_rate_hz, rel=0.2)
+    assert rad == pytest.approx(np.angle(tone.amplitude).std(), rel=0.2)
+    assert done.stages["averaged"][2] == pytest.approx(done.direct_amplitude.std() / 800, rel=0.3)
+
+
+def test_clipped_and_missing_chirps_are_left_out(row, setup):
+    frames, valid, ideal = row()
+    frames[2, 3 * PULSES + 1, 40] = 32767
+    valid[5 * PULSES : 5 * PULSES + 2] = False
+    valid[7 * PULSES : 8 * PULSES] = False
+    frames[:, ~valid] = 0
+    done = synchronise_row(frames, valid, setup)
+    assert done.chirps.tolist() == [6, 6, 6, 5, 6, 4, 6, 0, 6]
+    assert done.valid.tolist() == [True] * 7 + [False, True]
+    assert not done.samples[:, 7].any()
+    kept = done.valid
+    assert np.abs(done.samples[:, kept] / 800 - ideal[:, kept])[..., :192].mean() < 0.2
+
+
+def test_a_row_of_nothing_is_all_invalid(setup):
+    done = synchronise_row(np.zeros((4, 2 * PULSES, 256), np.complex64), np.zeros(2 * PULSES, bool), setup)
+    assert not done.valid.any()
+    assert done.stages == {}
+
+
+@pytest.mark.parametrize("shape", [(3, PULSES, 256), (4, PULSES + 1, 256), (4, PULSES, 128)])
+def test_frames_of_another_rig_are_refused(setup, shape):
+    with pytest.raises(DataError, match="are not bursts"):
+        synchronise_row(np.zeros(shape, np.complex64), np.ones(shape[1], bool), setup)

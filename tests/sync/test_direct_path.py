@@ -1,0 +1,191 @@
+import msgspec
+import numpy as np
+import pytest
+
+from host.sync.direct_path import prepare, reference
+from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from shared.units import SPEED_OF_LIGHT_M_S
+
+CENTRE = 95.5
+
+
+@pytest.fixture(scope="session")
+def prepared(rig):
+    return {b.name: prepare(rig, b) for b in rig.receivers}
+
+
+@pytest.fixture(params=[0, 1], ids=["H", "V"])
+def board(request, rig):
+    return rig.receivers[request.param]
+
+
+@pytest.fixture
+def run(rig, paths, noise, prepared, align_single):
+    """Reference randomly offset positions; return result, frequency error (Hz) and phase error (rad)."""
+
+    def go(board, echo=1.0, snr_db=None, positions=150, seed=0, direct=1.0, gain=0.0, drift_hz=0.0, **more):
+        rng = np.random.default_rng(seed)
+        signal, length = paths(board, positions, echo, rng, **more)
+        pure, _ = paths(board, positions, 0.0, rng)
+        signal = signal + (direct - 1) * pure
+        signal *= ((1 + gain * rng.standard_normal(4)) * np.exp(1j * gain * rng.standard_normal(4)))[:, None]
+        n, rate = np.arange(rig.chirp.samples), rig.chirp.sample_rate_hz
+        df, phase = rng.uniform(0.1, 0.8, positions), rng.uniform(-np.pi, np.pi, positions)
+        cycles = df[:, None] * (n - CENTRE) + 0.5 * drift_hz / rate / 192 * (n - CENTRE) ** 2
+        signal *= np.exp(1j * (2 * np.pi * cycles + phase[:, None]))[:, None]
+        if snr_db is not None:
+            signal += noise(signal.shape, -snr_db, rng)
+        done = reference(align_single(signal, np.ones(positions, bool)), prepared[board.name], rig.chirp)
+        delay = length[0] / SPEED_OF_LIGHT_M_S
+        f_error = (done.frequency - df - rig.chirp.hz_per_sample * delay + 0.5) % 1 - 0.5
+        middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * CENTRE
+        turn = np.exp(1j * (np.angle(done.amplitude) - phase - 2 * np.pi * middle_hz * delay))
+        return done, f_error * rate, np.angle(turn / turn.mean())
+
+    return go
+
+
+def test_without_an_object_it_is_exact(run, board):
+    done, f, phase = run(board, echo=0.0)
+    assert done.found.all()
+    assert np.abs(f).max() < 0.5
+    assert np.abs(phase).max() < 1e-3
+
+
+@pytest.mark.parametrize("echo", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("echoes", [1, 9])
+def test_the_object_3_to_4_bins_away_does_not_bias_it(run, board, echo, echoes):
+    done, f, phase = run(board, echo=echo, echoes=echoes)
+    assert done.found.all()
+    assert np.abs(f).max() < 12  # Hz: a thousandth of a bin of the linear samples
+    assert phase.std() < 1e-3
+
+
+@pytest.mark.parametrize(("z_mm", "bins"), [(400, 2.35), (499, 3.56), (620, 5.30)])
+def test_bias_is_small_for_every_object_distance_that_the_rig_file_tells(rig, align_single, board, z_mm, bins):
+    rig = msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=z_mm))
+    rng, n = np.random.default_rng(1), 300
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    direct = np.linalg.norm(rx - tx, axis=1)
+    v = np.add(specular_midpoint_m(rig, board), np.column_stack([rng.uniform(-0.05, 0.05, (n, 2)), np.zeros(n)]))
+    d = np.linalg.norm(v - tx, axis=1)[:, None] + np.linalg.norm(v[:, None] - rx, axis=2)
+    assert (d - direct).mean() * rig.chirp.hz_per_sample * 192 / SPEED_OF_LIGHT_M_S == pytest.approx(bins, abs=0.05)
+    f = (rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(256)) / SPEED_OF_LIGHT_M_S
+    received = np.exp(2j * np.pi * f * direct[:, None]) + np.exp(
+        2j * np.pi * (f * d[..., None] + rng.uniform(size=(n, 1, 1)))
+    )
+    received *= np.exp(2j * np.pi * 0.3 * np.arange(256))
+    done = reference(align_single(received, np.ones(n, bool)), prepare(rig, board), rig.chirp)
+    true = 0.3 + rig.chirp.hz_per_sample * direct[0] / SPEED_OF_LIGHT_M_S
+    assert done.found.all()
+    assert np.abs(done.frequency - true).max() * rig.chirp.sample_rate_hz < 10
+    assert np.angle(done.amplitude / done.amplitude.mean()).std() < 6e-4
+
+
+def test_unequal_receivers_do_not_bias_it_much(run, board):
+    done, f, phase = run(board, gain=0.2, echoes=5)
+    assert done.found.all()
+    assert f.std() < 25
+    assert phase.std() < 2e-3
+
+
+def test_noise_is_near_the_cramer_rao_bound(run, board):
+    done, f, phase = run(board, snr_db=16, positions=600)
+    power, n = 10**-1.6, 192
+    f_bound = np.sqrt(power / 2 / (4 * n * (n**2 - 1) / 12)) / 2 / np.pi * 2.15e6
+    assert done.found.all()
+    assert f.std() < 1.2 * f_bound
+    assert phase.std() < 1.15 * np.sqrt(power / 2 / (4 * n))
+
+
+def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig, noise, align_single, board):
+    near = msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=412.0))
+    rng, trials = np.random.default_rng(4), 1500
+    tx, rx = np.array(tx_position_m(near)), np.array(rx_positions_m(near, board))
+    v = np.array(specular_midpoint_m(near, board))
+    direct = np.linalg.norm(rx - tx, axis=1)
+    echo = np.linalg.norm(v - tx) + np.linalg.norm(v - rx, axis=1)
+    bins = (echo - direct).mean() * rig.chirp.hz_per_sample * 192 / SPEED_OF_LIGHT_M_S
+    assert bins == pytest.approx(2.5, abs=0.05)
+    f = (rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(256)) / SPEED_OF_LIGHT_M_S
+    between, phase = rng.uniform(size=(2, trials, 1, 1))
+    signal = np.exp(2j * np.pi * f * direct[:, None]) + np.exp(2j * np.pi * (f * echo[:, None] + between))
+    signal *= np.exp(2j * np.pi * (0.3 * (np.arange(256) - CENTRE) + phase))
+    signal += noise(signal.shape, -16, rng)
+    done = reference(align_single(signal, np.ones(trials, bool)), prepare(near, board), near.chirp)
+    error = np.angle(done.amplitude) - 2 * np.pi * phase[:, 0, 0]
+    error = np.angle(np.exp(1j * error) / np.exp(1j * error).mean())
+    assert done.found.all()
+    assert error.std() < 1.2 * np.sqrt(10**-1.6 / 2 / (4 * 192))
+
+
+def test_the_other_peak_is_taken_where_the_amplitude_is_out_of_line(rig, paths, prepared, align_single, board):
+    """An object that is far stronger at some positions hides the direct path there, but not what it should be."""
+    signal, _ = paths(board, 40, 0.5, np.random.default_rng(6), spread_m=0.02)
+    pure, length = paths(board, 40, 0.0, np.random.default_rng(6))
+    strong = np.arange(40) % 8 == 3
+    signal = np.where(strong[:, None, None], pure + 8 * (signal - pure), signal)
+    signal *= np.exp(2j * np.pi * 0.25 * np.arange(256))
+    done = reference(align_single(signal, np.ones(40, bool)), prepared[board.name], rig.chirp)
+    true = 0.25 + rig.chirp.hz_per_sample * length[0] / SPEED_OF_LIGHT_M_S
+    assert done.found.all()
+    assert np.abs(done.frequency - true).max() * 192 < 0.1  # IF bins; the object is 3.5 away
+
+
+def test_the_lower_of_two_peaks_is_taken_when_the_object_is_stronger(run, board):
+    done, f, _ = run(board, echo=1.0, direct=0.5, spread_m=0.05)
+    assert done.found.all()
+    assert np.abs(f).max() < 100
+
+
+def test_slope_difference_of_the_crystals_is_taken_out(run, board):
+    done, _, phase = run(board, drift_hz=5.5e3, snr_db=20)
+    assert done.found.all()
+    inside = done.samples[:, :, :192] / 1000
+    flat = run(board, drift_hz=0.0, snr_db=20)[0].samples[:, :, :192] / 1000
+    assert np.sqrt((np.abs(inside - flat) ** 2).mean()) < 0.05
+    assert phase.std() < 0.01
+
+
+def test_referenced_echo_has_positive_phase_of_its_excess_path(rig, paths, prepared, align_single, board):
+    rng = np.random.default_rng(3)
+    only_direct, length = paths(board, 1, 0.0, rng)
+    v = np.add(specular_midpoint_m(rig, board), (0.02, -0.03, 0))
+    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    excess = np.linalg.norm(v - tx) + np.linalg.norm(v - rx, axis=1) - length
+    f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(256)
+    echo = 0.8 * np.exp(2j * np.pi * f * (excess + length)[:, None] / SPEED_OF_LIGHT_M_S)
+    turn = np.exp(1j * (2 * np.pi * 0.3 * np.arange(256) + 2.0))
+    received = ((only_direct[0] + echo) * turn)[None].astype(np.complex64)
+    done = reference(align_single(received, np.ones(1, bool)), prepared[board.name], rig.chirp)
+    expected = 1 + 0.8 * np.exp(2j * np.pi * f * excess[:, None] / SPEED_OF_LIGHT_M_S)
+    np.testing.assert_allclose(done.samples[:, 0, :192] / 1000, expected[:, :192], atol=3e-3)
+
+
+def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, prepared, align_single, board):
+    rng = np.random.default_rng(2)
+    signal, _ = paths(board, 40, 1.0, rng)
+    signal *= np.exp(2j * np.pi * 0.2 * np.arange(256))
+    signal[5] = noise(signal[5].shape, -10, rng)
+    signal[9] *= 0.05
+    usable = np.ones(40, bool)
+    usable[20] = False
+    done = reference(align_single(signal, usable), prepared[board.name], rig.chirp)
+    assert np.flatnonzero(~done.found).tolist() == [5, 9, 20]
+    assert not done.samples[:, [5, 9, 20]].any()
+
+
+def test_a_row_of_nothing_but_noise_has_no_direct_path(rig, noise, prepared, align_single, board):
+    received = noise((400, 4, 256), 0, np.random.default_rng(7)).astype(np.complex64)
+    assert not reference(align_single(received, np.ones(400, bool)), prepared[board.name], rig.chirp).found.any()
+
+
+def test_an_if_outside_the_band_is_masked(rig, paths, prepared, align_single, board):
+    signal, _ = paths(board, 4, 1.0, np.random.default_rng(2))
+    base = rig.chirp.hz_per_sample * 1.39 / SPEED_OF_LIGHT_M_S
+    signal *= np.exp(2j * np.pi * (np.array([0.2, 0.5, 0.95, 0.7])[:, None] - base) * np.arange(256))[:, None]
+    done = reference(align_single(signal, np.ones(4, bool)), prepared[board.name], rig.chirp)
+    assert done.found.tolist() == [True, True, False, True]
+    two = msgspec.structs.replace(rig.chirp, if_mode="complex2x")
+    done = reference(align_single(signal, np.ones(4, bool)), prepared[board.name], two)
+    assert done.found.tolist() == [True, False, True, True]

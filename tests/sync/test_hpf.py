@@ -1,0 +1,88 @@
+import msgspec
+import numpy as np
+import pytest
+
+from host.sync.hpf import Equaliser, HighPass, filtered, fit_high_pass, high_pass
+from shared.errors import DataError
+
+
+def test_each_section_is_3_db_down_and_45_degrees_ahead_at_its_corner():
+    h = HighPass((175e3,)).response(np.array([175e3, 175e5]))
+    assert abs(h[0]) == pytest.approx(np.sqrt(0.5))
+    assert np.angle(h[0], deg=True) == pytest.approx(45)
+    assert abs(h[1]) == pytest.approx(1, abs=1e-4)
+
+
+def test_sections_multiply_and_no_corners_is_the_identity():
+    f = np.linspace(1e3, 2e6, 50)
+    both = HighPass((175e3, 350e3)).response(f)
+    np.testing.assert_allclose(both, HighPass((175e3,)).response(f) * HighPass((350e3,)).response(f))
+    np.testing.assert_array_equal(HighPass().response(f), 1)
+
+
+def test_negative_if_is_the_conjugate_of_positive(rig):
+    f = np.linspace(1e3, 1e6, 50)
+    model = high_pass(rig.chirp)
+    np.testing.assert_allclose(model.response(-f), model.response(f).conj())
+
+
+def test_noise_is_never_raised_more_than_fourfold(rig):
+    f = np.linspace(-2e6, 2e6, 4001)
+    model = high_pass(rig.chirp)
+    assert np.abs(model.inverse(f)).max() <= 4 + 1e-9
+    strong = np.abs(model.response(f)) > 0.25
+    np.testing.assert_allclose((model.inverse(f) * model.response(f))[strong], 1, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", ["complex1x", "complex2x"])
+@pytest.mark.parametrize(("if_hz", "worst"), [(300e3, 4e-3), (500e3, 1e-3), (900e3, 3e-4), (-700e3, 5e-4)])
+def test_three_taps_are_the_inverse_over_the_signals_band(rig, mode, if_hz, worst):
+    """Within 40 kHz of its centre every tone of a chirp comes out as it was before the filter."""
+    if mode == "complex1x" and if_hz < 0:
+        if_hz += rig.chirp.sample_rate_hz  # complex 1x knows no negative IF: this is 1.45 MHz
+    chirp = msgspec.structs.replace(rig.chirp, if_mode=mode)
+    model, rate = high_pass(chirp), chirp.sample_rate_hz
+    if mode == "complex2x" and if_hz > rate / 2:
+        if_hz -= rate
+    taps = Equaliser.of(model, chirp, 4).taps(np.array([if_hz / rate]))[0]
+    away = np.linspace(-40e3, 40e3, 81)
+    response = np.exp(2j * np.pi * np.outer(away / rate, 4 * np.array([-1, 0, 1]))) @ taps
+    np.testing.assert_allclose(response * model.response(if_hz + away), 1, atol=worst)
+
+
+def test_filtering_undoes_the_filter_on_two_tones_to_the_ends_of_the_record(rig):
+    model, chirp = high_pass(rig.chirp), rig.chirp
+    n, step, centre = np.arange(48), 4 / chirp.sample_rate_hz, 500e3
+    tones = np.array([-15e3, 17e3])
+    clean = np.exp(2j * np.pi * np.outer(tones, n * step)).sum(axis=0)
+    weak = (model.response(centre + tones)[:, None] * np.exp(2j * np.pi * np.outer(tones, n * step))).sum(axis=0)
+    taps = Equaliser.of(model, chirp, 4).taps(np.array([[centre / chirp.sample_rate_hz]])).astype(np.complex64)
+    restored = filtered(weak[None, None, None].astype(np.complex64), taps)[0, 0, 0]
+    assert np.abs(weak - clean).max() > 0.3
+    np.testing.assert_allclose(restored[1:-1], clean[1:-1], atol=2e-3)
+    np.testing.assert_allclose(restored, clean, atol=2e-2)
+
+
+def test_without_corners_nothing_is_changed(rig):
+    taps = Equaliser.of(HighPass(), rig.chirp, 4).taps(np.array([0.1, 0.6]))
+    np.testing.assert_allclose(taps, [[0, 1, 0]] * 2, atol=1e-12)
+
+
+@pytest.mark.parametrize("with_phase", [True, False])
+@pytest.mark.parametrize("corners", [(175e3, 350e3), (235e3, 700e3), (350e3, 1.4e6), (161e3, 372e3)])
+def test_a_fit_recovers_the_corners_of_a_sweep(corners, with_phase):
+    rng = np.random.default_rng(2)
+    f = np.linspace(100e3, 1.9e6, 60)
+    h = 37 * HighPass(corners).response(f)
+    amplitude = np.abs(h) * (1 + 0.01 * rng.standard_normal(60))
+    phase = np.angle(h) + 1.0 + 0.01 * rng.standard_normal(60)
+    found = fit_high_pass(f, amplitude, phase if with_phase else None)
+    np.testing.assert_allclose(found.corners_hz, corners, rtol=0.02 if with_phase else 0.06)
+
+
+def test_a_sweep_that_cannot_tell_is_refused():
+    f = np.linspace(1.5e6, 1.9e6, 40)
+    with pytest.raises(DataError, match="do not tell"):
+        fit_high_pass(f[:5], np.ones(5))
+    with pytest.raises(DataError, match="no filter fits"):
+        fit_high_pass(f, 1 + 0 * f)

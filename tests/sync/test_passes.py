@@ -1,0 +1,58 @@
+"""Compiled and plain passes over raw samples: the same results."""
+
+import numpy as np
+import pytest
+
+from host.sync import plain
+from host.sync.align import align_row
+from host.sync.hpf import Equaliser, high_pass
+from host.sync.passes import passes
+
+compiled = pytest.importorskip("host.sync.compiled", reason="numba is not installed")
+
+
+@pytest.fixture(scope="module")
+def words():
+    rng = np.random.default_rng(4)
+    n = np.arange(256)
+    tones = np.exp(2j * np.pi * (0.2 * n[:, None] + 0.1 * rng.standard_normal((5, 6, 1, 1)) * n[:, None]))
+    tones = tones * np.exp(1j * np.arange(4)) + 0.5 * rng.standard_normal((5, 6, 256, 4))
+    return np.rint(1000 * np.stack([tones.real, tones.imag], axis=3)).astype(np.int16)
+
+
+def same(one, other):
+    """Equal to a millionth of the largest value."""
+    for a, b in zip(one, other, strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-6 * max(1.0, float(np.abs(b).max())))
+
+
+@pytest.mark.parametrize("linear", [(0, 192), (8, 204)])
+def test_products_agree(words, linear):
+    reference = np.array([0, 5, 2, 1, 3])
+    same(*(by.products(by.load(words), reference, linear, 256) for by in (compiled, plain)))
+
+
+@pytest.mark.parametrize("taps", [1, 3])
+def test_products_with_the_others_and_the_average_agree(words, taps):
+    rng = np.random.default_rng(1)
+    frequency = 0.2 + 0.1 * rng.standard_normal((5, 6))
+    weights = (rng.standard_normal((5, 6, taps)) + 1j * rng.standard_normal((5, 6, taps))).astype(np.complex64)
+    good = rng.uniform(size=(5, 6)) < 0.8
+    edges = np.array([0, 7, 20, 33, 48])
+    args = (frequency, weights, good, (0, 192), edges)
+    same(*(by.against_others(by.load(words), *args) for by in (compiled, plain)))
+    args = (frequency, weights * good[..., None], rng.uniform(size=(5, 6)) < 0.5, (4, 196))
+    same(*(by.average(by.load(words), *args) for by in (compiled, plain)))
+
+
+def test_a_whole_row_agrees_and_the_compiled_passes_are_used(rig, words):
+    assert passes is compiled
+    valid = np.ones(words.shape[:2], bool)
+    valid[2, 3] = False
+    equaliser = Equaliser.of(high_pass(rig.chirp), rig.chirp, 4)
+    one, other = (align_row(words, valid, (0, 192), equaliser, by=by) for by in (compiled, plain))
+    np.testing.assert_array_equal(one.good, other.good)
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-5 * np.abs(other.mean).max())
+    np.testing.assert_allclose(one.frequency, other.frequency, atol=1e-8)
+    np.testing.assert_allclose(np.exp(1j * one.phase), np.exp(1j * other.phase), atol=1e-5)

@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.sync.tone import block_edges, block_times, cis, estimate_tone, phasor
+
+
+@given(st.floats(-0.49, 0.49), st.floats(-3.1, 3.1), st.integers(24, 256))
+def test_a_clean_tone_is_recovered(frequency, phase, n):
+    z = np.exp(1j * (2 * np.pi * frequency * (np.arange(n) - (n - 1) / 2) + phase)).astype(np.complex64)
+    tone = estimate_tone(z[None])
+    assert tone.frequency[0] == pytest.approx(frequency, abs=1e-3 / n)
+    assert np.angle(tone.amplitude[0] * np.exp(-1j * phase)) == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("snr_db", [7, 16, 22, 30])
+def test_error_is_at_the_cramer_rao_bound(noise, snr_db):
+    # Rife and Boorstyn 1974: var(w) = sigma^2 / (2 A^2 sum (n - mean)^2), var(central phase) = sigma^2 / (2 A^2 N).
+    rng, n, trials = np.random.default_rng(1), 192, 20_000
+    f = rng.uniform(-0.49, 0.49, trials)
+    t = np.arange(n) - (n - 1) / 2
+    z = np.exp(2j * np.pi * f[:, None] * t) + noise((trials, n), -snr_db, rng)
+    tone = estimate_tone(z.astype(np.complex64))
+    power = 10 ** (-snr_db / 10)
+    w_bound, phase_bound = np.sqrt(power / 2 / (t**2).sum()), np.sqrt(power / 2 / n)
+    assert 0.97 < (tone.frequency - f).std() * 2 * np.pi / w_bound < 1.05
+    assert 0.97 < np.angle(tone.amplitude).std() / phase_bound < 1.05
+
+
+@given(st.integers(1, 300))
+def test_blocks_cover_a_record_once(n):
+    edges = block_edges(n)
+    assert (edges[0], edges[-1]) == (0, n)
+    assert (np.diff(edges) > 0).all()
+    assert np.average(block_times(edges), weights=np.diff(edges)) == pytest.approx(0, abs=1e-9)
+
+
+@given(st.floats(-1e4, 1e4))
+def test_cis_is_on_the_unit_circle_at_its_angle(angle):
+    assert cis(np.array(angle)) == pytest.approx(np.exp(1j * angle), abs=5e-7)
+
+
+def test_phasor_is_the_exponential():
+    f, p = np.array([0.3, -0.41]), np.array([1.0, -2.0])
+    n = np.arange(250)
+    np.testing.assert_allclose(
+        phasor(f, p, 250, 95.5), np.exp(1j * (2 * np.pi * f[:, None] * (n - 95.5) + p[:, None])), atol=1e-6
+    )

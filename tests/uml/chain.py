@@ -1,0 +1,111 @@
+"""In the guest: emulated UNO -> pseudo terminal and trigger wire -> gpio-sim -> the Pi's program, as a Pi runs it.
+
+Carries out the one row of the rig file that is its argument, and prints `RESULT {...}`: what the Pi told, and what the
+kernel saw on the lines.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+sys.path += [str(Path(__file__).parent), str(ROOT / "tests" / "pi")]
+
+from gpio_sim import Change, SimChip  # noqa: E402
+from host_side import HostSide  # noqa: E402
+
+from shared import messages as m  # noqa: E402
+from shared.config import load_instrument  # noqa: E402
+from shared.wires import WireEdge, parse  # noqa: E402
+
+LINES = 28
+LIMIT_S = 600.0
+WIRES, PORT = Path("/run/wires"), Path("/run/ttySTAGE")
+SIOCSIFFLAGS, IFF_UP = 0x8914, 1
+
+
+def loopback_up() -> None:
+    """What `ip link set lo up` does."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
+        fcntl.ioctl(s, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
+
+
+def trigger_wire(listener: socket.socket, chip: SimChip) -> None:
+    """The wire from the board's trigger pin to the chip: every edge it tells is driven into the input."""
+    peer, _ = listener.accept()
+    with peer, peer.makefile("r", encoding="ascii") as lines:
+        for line in lines:
+            message = parse(line)
+            if isinstance(message, WireEdge):
+                chip.pull(message.line, bool(message.value))
+
+
+def start(*command: str) -> subprocess.Popen[str]:
+    """A process of the chain, once it has said that it is ready."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    first = process.stdout.readline()
+    assert first.startswith("ready"), f"{command[0]}: {first!r}"
+    return process
+
+
+def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
+    """Home, run the row, end the Pi's program; what it told."""
+    rig = load_instrument(config)
+    python = [sys.executable, "-m"]
+    uno = start(*python, "simulators.uno", "--config", str(config), "--wires", str(WIRES), "--link", str(PORT))
+    pi = start(*python, "pi_controller", "run", "--config", str(config), "--stage-port", str(PORT))
+    host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
+    host.accepted(host.begin())
+    host.accepted(m.Home())
+    host.wait(m.StageStatus, lambda e: e.state == "idle" and (e.x_mm, e.y_mm) == (0.0, 0.0), LIMIT_S)
+    host.until_state("ready")
+    list(chip.changes())  # what came before the row does not count
+    host.accepted(m.RunRow(scan_id="scan", row_index=0, take=1))
+    finished = host.wait(m.RowFinished, limit_s=LIMIT_S)
+    captures = [e for e in host.events if isinstance(e, m.Capture)]
+    pi.send_signal(signal.SIGTERM)
+    status = pi.wait(LIMIT_S)
+    uno.send_signal(signal.SIGTERM)
+    uno.wait(LIMIT_S)
+    host.close()
+    return {
+        "finished": [finished.points, finished.fault, finished.reason],
+        "captures": [
+            [e.point, e.column, e.pulses, e.edge_ns, e.first_pulse_ns, e.last_pulse_ns, e.width_max_ns, e.jitter_ns]
+            for e in captures
+        ],
+        "pi_status": status,
+        "left_high": chip.value(rig.pi.sync_out[0]),
+    }
+
+
+def main() -> None:
+    """Print the result."""
+    config = Path(sys.argv[1])
+    rig = load_instrument(config)
+    loopback_up()
+    chip = SimChip(rig.pi.gpio_chip, LINES)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(str(WIRES))
+    listener.listen()
+    threading.Thread(target=trigger_wire, args=(listener, chip), daemon=True).start()
+    result = one_row(config, chip)
+    changes: list[Change] = list(chip.changes())
+    result["changes"] = [[c.t_ns, c.line, c.value] for c in changes]
+    result["digest"] = hashlib.sha256(repr(changes).encode()).hexdigest()
+    print("RESULT", json.dumps(result, separators=(",", ":")), flush=True)  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

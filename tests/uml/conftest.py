@@ -1,0 +1,85 @@
+"""User-mode Linux: built on demand, started with a program in it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import tomli_w
+
+from shared.config import Instrument, load_instrument, to_builtins
+from simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+LIMIT_S = 900
+
+
+@pytest.fixture(scope="session")
+def kernel(request: pytest.FixtureRequest) -> Path:
+    """The kernel, with simulated GPIO chips."""
+    if not request.config.getoption("--uml"):
+        pytest.skip("not asked for: `make test-uml` builds a user-mode Linux (minutes, once) and runs these too")
+    if lacking := missing():
+        pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
+    emulator(), firmware()  # compiled here: in the guest everything is read-only
+    built = subprocess.run([str(HERE / "build_kernel.sh")], stdout=subprocess.PIPE, text=True, check=False)
+    assert built.returncode == 0, "the kernel was not built: see above"
+    return Path(built.stdout.splitlines()[-1])
+
+
+@pytest.fixture
+def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
+    """Runs chain.py in the guest for a row of so many points; kernel options such as time-travel can be given."""
+
+    def run(points: int, *options: str, real_time: bool = False) -> dict[str, Any]:
+        config = tmp_path / "instrument.toml"
+        config.write_bytes(tomli_w.dumps(to_builtins(_rig(points, one_shot=real_time))).encode())
+        program = [f"PYTHON={sys.executable}", f"PROGRAM={HERE / 'chain.py'}", f"ARGUMENT={config}"]
+        root = ["root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro", "mem=256M", f"init={HERE / 'init.sh'}"]
+        console = ["con=null", "con0=null,fd:1", "quiet"]
+        done = subprocess.run(
+            [str(kernel), *root, *console, *options, *program],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=LIMIT_S,
+            check=False,
+            preexec_fn=_before_others if real_time else None,
+        )
+        results = [line.removeprefix("RESULT ") for line in done.stdout.splitlines() if line.startswith("RESULT ")]
+        assert results, f"the guest says:\n{done.stdout[-3000:]}"
+        return json.loads(results[0])
+
+    return run
+
+
+def _before_others() -> None:
+    """Real-time scheduling where it is permitted: a Pi does not share its processor with a test suite."""
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+
+
+def _rig(points: int, one_shot: bool) -> Instrument:
+    """The published rig with one row, near the home corner.
+
+    In real time a system call takes some 10 us in user-mode Linux: there pulses are not short enough without one shot.
+    """
+    rig = load_instrument(ROOT / "instrument.toml")
+    replace = msgspec.structs.replace
+    width_mm = (points - 1) * rig.grid.step_x_mm
+    return replace(
+        rig,
+        grid=replace(rig.grid, columns=points, rows=1),
+        stage=replace(rig.stage, heartbeat_ms=5000, centre_x_mm=10 + width_mm / 2, centre_y_mm=5.0),
+        pi=replace(rig.pi, one_shot=one_shot, journal_dir="/run/journal", key_dir="/run/keys"),
+    )

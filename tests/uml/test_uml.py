@@ -1,0 +1,117 @@
+"""The chain on a kernel's own GPIO chip: emulated UNO, serial port, trigger wire, libgpiod, the Pi's program, SYNC_IN.
+
+`make test-uml` runs these; docs/decisions/0005-firmware.md tells what is real in it. Figures are printed.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from statistics import quantiles
+from typing import Any, NamedTuple
+
+import pytest
+
+PULSES, PERIOD_NS, SYNC_OUT = 16, 1_500_000, 22  # of instrument.toml
+SPACING_NS = 100_000_000  # 2 mm at 20 mm/s
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
+
+
+class Capture(NamedTuple):
+    """A capture event of the Pi."""
+
+    point: int
+    column: int
+    pulses: int
+    edge_ns: int
+    first_ns: int
+    last_ns: int
+    width_max_ns: int
+    jitter_ns: int
+
+
+class Pulse(NamedTuple):
+    """A pulse as the kernel recorded it."""
+
+    rise_ns: int
+    fall_ns: int
+
+
+def bursts_of(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
+    """The Pi's capture events with their pulses, after checking that what the Pi tells is what the kernel saw."""
+    changes = result["changes"]
+    assert {line for _, line, _ in changes} == {SYNC_OUT}
+    rises = [i for i, (_, _, value) in enumerate(changes) if value]
+    assert all(changes[i + 1][2] == 0 for i in rises)  # each goes low again before the next
+    pulses = iter([Pulse(changes[i][0], changes[i + 1][0]) for i in rises])
+    bursts = []
+    for capture in itertools.starmap(Capture, result["captures"]):
+        burst = list(itertools.islice(pulses, capture.pulses))
+        assert len(burst) == capture.pulses
+        assert capture.edge_ns < capture.first_ns <= burst[0].rise_ns
+        assert burst[-2].rise_ns < capture.last_ns <= burst[-1].rise_ns
+        assert max(p.fall_ns - p.rise_ns for p in burst) <= capture.width_max_ns
+        bursts.append((capture, burst))
+    assert list(pulses) == []  # no pulse that was not told
+    assert [c.point for c, _ in bursts] == list(range(len(bursts)))
+    assert (result["pi_status"], result["left_high"]) == (0, 0)
+    return bursts
+
+
+def complete(result: dict[str, Any], points: int) -> bool:
+    """Whether the row ended without a fault, with a full burst at every point."""
+    pulses = [c[2] for c in result["captures"]]
+    return result["finished"] == [points, 0, ""] and pulses == [PULSES] * points
+
+
+def period_errors_ns(bursts: list[tuple[Capture, list[Pulse]]]) -> list[int]:
+    """Rising edge to rising edge within a burst, less the nominal period."""
+    return [b.rise_ns - a.rise_ns - PERIOD_NS for _, burst in bursts for a, b in itertools.pairwise(burst)]
+
+
+def tell(text: str) -> None:
+    """One line to standard output, which `make test-uml` shows."""
+    sys.stdout.write(text + "\n")
+
+
+def tell_figures(what: str, bursts: list[tuple[Capture, list[Pulse]]]) -> None:
+    """The figures of docs/benchmarks.md."""
+    errors = [e / 1e3 for e in sorted(period_errors_ns(bursts))]
+    latency = [(burst[0].rise_ns - capture.edge_ns) / 1e3 for capture, burst in bursts]
+    cuts = quantiles(latency, n=1000, method="inclusive")
+    width = max(p.fall_ns - p.rise_ns for _, burst in bursts for p in burst) / 1e3
+    bound = max(capture.width_max_ns for capture, _ in bursts) / 1e3
+    tell(f"{what}: {len(bursts)} positions, {sum(len(burst) for _, burst in bursts)} pulses, none lost")
+    tell(f"  period error {errors[0]:+.2f} .. {errors[-1]:+.2f} us, median {errors[len(errors) // 2]:+.2f} us")
+    tell(f"  edge to first pulse p50 {cuts[499]:.2f} us, p99.9 {cuts[998]:.2f} us")
+    tell(f"  longest pulse {width:.2f} us, the Pi's bound of it {bound:.2f} us")
+
+
+def test_a_published_row_in_virtual_time(run_row):
+    """350 positions, 5600 pulses, nothing lost, and every period within 2 us of nominal."""
+    result = run_row(350, "time-travel=inf-cpu")
+    assert complete(result, 350), result["finished"]
+    bursts = bursts_of(result)
+    tell_figures("virtual time", bursts)
+    assert sum(len(burst) for _, burst in bursts) == 5600
+    assert max(map(abs, period_errors_ns(bursts))) <= 2_000
+    edges = [capture.edge_ns for capture, _ in bursts]
+    assert all(abs(b - a - SPACING_NS) <= 500_000 for a, b in itertools.pairwise(edges))
+
+
+def test_virtual_time_repeats_itself(run_row):
+    """Two runs make the same changes at the same nanoseconds."""
+    assert run_row(12, "time-travel=inf-cpu")["digest"] == run_row(12, "time-travel=inf-cpu")["digest"]
+
+
+def test_a_row_in_real_time(run_row):
+    """In real time the machine may be late: then the Pi says so and ends the row, and it is taken again."""
+    for _ in range(5):
+        result = run_row(20, real_time=True)
+        bursts = bursts_of(result)
+        if complete(result, 20):
+            tell_figures("real time", bursts)
+            return
+        assert result["finished"][1] != 0, result["finished"]
+        tell(f"a take ended with {result['finished']}")
+    pytest.fail("no take of five was complete: this machine is too busy")

@@ -24,27 +24,40 @@ LIMIT_S = 60.0
 # x, y in um at the triggers of dialogues/row.txt
 ROW_POINTS = [(5 * x, 5000) for x in range(20_000, 22_000, 400)] + [(5 * x, 7000) for x in range(21_600, 19_600, -400)]
 # A host that homes, starts a row, and keeps the heartbeat up until it is killed. Its heartbeat may be silent for six
-# seconds of the board, three of a busy machine's; the default's half second is tested in lockstep.
+# seconds of the board, three of a busy machine's; the default's half second is tested in lockstep. A board that is
+# reset late (it sees that its port was opened when it is scheduled) hears nothing meanwhile: HELLO is said again.
 PEER = """
-import os, sys, time
+import os, select, sys, threading, time
 from shared.stage_line import Command
 port = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
-def until(word):
-    seen = b""
+def until(word, wait_s=60):
+    seen, limit = b"", time.monotonic() + wait_s
     while word not in seen:
-        seen += os.read(port, 1)
-        if seen.endswith(b"\\n"):
-            os.write(port, b"\\x84")
-def ask(n, verb, *args):
+        if time.monotonic() > limit or b"alarm:" in seen:
+            raise TimeoutError(f"no {word!r} in {seen[-2000:]!r}")
+        if select.select([port], [], [], 0.1)[0]:
+            seen += os.read(port, 1)
+def beat():
+    while True:
+        os.write(port, b"\\x84")
+        time.sleep(0.02)
+def ask(n, verb, *args, wait_s=60):
     os.write(port, Command(n, verb, args).encode())
-    until(b"ok N%d" % n)
+    until(b"ok N%d" % n, wait_s)
+def greet():
+    for _ in range(60):
+        try:
+            return ask(1, "HELLO", wait_s=1)
+        except TimeoutError:
+            pass
+    raise TimeoutError("the board does not answer HELLO")
 until(b"polysight-stage"), until(b"\\n")  # the whole line: a board that is still starting hears nothing
-ask(1, "HELLO"), ask(2, "SET", 1, 6000), ask(3, "ENABLE", 1), ask(4, "HOME"), until(b"done N4")
+greet(), ask(2, "SET", 1, 6000)
+threading.Thread(target=beat, daemon=True).start()
+ask(3, "ENABLE", 1), ask(4, "HOME"), until(b"done N4")
 ask(5, "ROW", 3000, 100, 400, 0, 4000)
 print("row", flush=True)
-while True:
-    os.write(port, b"\\x84")
-    time.sleep(0.02)
+time.sleep(600)
 """
 
 

@@ -7,7 +7,7 @@ OUT ?= out
 JOBS ?= 2
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test test-long test-uml check bench firmware flash pi-install library reproduce clean
+.PHONY: help demo test test-long test-uml check bench firmware flash pi-install library reproduce docs clean
 
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -29,7 +29,7 @@ test: $(VENV)/installed  ## install what is missing, then run every test
 
 test-long: $(VENV)/installed  ## tests at full length: 10,000 random rows and 1,000,000 bytes of the stage, 50 kills (an hour)
 	@./tests/install-tools.sh
-	$(BIN)/python -m pytest tests/stage tests/store tests/e2e/test_killed_processes.py -n $(JOBS) --dist loadgroup --long
+	$(BIN)/python -m pytest tests/stage tests/store tests/calibration/test_metal.py tests/e2e/test_killed_processes.py -n $(JOBS) --dist loadgroup --long
 
 test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode Linux built from Debian's source (10 minutes, once)
 	@./tests/install-tools.sh kernel
@@ -50,6 +50,9 @@ reproduce: $(VENV)/installed  ## the paper's tables and figures from simulation,
 
 library: $(VENV)/installed  ## make the simulated reference library of the classifier again
 	$(BIN)/polysight train --simulate examples/library --out host/materials/simulated-library.npz
+
+docs: $(VENV)/installed  ## check the links of README and docs, and run every command they show against the simulated rig
+	$(BIN)/python -m docs.check --run
 
 firmware: $(VENV)/installed  ## build the sketch for an UNO with avr-gcc
 	$(MAKE) -C arduino_stage firmware

@@ -8,29 +8,22 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from host.cli_calibrate import add_calibrate_command
 from host.cli_card import add_card_arguments, card_status
+from host.cli_doctor import add_doctor_command
+from host.cli_export import add_export_command
 from host.cli_materials import add_material_commands
+from host.cli_options import RIG, add_config_option, add_material_options, options_of, positive, rig_file
+from host.cli_plan import add_plan_command
+from host.cli_polarimetry import add_leakage_command, add_polarimetry_options, with_polarimetry
+from host.cli_preview import add_preview_command
+from host.cli_process import add_data_arguments, process_scans
 from host.cli_reproduce import add_reproduce_command
+from host.cli_scan import add_scan_commands
 from shared.errors import DeviceError, PolysightError
 
-if TYPE_CHECKING:
-    from host.pipeline import Options
-
 Run = Callable[[argparse.Namespace], int]
-RIG = Path("instrument.toml")
-
-
-def _options(args: argparse.Namespace) -> Options:
-    from host.pipeline import Options
-
-    return Options(metal_box_mm=args.metal, library=args.library)
-
-
-def _rig_file(args: argparse.Namespace) -> Path | None:
-    """The rig file that was given, or the one that lies here."""
-    return args.config or (RIG if RIG.exists() else None)
 
 
 def _demo(args: argparse.Namespace) -> int:
@@ -49,55 +42,41 @@ def _simulate(args: argparse.Namespace) -> int:
     return run_simulator(command)
 
 
-def _scan(args: argparse.Namespace) -> int:
-    from host.live import scan
-
-    return scan(args.config, args.out, args.truth, _options(args), args.keep_incomplete, not args.no_process)
-
-
-def _resume(args: argparse.Namespace) -> int:
-    from host.live import resume
-
-    return resume(args.folder, _options(args), args.keep_incomplete, not args.no_process)
-
-
-def _validate(args: argparse.Namespace) -> int:
-    from host.checks import validate_folder
-
-    return validate_folder(args.folder, args.json)
-
-
-def _drop_raw(args: argparse.Namespace) -> int:
-    from host.dropping import drop_raw
-
-    return drop_raw(args.folder, args.products, args.yes)
-
-
 def _process(args: argparse.Namespace) -> int:
+    return process_scans(args, process_one, rig_file)
+
+
+def process_one(args: argparse.Namespace) -> int:
+    """`polysight process` of one scan."""
     from host.offline import process
 
-    return process(args.data, args.out, _rig_file(args), _options(args))
+    config = rig_file(args)
+    return process(args.data, args.out, config, with_polarimetry(options_of(args), args, config))
 
 
 def _image(args: argparse.Namespace) -> int:
     from host.offline import image
 
-    return image(args.data, args.out, _rig_file(args))
+    return image(args.data, args.out, rig_file(args))
 
 
 def _focus(args: argparse.Namespace) -> int:
     from host.offline import focus
 
-    return focus(args.data, args.out, _rig_file(args), args.depth)
+    return focus(args.data, args.out, rig_file(args), args.depth)
 
 
 def _sync_report(args: argparse.Namespace) -> int:
     from host.offline import sync_report
 
-    return sync_report(args.data, args.out, _rig_file(args))
+    return sync_report(args.data, args.out, rig_file(args))
 
 
 def _train(args: argparse.Namespace) -> int:
+    if args.authors is not None:
+        from host.reproduce.authors_library import train_authors
+
+        return train_authors(args.authors, args.config, args.out)
     from host.offline import train
 
     return train(args.simulate, args.data, args.config, args.out)
@@ -107,27 +86,6 @@ def _inspect(args: argparse.Namespace) -> int:
     from host.checks import inspect_file
 
     return inspect_file(args.file, args.config, args.plot, args.card, args.json)
-
-
-def _box(text: str) -> tuple[float, float, float, float]:
-    """`x,y,width,height` in millimetres as corners (x0, y0, x1, y1)."""
-    try:
-        x, y, w, h = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not of the form x,y,width,height in mm, e.g. 0,0,40,40"
-        ) from None
-    if w <= 0 or h <= 0:
-        raise argparse.ArgumentTypeError(f"width and height of {text!r} must be positive")
-    return x - w / 2, y - h / 2, x + w / 2, y + h / 2
-
-
-def _positive(text: str) -> float:
-    """A number above zero."""
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
-    return value
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -151,27 +109,13 @@ def build_parser() -> argparse.ArgumentParser:
         sub.set_defaults(run=run)
         return sub
 
-    def config(sub: argparse.ArgumentParser) -> None:
-        sub.add_argument("--config", type=Path, default=RIG, metavar="FILE", help="rig file (default: instrument.toml)")
-
-    def materials(sub: argparse.ArgumentParser) -> None:
-        sub.add_argument(
-            "--library", type=Path, default=None, metavar="FILE", help="reference library (default: the simulated one)"
-        )
-        sub.add_argument(
-            "--metal",
-            type=_box,
-            metavar="X,Y,W,H",
-            help="metal reference: place and size, mm from the image centre, e.g. --metal=-60,0,40,40 (default: found)",
-        )
-
     sub = add(
         "demo",
         _demo,
         "scan a scene with the whole rig simulated, and make the report; no hardware is needed",
         "polysight demo --out out/demo",
     )
-    config(sub)
+    add_config_option(sub)
     sub.add_argument(
         "--scene",
         type=Path,
@@ -187,7 +131,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="folder to make (default: out/demo); an earlier demo's is replaced",
     )
     sub.add_argument(
-        "--time-scale", type=_positive, default=None, metavar="X", help="simulated seconds per second (default: 40)"
+        "--time-scale", type=positive, default=None, metavar="X", help="simulated seconds per second (default: 40)"
     )
 
     sub = add(
@@ -196,7 +140,7 @@ def build_parser() -> argparse.ArgumentParser:
         "make the raw data of a scene, with truth.json, in one step and without processes",
         "polysight simulate examples/point-targets.toml --out out/points",
     )
-    config(sub)
+    add_config_option(sub)
     sub.add_argument("scene", type=Path, metavar="SCENE.toml", help="what to scan, e.g. examples/metal-plate.toml")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
     sub.add_argument(
@@ -207,64 +151,16 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--seed", type=int, default=None, help="noise seed (default: the scene's)")
 
-    sub = add(
-        "scan",
-        _scan,
-        "scan with the rig, and process while it scans; Ctrl-C ends it after the row, twice at once",
-        "polysight scan --config instrument.toml --out scans/one",
-    )
-    config(sub)
-    materials(sub)
-    sub.add_argument("--out", type=Path, required=True, metavar="SCAN", help="scan folder to make; never overwritten")
-    sub.add_argument(
-        "--truth", type=Path, default=None, metavar="FILE", help="truth.json of a simulated scene, for the report"
-    )
-    sub.add_argument(
-        "--keep-incomplete",
-        action="store_true",
-        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
-    )
-    sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
-
-    sub = add(
-        "resume",
-        _resume,
-        "go on with a scan that was stopped or killed, at its first missing row",
-        "polysight resume scans/one",
-    )
-    materials(sub)
-    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; the rig file is in it")
-    sub.add_argument(
-        "--keep-incomplete",
-        action="store_true",
-        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
-    )
-    sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
-
-    sub = add(
-        "validate", _validate, "check every file of a scan folder, and name every fault", "polysight validate scans/one"
-    )
-    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
-    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
-
+    add_scan_commands(add)
     for name, run, text in (
         ("process", _process, "make images, material names and the report from recorded data"),
         ("image", _image, "make only the images from recorded data (image.npz), without naming materials"),
     ):
         sub = add(name, run, text, f"polysight {name} scans/one --out out/one")
-        sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or the authors' unsynced/<scan>")
-        sub.add_argument(
-            "--out", type=Path, required=True, metavar="DIR", help="folder for the products; earlier ones are replaced"
-        )
-        sub.add_argument(
-            "--config",
-            type=Path,
-            default=None,
-            metavar="FILE",
-            help="rig file for unsynced/<scan>; scan folders bring their own (default: instrument.toml, if it is here)",
-        )
+        add_data_arguments(sub, several=name == "process")
         if name == "process":
-            materials(sub)
+            add_material_options(sub)
+            add_polarimetry_options(sub)
 
     sub = add(
         "focus",
@@ -275,7 +171,7 @@ def build_parser() -> argparse.ArgumentParser:
     sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or the authors' unsynced/<scan>")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for focus.json and focus.png")
     sub.add_argument(
-        "--depth", type=_positive, default=8.0, metavar="MM", help="how far to look to either side (default: 8 mm)"
+        "--depth", type=positive, default=8.0, metavar="MM", help="how far to look to either side (default: 8 mm)"
     )
     sub.add_argument("--config", type=Path, default=None, metavar="FILE", help="rig file for unsynced/<scan>")
 
@@ -301,30 +197,29 @@ def build_parser() -> argparse.ArgumentParser:
         "make the classifier's reference library from scans of known plates",
         "polysight train --simulate examples/library --out library.npz",
     )
-    config(sub)
+    add_config_option(sub)
     sub.add_argument("data", type=Path, nargs="*", metavar="DATA", help="scan folders with truth.json")
     sub.add_argument(
         "--simulate", type=Path, default=None, metavar="DIR", help="simulate every scene in DIR and use it"
     )
-    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="library to write (.npz)")
-
-    sub = add(
-        "drop-raw",
-        _drop_raw,
-        "remove the raw rows of a finished scan that saved products were made from; their digests stay",
-        "polysight drop-raw scans/one",
+    sub.add_argument(
+        "--authors", type=Path, default=None, metavar="DIR", help="the published data set: its materials/ and labels/"
     )
-    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
-    sub.add_argument("--products", type=Path, metavar="DIR", help="products made from it (default: SCAN/products)")
-    sub.add_argument("--yes", action="store_true", help="do not ask; the default is to have the word drop typed")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="library to write (.npz)")
 
     add_material_commands(add, RIG)
     add_reproduce_command(add, RIG)
+    add_leakage_command(add, RIG)
+    add_preview_command(add)
+    add_doctor_command(add, RIG)
+    add_calibrate_command(add)
+    add_plan_command(add, RIG)
+    add_export_command(add)
 
     sub = add(
         "card", card_status, "say of each capture card which hop to it is silent; write its addresses", "polysight card"
     )
-    config(sub)
+    add_config_option(sub)
     add_card_arguments(sub)
 
     sub = add(

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from host.cli_polarimetry import count
+
 if TYPE_CHECKING:
     from host.materials.layers import Layer
 
@@ -24,7 +26,9 @@ class Add(Protocol):
 def _permittivity(args: argparse.Namespace) -> int:
     from host.material_commands import permittivity
 
-    return permittivity(args.products, args.config, args.layer, args.segment, args.json)
+    return permittivity(
+        args.products, args.config, args.layer, args.segment, args.json, args.bands, args.amplitude / 100
+    )
 
 
 def _concentration(args: argparse.Namespace) -> int:
@@ -34,9 +38,9 @@ def _concentration(args: argparse.Namespace) -> int:
 
 
 def _classify(args: argparse.Namespace) -> int:
-    from host.material_commands import classify
+    from host.classify_commands import classify
 
-    return classify(args.library, args.json)
+    return classify(args.data, args.library, args.model, args.json)
 
 
 def _layer(text: str) -> Layer:
@@ -58,11 +62,25 @@ def _value(text: str) -> tuple[str, float]:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PERCENT, e.g. water=0") from None
 
 
+def _percent(text: str) -> float:
+    value = float(text)
+    if not 0 <= value <= 100:
+        raise argparse.ArgumentTypeError(f"{text} is not a percentage from 0 to 100")
+    return value
+
+
 def _share(text: str) -> float:
     value = float(text)
     if not 0.5 <= value < 1:
         raise argparse.ArgumentTypeError(f"{text} is not a share from 0.5 to below 1")
     return value
+
+
+def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
+    """`--model`: which classifier; `none`: whether naming can be left out."""
+    names = ["knn", "discriminant", "own-spread", *(["none"] if none else [])]
+    told = "classifier instead of the one that was chosen for the library by leaving scans out; knn is the paper's"
+    sub.add_argument("--model", choices=names, help=told + ("; none names nothing" if none else ""))
 
 
 def add_material_commands(add: Add, rig: Path) -> None:
@@ -83,6 +101,20 @@ def add_material_commands(add: Add, rig: Path) -> None:
         metavar="LAYER",
         help="layers in the order the wave meets them: NAME,REAL,LOSS,MM for a known one, NAME,?,MM for the unknown"
         " one; without MM the last one has no back (default: one interface)",
+    )
+    sub.add_argument(
+        "--bands",
+        type=count,
+        default=1,
+        metavar="K",
+        help="with --layer: use K sub-bands of the sweep, as processed with --bands K (default: the whole sweep)",
+    )
+    sub.add_argument(
+        "--amplitude",
+        type=_percent,
+        default=10.0,
+        metavar="PERCENT",
+        help="with --layer: how far |H| may be trusted; 0 uses the ratio alone (default: 10)",
     )
     sub.add_argument("--config", type=Path, default=rig, metavar="FILE", help="rig file of the scan")
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")
@@ -108,10 +140,17 @@ def add_material_commands(add: Add, rig: Path) -> None:
     sub = add(
         "classify",
         _classify,
-        "judge the classifiers on a library, with whole scans left out and by pixel",
-        "polysight classify library.npz",
+        "name the patches of processed scans, of several angles together; or judge the classifiers on a library",
+        "polysight classify out/at-60 out/at-55",
     )
     sub.add_argument(
-        "library", type=Path, metavar="LIBRARY", help="library (.npz), or folder of published material files"
+        "data",
+        type=Path,
+        nargs="+",
+        metavar="DATA",
+        help="folders that polysight process wrote, one for each angle the same patches were scanned under; or one"
+        " library (.npz) or folder of published material files, on which every classifier is judged",
     )
+    sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
+    add_model_option(sub)
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")

@@ -8,9 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from host.offline import TRUTH, check_library, clear_products, finish, truth_of
-from host.pipeline import Options, Pipeline
+from host.options import Options
+from host.pipeline import Pipeline
 from host.progress import ScanBar
+from host.scan.control import ControlDesk
+from host.scan.result import OnProgress
 from host.scan.run import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
+from host.scan.stop import StopRequest
 from host.store import manifest
 from host.store.raw import require_raw
 from host.store.scanfolder import MANIFEST, ScanFolder
@@ -35,12 +39,22 @@ class _Live:
         self.pipeline.add_row(row)
 
 
-def _run(folder: Path, options: Options, process: bool, take: Callable[[OnRow | None, ScanBar], ScanResult]) -> int:
+Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
+
+
+def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
     if process:
         check_library(options)
     live = _Live(folder)
-    with ScanBar() as bar:
-        result = take(live.add_row if process else None, bar)
+    stop = StopRequest()
+    with ScanBar() as bar, ControlDesk(folder, stop) as desk:
+
+        def told(progress: ScanProgress) -> None:
+            bar.update(progress)
+            if progress.phase != "connect":
+                desk.open()  # the scan folder is there, and locked by this program
+
+        result = take(live.add_row if process else None, told, stop)
     if result.processing_error is not None:
         raise result.processing_error
     if result.exit_status != "success":
@@ -74,13 +88,13 @@ def scan(config: Path, folder: Path, truth: Path | None, options: Options, keep_
     rig = load_instrument(config)
     _check_new(folder)
 
-    def take(on_row: OnRow | None, bar: ScanBar) -> ScanResult:
+    def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
         def told(progress: ScanProgress) -> None:
-            bar.update(progress)
+            tell(progress)
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
                 shutil.copyfile(truth, folder / TRUTH)
 
-        return run_scan(rig, folder, on_row=on_row, progress=told, keep_incomplete=keep_incomplete)
+        return run_scan(rig, folder, on_row=on_row, progress=told, keep_incomplete=keep_incomplete, stop=stop)
 
     return _run(folder, options, process, take)
 
@@ -89,7 +103,7 @@ def resume(folder: Path, options: Options, keep_incomplete: bool, process: bool)
     """Take a scan up at its first row that is not committed; returns the exit status. Raises PolysightError."""
     require_raw(ScanFolder.load(folder))
 
-    def take(on_row: OnRow | None, bar: ScanBar) -> ScanResult:
-        return resume_scan(folder, on_row=on_row, progress=bar.update, keep_incomplete=keep_incomplete)
+    def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
+        return resume_scan(folder, on_row=on_row, progress=tell, keep_incomplete=keep_incomplete, stop=stop)
 
     return _run(folder, options, process, take)

@@ -1,4 +1,4 @@
-"""Commands on materials that were found already: permittivity through layers, concentration, classifiers."""
+"""Commands on materials that were found already: permittivity through layers, and concentration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import numpy as np
 from host.materials import Library
 from host.materials.authors import read_materials
 from host.materials.concentration import fit_concentration
-from host.materials.layers import Bands, Layer, LayerFit, Spectrum, fit_layer
+from host.materials.layers import Layer, LayerFit, fit_layer
+from host.materials.subbands import AMPLITUDE_ERROR, bands_of_row
 from shared.config import load_instrument
 from shared.errors import ConfigError, DataError
 
@@ -49,29 +50,35 @@ def _segments(products: Path) -> list[dict[str, Any]]:
         raise DataError(f"{path}: cannot be read: {e}", "written by polysight process", "process the scan again") from e
 
 
-def _fit(segment: Mapping[str, Any], stack: Sequence[Layer], spectrum: Spectrum, angle_deg: float) -> LayerFit | None:
-    ratio, std = segment.get("ratio"), segment.get("inverse_ratio_std")
-    if ratio is None or not std or segment.get("metal_reference"):
-        return None
-    inverse = 1 / complex(ratio["real"], ratio["imag"])
-    return fit_layer(Bands(spectrum, np.array([inverse]), np.array([std])), stack, float(np.radians(angle_deg)))
-
-
-def permittivity(products: Path, config: Path, stack: Sequence[Layer], segment: int | None, as_json: bool) -> int:
+def permittivity(
+    products: Path,
+    config: Path,
+    stack: Sequence[Layer],
+    segment: int | None,
+    as_json: bool,
+    bands: int = 1,
+    amplitude_error: float = AMPLITUDE_ERROR,
+) -> int:
     """Permittivity of patches, as one interface or as the unknown layer of a stack; returns the exit status.
+
+    With `bands` above 1 the stack is fitted to so many sub-bands of the sweep, which the products must hold.
+    `amplitude_error` is how far |H| may be trusted, relative; 0 leaves it out.
 
     Raises
     ------
     DataError
-        when the folder holds no materials, or not that segment.
+        when the folder holds no materials, not that segment, or not so many sub-bands.
     """
     rows = [r for r in _segments(products) if segment is None or r["label"] == segment]
     if not rows:
         raise DataError(f"{products}: no segment {segment}", "its number is not in materials.json")
-    spectrum = Spectrum.of(load_instrument(config).chirp) if stack else None
+    chirp = load_instrument(config).chirp if stack else None
     out: list[dict[str, Any]] = []
     for row in rows:
-        found = _fit(row, stack, spectrum, row["incidence_deg"]) if spectrum else None
+        found = None
+        if chirp is not None and not row.get("metal_reference"):
+            data = bands_of_row(row, chirp, bands, amplitude_error)
+            found = fit_layer(data, stack, float(np.radians(row["incidence_deg"]))) if data else None
         out.append({"label": row["label"], "name": row["name"], "single_interface": row["permittivity"]})
         if found is not None:
             out[-1]["layer"] = _layer_row(found)
@@ -139,34 +146,4 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
         f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals hold the"
         f" truth in {100 * result.covered:.0f} % of the patches\n"
     )
-    return 0
-
-
-def classify(data: Path, as_json: bool) -> int:
-    """Share of pixels and patches that each model names right under both splits; returns the exit status.
-
-    `data` is a library (.npz) or a folder of the published material files. Raises DataError.
-    """
-    from host.materials.models import MODELS, Samples, score  # here: scikit-learn loads for a second
-
-    library = read_materials(data) if data.is_dir() else Library.load(data)
-    samples = Samples.of(library)
-    scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
-    source = "simulated" if library.simulated else "measured"
-    if as_json:
-        rows = [{k: v for k, v in asdict(s).items() if k not in ("confusion", "names")} for s in scores]
-        best = max(scores[::2], key=lambda s: s.pixels)
-        content = {"source": source, "names": best.names, "scores": rows}
-        content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
-        return 0
-    sys.stdout.write(
-        f"{source}: {len(library.names)} materials, {len(library.scans)} scans, {samples.names.size} pixels\n"
-        f"{'':36s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
-        f"{'model':36s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
-    )
-    for held, mixed in zip(scores[::2], scores[1::2], strict=True):
-        sys.stdout.write(
-            f"{held.model:36s}{held.pixels:11.1%}{held.patches:11.1%}{mixed.pixels:12.1%}{mixed.patches:12.1%}\n"
-        )
     return 0

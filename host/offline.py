@@ -13,13 +13,18 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 
+from host.calibration.in_force import of_scan
 from host.demo import run_simulator
+from host.imaging import ChannelImages
 from host.imaging.focus import focus_sweep
+from host.many import MARK
 from host.materials import Library, TrainingScan, TruthPlate, make_library, patches_from_labels, read_truth
-from host.pipeline import LIBRARY, Options, Pipeline
+from host.options import LIBRARY, Options
+from host.pipeline import Pipeline
 from host.products import Products, write_images, write_quality
 from host.report import write_json
 from host.report.focus import focus_figure
+from host.report.scan_facts import SCAN, write_scan_facts
 from host.store.authors import AuthorsCube, open_scan
 from host.store.raw import require_raw
 from host.store.scanfolder import MANIFEST, ScanFolder, versions
@@ -28,29 +33,23 @@ from shared.config import load_instrument
 from shared.errors import ConfigError, DataError, ScanError
 
 TRUTH = "truth.json"
-PRODUCTS = ("image.npz", "quality.json", "materials.json", "report.html", "figures")
+PRODUCTS = ("image.npz", SCAN, "quality.json", "materials.json", "patches.npz", "report.html", "figures")
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
 
 
-def _open(data: Path, config: Path | None) -> ScanSource:
+def _open(data: Path, config: Path | None) -> ScanSource | AuthorsCube:
     """A recorded scan of any layout; the rig file is read only where the data brings none."""
     own = (data / MANIFEST).exists()
     source = open_scan(data, None if own or config is None else load_instrument(config))
-    if isinstance(source, AuthorsCube):
-        raise DataError(
-            f"{data}: cubes that were synchronised already are not processed yet",
-            "this is the authors' raw/ layout",
-            "give the same scan's unsynced/ folder",
-        )
     if isinstance(source, ScanFolder):
         require_raw(source)
     return source
 
 
-def _rows(source: ScanSource, data: Path, depth_m: float = 0.0) -> Pipeline:
+def _rows(source: ScanSource | AuthorsCube, data: Path, depth_m: float = 0.0, bands: int = 1) -> Pipeline:
     """A pipeline with all rows of a source, with a progress bar."""
-    pipeline = Pipeline(source, depth_m=depth_m)
+    pipeline = Pipeline(source, depth_m=depth_m, bands=bands)
     rows = list(source.rows())
     if not rows:
         raise DataError(
@@ -62,6 +61,12 @@ def _rows(source: ScanSource, data: Path, depth_m: float = 0.0) -> Pipeline:
     for row in track(rows, "rows", console=console, disable=not console.is_terminal):
         pipeline.add_row(row)
     return pipeline
+
+
+def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, ChannelImages]:
+    """A recorded scan of any layout, processed up to its images. Raises PolysightError."""
+    pipeline = _rows(_open(data, config), data, bands=bands)
+    return pipeline, pipeline.form_images()
 
 
 def truth_of(data: Path) -> tuple[TruthPlate, ...]:
@@ -92,7 +97,7 @@ def clear_products(out: Path) -> None:
                 "products go into a folder of their own",
                 "give another --out",
             )
-        for name in PRODUCTS[:-1]:
+        for name in (MARK, *PRODUCTS[:-1]):
             (out / name).unlink(missing_ok=True)
         shutil.rmtree(out / PRODUCTS[-1], ignore_errors=True)
     except OSError as e:
@@ -119,7 +124,7 @@ def process(data: Path, out: Path, config: Path | None, options: Options) -> int
     source, plates = _open(data, config), truth_of(data)
     check_library(options)
     clear_products(out)
-    sys.stdout.write(finish(_rows(source, data), out, options, plates).summary())
+    sys.stdout.write(finish(_rows(source, data, bands=options.bands), out, options, plates).summary())
     return 0
 
 
@@ -128,7 +133,9 @@ def image(data: Path, out: Path, config: Path | None) -> int:
     source = _open(data, config)
     clear_products(out)
     pipeline = _rows(source, data)
-    write_images(out, pipeline.form_images())
+    images = pipeline.form_images()
+    write_images(out, images)
+    write_scan_facts(out, pipeline.source, pipeline.rig, images)
     write_quality(out, pipeline.quality.to_dict(**pipeline.quality_notes))
     sys.stdout.write(f"image: {out / 'image.npz'}\n")
     return 0
@@ -138,7 +145,8 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     """Find the object plane's distance and tilt by sharpness; focus.json and focus.png. Raises PolysightError."""
     source = _open(data, config)
     out.mkdir(parents=True, exist_ok=True)
-    builder = _rows(source, data, depth_mm / 1e3).images
+    pipeline = _rows(source, data, depth_mm / 1e3)
+    builder = pipeline.images
     found = focus_sweep(builder, depth_mm / 1e3)
     sweep = found.to_dict()
     grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
@@ -146,7 +154,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     pictures = (board.image()[0], board.image(moved)[0])
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, grid.x_m, grid.y_m, source.simulated))
-    at = source.instrument.geometry.object_distance_mm
+    at = pipeline.rig.geometry.object_distance_mm
     sys.stdout.write(
         f"{'simulated ' if source.simulated else ''}scan {source.scan_id}: the plane is sharpest"
         f" {found.depth_mm:+.2f} mm from the rig file's: object_distance_mm = {at + found.depth_mm:.2f}\n"
@@ -154,6 +162,8 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
         f" sharpness {found.gain:.3f} times the rig file's plane\n"
         f"figure: {out / 'focus.png'}\n"
     )
+    if pipeline.by_columns:
+        sys.stdout.write("the scan was taken by columns: x and y are swapped in these results and in the figure\n")
     if not found.certain:
         sys.stdout.write(
             "do not rely on it: the sharpness hardly changes over the sweep (a narrow scan, or no points and edges in"
@@ -169,9 +179,17 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     from host.sync import BoardSetup, synchronise_row
 
     source = _open(data, config)
-    chirp, reports = source.instrument.chirp, {}
-    for board in source.instrument.receivers:
-        setup = BoardSetup.of(source.instrument, board)
+    if isinstance(source, AuthorsCube):
+        raise DataError(
+            f"{data}: the chirps are not in it",
+            "these cubes were synchronised already, by the authors",
+            "give the same scan's unsynced/ folder",
+        )
+    calibration = of_scan(source)
+    rig = calibration.rig(source.instrument)
+    chirp, reports = rig.chirp, {}
+    for board in rig.receivers:
+        setup = BoardSetup.of(rig, board, model=calibration.high_pass(board.name))
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
         for row in source.rows():
             recorded = source.read_row(board.name, row)

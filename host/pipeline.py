@@ -2,67 +2,102 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from host.calibration.in_force import of_scan
 from host.capture.decode import row_words
 from host.imaging import ChannelImages, ImageBuilder
 from host.imaging.facts import imaging_facts
-from host.materials import Classifier, Library, MaterialsResult, TruthPlate, analyse, pixel_accuracy
+from host.imaging.subbands import SubBandImages
+from host.materials import Classifier, MaterialsResult, TruthPlate, analyse, pixel_accuracy
+from host.materials.incidence import permittivity_change
 from host.materials.segment import Box, Segmentation
-from host.polarimetry import incidence_map
+from host.materials.subbands import band_rows
+from host.options import Options
+from host.polarimetry import Incidence, PlaneReference, incidence_choice
 from host.products import Products, write_images, write_materials, write_quality
 from host.quality import Quality
-from host.store.source import ScanSource
-from host.sync.chain import BoardSetup, synchronise_row
-
-LIBRARY = Path(__file__).parent / "materials" / "simulated-library.npz"
-
-
-@dataclass(frozen=True)
-class Options:
-    """What the user may choose: where the metal is (else it is found), and the classifier's library."""
-
-    metal_box_mm: Box | None = None
-    library: Path | None = None
+from host.report.scan_facts import write_scan_facts
+from host.store.authors import AuthorsCube
+from host.store.authors_settings import mirrored
+from host.store.source import RowData, ScanSource
+from host.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from host.sync.cubes import CubeReader
+from shared.config import Instrument
 
 
 class Pipeline:
     """Processes one scan, row by row as they are committed, then to the end.
 
     With `live`, the images so far can be looked at after every row at next to no cost (`images.current()`).
-    `depth_m` keeps what lies that much nearer or farther than the rig file says, for autofocus.
+    `depth_m` keeps what lies that much nearer or farther than the rig file says, for autofocus. With `bands` above 1
+    that many sub-bands of the sweep are imaged too.
     """
 
-    def __init__(self, source: ScanSource, live: bool = False, depth_m: float = 0.0) -> None:
-        rig = source.instrument
-        self.source = source
-        self.setups = {board.name: BoardSetup.of(rig, board) for board in rig.receivers}
+    def __init__(
+        self, source: ScanSource | AuthorsCube, live: bool = False, depth_m: float = 0.0, bands: int = 1
+    ) -> None:
+        self.calibration = of_scan(source)
+        rig = self.calibration.rig(source.instrument)
+        self.source = CubeReader(source) if isinstance(source, AuthorsCube) else source
+        self.by_columns = getattr(source, "by_columns", False)  # its rig is the mirrored one, and so is its image
+        self.setups = {b.name: BoardSetup.of(rig, b, model=self.calibration.high_pass(b.name)) for b in rig.receivers}
         self.images = ImageBuilder(rig, live=live, depth_m=depth_m)
+        self.sub_bands = SubBandImages(rig, bands) if bands > 1 else None
         self.quality = Quality(rig)
         self.quality_notes: dict[str, Any] = {}
 
-    def add_row(self, row: int) -> None:
-        """Decode, compensate the filter, align the bursts, reference to the direct path, reduce for the image."""
-        chirp = self.source.instrument.chirp
+    def add_row(self, row: int) -> dict[str, SyncedRow]:
+        """Decode, compensate the filter, align the bursts, reference to the direct path, reduce for the image.
+
+        Returns each board's synchronised row, for who wants to look at it.
+        """
+        made: dict[str, SyncedRow] = {}
         for board, setup in self.setups.items():
-            with self.quality.timed("read and decode"):
-                recorded = self.source.read_row(board, row)
-                frames, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples)
-            with self.quality.timed("synchronise"):
-                synced = synchronise_row(frames, valid, setup)
+            recorded, frames_valid, synced = self._synchronised(board, row, setup)
             with self.quality.timed("reduce"):
                 self.images.add_row(board, row, synced)
-            self.quality.boards[board].add(row, recorded, int(valid.sum()), synced)
+                if self.sub_bands is not None:
+                    self.sub_bands.add_row(board, row, synced)
+            self.quality.boards[board].add(row, recorded, frames_valid, synced)
+            made[board] = synced
+        return made
+
+    def _synchronised(self, board: str, row: int, setup: BoardSetup) -> tuple[RowData, int, SyncedRow]:
+        """A row as recorded, how many of its frames are whole, and what synchronisation makes of it.
+
+        A cube was synchronised by its maker; only its form is brought to ours.
+        """
+        if isinstance(self.source, CubeReader):
+            with self.quality.timed("read and decode"):
+                synced = self.source.row(board, row)
+            return RowData.none(synced.valid.size), int(synced.valid.sum()), synced
+        with self.quality.timed("read and decode"):
+            recorded = self.source.read_row(board, row)
+            samples = self.source.instrument.chirp.samples
+            frames, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, samples)
+        with self.quality.timed("synchronise"):
+            return recorded, int(valid.sum()), synchronise_row(frames, valid, setup)
+
+    @property
+    def rig(self) -> Instrument:
+        """The rig of the images, x from TX to RX: the source's, mirrored back where it was scanned by columns."""
+        rig = self.calibration.rig(self.source.instrument)
+        return mirrored(rig) if self.by_columns else rig
 
     def form_images(self) -> ChannelImages:
         """Both channels, flattened by their footprint, not yet referenced to metal."""
         with self.quality.timed("image"):
             images = self.images.finish()
+        if in_force := self.calibration.facts():
+            self.quality_notes["calibration"] = in_force
         with self.quality.timed("point response"):
             self.quality_notes["imaging"] = imaging_facts(self.images, images)
-        return images
+        if recording := getattr(self.source, "recording", None):
+            self.quality_notes["recording"] = recording()
+        return images.transposed() if self.by_columns else images
 
     def find_materials(
         self,
@@ -71,31 +106,65 @@ class Pipeline:
         classifier: Classifier | None = None,
         plates: tuple[TruthPlate, ...] = (),
         segmentation: Segmentation | None = None,
+        reference: PlaneReference | None = None,
+        incidence: Incidence = "one",
     ) -> MaterialsResult:
-        """Patches (found, unless given), metal reference, leakage, permittivity, names."""
-        rig = self.source.instrument
+        """Patches (found, unless given), metal reference, leakage, permittivity, names; sub-bands where imaged."""
+        rig = self.rig
+        leakage = (complex(*rig.polarimetry.leakage_h), complex(*rig.polarimetry.leakage_v))
         with self.quality.timed("materials"):
-            return analyse(
+            angles = incidence_choice(rig, images.x_m, images.y_m, incidence)
+            found = analyse(
                 images.h,
                 images.v,
                 images.x_m,
                 images.y_m,
                 images.valid,
-                theta_rad=incidence_map(rig, images.x_m, images.y_m),
+                theta_rad=angles.used_rad,
                 classifier=classifier,
                 metal_box_mm=metal_box_mm,
-                leakage=(complex(*rig.polarimetry.leakage_h), complex(*rig.polarimetry.leakage_v)),
+                leakage=leakage,
                 smooth_px=rig.polarimetry.smooth_px,
                 plates=plates,
                 segmentation=segmentation,
+                reference=reference,
             )
+            self.quality_notes["incidence"] = {**angles.facts(images.valid), **permittivity_change(found, angles)}
+        if reference is not None:
+            self.quality_notes["metal_reference"] = reference.facts()
+        if self.sub_bands is None:
+            return found
+        with self.quality.timed("sub-bands"):
+            parts = reference.bands if reference is not None else None
+            bands = self.sub_bands.bands
+            rows = band_rows(found, bands, self.band_images(), leakage, rig.polarimetry.smooth_px, parts)
+        return replace(found, bands=rows)
+
+    def band_images(self) -> tuple[ChannelImages, ...]:
+        """Both channels in every sub-band, flattened; none when they were not asked for."""
+        made = self.sub_bands.finish() if self.sub_bands is not None else ()
+        return tuple(images.transposed() for images in made) if self.by_columns else made
 
     def finish(self, out: Path, options: Options, plates: tuple[TruthPlate, ...] = ()) -> Products:
         """Images, materials and report into `out`. The images are written even when no metal reference is found."""
-        library = Library.load(options.library or LIBRARY)
         images = self.form_images()
         write_images(out, images)
+        write_scan_facts(out, self.source, self.rig, images)
         write_quality(out, self.quality.to_dict(**self.quality_notes))
-        found = self.find_materials(images, options.metal_box_mm, Classifier(library), plates)
+        classifier = options.classifier(self.rig)
+        reference = options.reference
+        if reference is None and options.metal_box_mm is None:
+            reference = self.calibration.reference()
+        if reference is not None:
+            reference.check_axes(images.x_m, images.y_m)
+            images = replace(images, valid=images.valid & reference.valid)
+        found = self.find_materials(
+            images,
+            options.metal_box_mm,
+            classifier,
+            plates,
+            reference=reference,
+            incidence=options.incidence,
+        )
         quality = self.quality.to_dict(pixel_accuracy=pixel_accuracy(found), **self.quality_notes)
-        return write_materials(out, self.source, images, found, library, quality, plates)
+        return write_materials(out, self.source, images, found, classifier, quality, plates, self.rig)

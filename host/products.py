@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from host.imaging import ChannelImages
-from host.materials import Library, MaterialsResult, TruthPlate, pixel_accuracy
+from host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
+from host.materials.patches import PATCHES, pack_patches
 from host.polarimetry import ratio
 from host.report import write_image, write_json, write_report
-from host.report.assemble import context_of, library_sentence
+from host.report.assemble import classifier_sentence, context_of
+from host.report.products import write_atomically
+from host.report.scan_facts import with_scan
 from host.store.scanfolder import versions
-from host.store.source import ScanSource
+from host.store.source import Scan
 from shared.config import Instrument
 from shared.geometry import incidence_deg
 
@@ -48,25 +51,29 @@ def write_quality(out: Path, quality: dict[str, Any]) -> None:
 
 def write_materials(
     out: Path,
-    source: ScanSource,
+    source: Scan,
     images: ChannelImages,
     found: MaterialsResult,
-    library: Library,
+    classifier: Classifier | None,
     quality: dict[str, Any],
     truth: tuple[TruthPlate, ...],
+    rig: Instrument | None = None,
 ) -> Products:
-    """The metal-referenced image.npz, quality.json, materials.json, figures and report."""
+    """The metal-referenced image.npz, quality.json, materials.json, figures and report; `rig` if not the scan's own."""
     c = found.calibrated
     write_image(out / "image.npz", c.h, c.v, c.p, images.x_m, images.y_m, images.valid)
     write_quality(out, quality)
+    write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, source.simulated))
     rows = found.rows()
+    named_by = classifier_sentence(classifier) if classifier else "Nothing was named."
     write_json(
         out / "materials.json",
         {
             "scan_id": source.scan_id,
             "simulated": source.simulated,
             "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
-            "library": library_sentence(library),
+            "library": named_by,
+            "model": classifier.model if classifier else None,
             "pixel_accuracy": pixel_accuracy(found),
             "segments": rows,
         },
@@ -79,9 +86,9 @@ def write_materials(
         simulated=source.simulated,
         valid=images.valid,
         plates=truth,
-        library=library,
+        named_by=named_by,
         quality=quality,
-        config=_config_summary(source.instrument),
+        config=_config_summary(rig or source.instrument),
         provenance={
             "scan": source.scan_id,
             "processed": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
@@ -89,7 +96,7 @@ def write_materials(
         },
         notes=[NOT_ON_HARDWARE],
     )
-    write_report(out, context)
+    write_report(out, with_scan(context, source.plan, rig or source.instrument, images))
     return Products(out, _lines(source, found, rows))
 
 
@@ -106,11 +113,11 @@ def _config_summary(rig: Instrument) -> dict[str, Any]:
     }
 
 
-def _lines(source: ScanSource, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
+def _lines(source: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
     head = (
         f"{'simulated ' if source.simulated else ''}scan {source.scan_id}: {len(rows)} patches; metal {found.metal.how}"
     )
-    known = [r for r in rows if r["truth"] is not None]
+    known = [r for r in rows if r["truth"] is not None and r["name"] is not None]
     if not known:
         return (head,)
     right = sum(r["name"] == r["truth"]["name"] for r in known)

@@ -15,6 +15,7 @@ from host.store.source import RowData
 from host.sync.backlash import echo_of_row, estimate_backlash, object_filter
 from host.sync.chain import SyncedRow
 from shared.config import Board, Instrument
+from shared.raster import plan_raster
 
 
 @dataclass
@@ -39,6 +40,7 @@ class BoardQuality:
             "crc32": recorded.crc32,
             "positions": int(synced.valid.size),
             "positions_masked": int(synced.valid.size - synced.valid.sum()),
+            "masked_columns": masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
             "direct_hz": synced.direct_hz[synced.valid],
             "stages": synced.stages,
         }
@@ -65,6 +67,8 @@ class BoardQuality:
                 "max": float(direct.max()),
             }
         total["stage_backlash_mm"] = self._backlash()
+        total["masked_columns"] = {row: r["masked_columns"] for row, r in self.rows.items() if r["masked_columns"]}
+        total["rows_recorded"] = sorted(self.rows)
         total["raw_crc32"] = {row: r["crc32"] for row, r in self.rows.items() if r["crc32"]}
         return {**total, "synchronisation": stages}
 
@@ -72,6 +76,12 @@ class BoardQuality:
         """How far odd rows lie towards +x of where the plan puts them, from the echoes; None where they do not tell."""
         found = estimate_backlash(self.echoes, self.rig)
         return None if found is None else {"shift": round(found.shift_mm, 4), "std": round(found.std_mm, 4)}
+
+
+def masked_runs(masked: NDArray[np.bool_]) -> list[list[int]]:
+    """Half-open ranges [start, stop) of what is masked, ascending."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(np.int8), [0]])))
+    return edges.reshape(-1, 2).tolist()
 
 
 class Quality:

@@ -13,13 +13,14 @@ from typing import NamedTuple
 from pi_controller.trigger_lines import TriggerLines
 from shared.config import Burst
 from shared.faults import PiFault
+from shared.raster import FIRST_PULSE_DELAY_S
 from shared.units import us_to_ns
 
 MIN_PERIOD_NS = 300_000
 MAX_WIDTH_NS = 4_000
 # From edge to first pulse. A fixed delay longer than the usual wake-up keeps the pulses of all positions at the same
 # place behind their edges; 200 us are 4 um of travel at 20 mm/s.
-FIRST_PULSE_DELAY_NS = 200_000
+FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
 
 
 class BurstSpec(NamedTuple):

@@ -16,11 +16,12 @@ from pi_controller.burst import BurstSpec
 from pi_controller.journal import JournalFullError
 from pi_controller.ledger import Ledger
 from pi_controller.machine import Machine
-from pi_controller.rows import RefusedError, check_run, row_of
+from pi_controller.rows import RefusedError, check_pulses, check_run, row_of
 from pi_controller.running_row import RunningRow
 from pi_controller.stage_driver import StageDriver
 from pi_controller.stage_link import StageLost, StageNews
-from pi_controller.trigger_loop import BurstSent, LoopFault, TriggerLoop
+from pi_controller.states import MOVING
+from pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
 from shared import messages as m
 from shared.errors import DataError, ProtocolError
 from shared.faults import PiFault, explain
@@ -42,6 +43,7 @@ class Snapshot(NamedTuple):
 
     status: m.StatusReply
     firmware: str = ""
+    in_run: bool = False
 
 
 class Executor:
@@ -63,6 +65,7 @@ class Executor:
         self._last_row: tuple[int, int] | None = None
         self._after_row: Callable[[], None] | None = None
         self._replies: list[tuple[Callable[[m.AnyReply], None], m.AnyReply]] = []
+        self._pulsing: list[Callable[[m.AnyReply], None]] = []
         self._ending = self._ended = False
         self.crash: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
@@ -70,7 +73,7 @@ class Executor:
 
     # --- for other threads ------------------------------------------------------------------------------------------
 
-    def post(self, item: Request | StageNews | BurstSent | LoopFault | Callable[[], None]) -> None:
+    def post(self, item: Request | StageNews | BurstSent | BenchBurst | LoopFault | Callable[[], None]) -> None:
         """Hand something over; returns at once."""
         self._inbox.put(item)
 
@@ -130,8 +133,17 @@ class Executor:
     def _take(self, item: Any) -> None:
         if isinstance(item, BurstSent):
             self._machine.take_burst(item)
+        elif isinstance(item, BenchBurst):
+            r = item.record
+            told = m.Pulsed(pulses=r.pulses, width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns, fault=r.fault)
+            self._replies += [(answer, told) for answer in self._pulsing]
+            self._pulsing.clear()
         elif isinstance(item, LoopFault):
             self._machine.take_loop_fault(item)
+            lost = explain(item.number)
+            refused = m.Refused(number=item.number, what=item.detail, why=lost.why, remedy=lost.remedy)
+            self._replies += [(answer, refused) for answer in self._pulsing]  # REP owes every request a reply
+            self._pulsing.clear()
         elif isinstance(item, Request):
             try:
                 reply = self._on_command(item)
@@ -161,6 +173,8 @@ class Executor:
             return self._begin(request, command)
         if isinstance(command, m.EndRun):
             return self._end_run(command)
+        if isinstance(command, m.Pulse):
+            return self._pulse(request, command)
         if isinstance(command, m.Home):
             self._machine.home()
             return self._accept()
@@ -176,6 +190,18 @@ class Executor:
 
     def _accept(self) -> m.Accepted:
         return m.Accepted(state=self._machine.state)
+
+    def _pulse(self, request: Request, command: m.Pulse) -> None:
+        """Hand a burst to the trigger loop; its reply follows when it has been sent."""
+        state = self._machine.state
+        if self._run is not None or state in MOVING or state == "done":
+            why = f"run {self._run.scan_id} is begun" if self._run else f"the state is {state}"
+            raise RefusedError(PiFault.NOT_READY, why, "pulses would belong to no point", "wait for the scan's end")
+        if not self._loop.alive:
+            raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
+        spec = check_pulses(command.pulses, command.period_us, command.width_us, self._check_width)
+        self._pulsing.append(request.answer)
+        self._loop.send(spec)
 
     def _begin(self, request: Request, run: m.BeginRun) -> m.AnyReply | None:
         check_run(run, self._machine.stage.config)
@@ -268,4 +294,5 @@ class Executor:
                 reason=machine.reason,
             ),
             machine.stage.firmware,
+            self._run is not None,
         )

@@ -10,7 +10,8 @@ python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
   exit 2
 }
 getent group gpio >/dev/null || groupadd --system gpio
-getent passwd polysight >/dev/null || useradd --system --user-group --no-create-home --shell /usr/sbin/nologin polysight
+getent passwd polysight >/dev/null ||
+  useradd --system --user-group --groups gpio,dialout --no-create-home --shell /usr/sbin/nologin polysight
 
 mkdir -p "$root/opt/polysight" "$root/etc/polysight/keys" "$root/etc/udev/rules.d" "$root/etc/systemd/system"
 python3 -m venv "$root/opt/polysight/venv"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from pi_controller.burst import MAX_WIDTH_NS, MIN_PERIOD_NS
+from pi_controller.burst import MAX_WIDTH_NS, MIN_PERIOD_NS, BurstSpec
 from shared.config import Stage
 from shared.errors import PolysightError
 from shared.faults import PiFault, explain
@@ -60,11 +60,7 @@ def check_run(run: BeginRun, stage: Stage) -> None:
     RefusedError
         PERIOD_TOO_SHORT, PULSE_TOO_LONG, or BAD_REQUEST, with the values that do not go together.
     """
-    plan, period_ns, width_ns = run.plan, us_to_ns(run.period_us), us_to_ns(run.width_us)
-    if period_ns < MIN_PERIOD_NS:
-        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {run.period_us} us is below {MIN_PERIOD_NS / 1e3} us")
-    if not MIN_WIDTH_NS <= width_ns <= MAX_WIDTH_NS:
-        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {run.width_us} us is outside 0.025..4 us")
+    plan, period_ns = run.plan, check_pulses(run.pulses, run.period_us, run.width_us).period_ns
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
     fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)
@@ -87,6 +83,16 @@ def check_run(run: BeginRun, stage: Stage) -> None:
     run_up_mm = run.speed_mm_s**2 / (2 * stage.accel_mm_s2) + max(plan.step_x_mm, stage.backlash_mm)
     _fits("x", plan.columns, plan.step_x_mm, run_up_mm, stage.centre_x_mm, stage.travel_x_mm)
     _fits("y", plan.rows, plan.step_y_mm, stage.backlash_mm, stage.centre_y_mm, stage.travel_y_mm)
+
+
+def check_pulses(pulses: int, period_us: float, width_us: float, check_width: bool = True) -> BurstSpec:
+    """The burst, where the radars take it. Raises RefusedError PERIOD_TOO_SHORT or PULSE_TOO_LONG."""
+    period_ns, width_ns = us_to_ns(period_us), us_to_ns(width_us)
+    if period_ns < MIN_PERIOD_NS:
+        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {period_us} us is below {MIN_PERIOD_NS / 1e3} us")
+    if not MIN_WIDTH_NS <= width_ns <= MAX_WIDTH_NS:
+        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {width_us} us is outside 0.025..4 us")
+    return BurstSpec(pulses, period_ns, width_ns, check_width)
 
 
 def row_of(plan: RasterPlan, index: int) -> Row:

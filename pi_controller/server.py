@@ -158,6 +158,8 @@ class Server:
             state=status.state,
             scan_id=status.scan_id,
             last_seq=status.last_seq,
+            t_unix_ns=time.time_ns(),
+            in_run=snapshot.in_run,
         )
 
     def _beat(self, snapshot: Snapshot) -> None:

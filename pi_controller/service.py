@@ -19,7 +19,7 @@ from pi_controller.server import Server
 from pi_controller.stage_driver import StageDriver
 from pi_controller.stage_link import StageNews
 from pi_controller.trigger_lines import TriggerLines
-from pi_controller.trigger_loop import BurstSent, LoopFault, TriggerLoop
+from pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
 from pi_controller.wiring import check_wiring, read_model
 from shared.config import Instrument
 from shared.errors import DeviceError
@@ -110,7 +110,7 @@ class Service:
             stage.connect()
             self._opened = opened.pop_all()
 
-    def _post(self, item: StageNews | BurstSent | LoopFault) -> None:
+    def _post(self, item: StageNews | BurstSent | BenchBurst | LoopFault) -> None:
         self.executor.post(item)
 
     def _close_ledger(self) -> None:

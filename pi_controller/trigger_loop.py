@@ -38,6 +38,12 @@ class BurstSent(NamedTuple):
     record: BurstRecord
 
 
+class BenchBurst(NamedTuple):
+    """A burst that no edge asked for has been sent."""
+
+    record: BurstRecord
+
+
 class LoopFault(NamedTuple):
     """The row of this job (None: any) cannot go on. The loop is disarmed."""
 
@@ -62,18 +68,22 @@ class TriggerLoop:
     lines
         The lines; after :meth:`start` they belong to the loop's thread, which closes them at its end.
     post
-        Takes :class:`BurstSent` and :class:`LoopFault`. Must return at once.
+        Takes :class:`BurstSent`, :class:`BenchBurst` and :class:`LoopFault`. Must return at once.
     prepare
         Run first in the thread, for example to ask for real-time scheduling.
     """
 
     def __init__(
-        self, lines: TriggerLines, post: Callable[[BurstSent | LoopFault], None], prepare: Callable[[], object]
+        self,
+        lines: TriggerLines,
+        post: Callable[[BurstSent | BenchBurst | LoopFault], None],
+        prepare: Callable[[], object],
     ) -> None:
         self._lines, self._post, self._prepare = lines, post, prepare
         self._lock = threading.Lock()  # held while an edge is answered: arm and disarm wait for the burst to end
         self._stop = threading.Event()
         self._job: RowJob | None = None
+        self._bench: BurstSpec | None = None
         self._counts = Counts()
         self._last_seqno: int | None = None
         self._last_rise_ns: int | None = None
@@ -92,11 +102,20 @@ class TriggerLoop:
             self._counts = Counts()
             return job
 
+    def send(self, spec: BurstSpec) -> None:
+        """Send one burst that no edge asks for, when the loop next looks up. Only while no row is armed."""
+        self._bench = spec
+
     def disarm(self) -> Counts:
         """Answer no more edges; a running burst ends after its pulse. Returns what was counted since :meth:`arm`."""
         self._job = None
         with self._lock:
             return self._counts
+
+    @property
+    def alive(self) -> bool:
+        """Whether the loop still serves its lines."""
+        return self._thread.is_alive()
 
     @property
     def counts(self) -> Counts:
@@ -120,6 +139,9 @@ class TriggerLoop:
                 if edge is not None:
                     with self._lock:
                         self._take(edge)
+                if self._bench is not None:
+                    with self._lock:
+                        self._send(self._bench)
         except DeviceError as e:
             self._job = None
             self._post(LoopFault(None, PiFault.TRIGGER_LINE_LOST, e.what))
@@ -160,6 +182,16 @@ class TriggerLoop:
             if record.fault == PiFault.PULSE_TOO_LONG:
                 detail += f": may have lasted {record.width_max_ns / 1e3:.1f} us"
             self._fail(job, record.fault, detail)
+
+    def _send(self, spec: BurstSpec) -> None:
+        self._bench = None
+        start_ns = self._lines.now_ns()
+        if self._last_rise_ns is not None:
+            start_ns = max(start_ns, self._last_rise_ns + spec.period_ns)
+        record = send_burst(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
+        if record.pulses:
+            self._last_rise_ns, self._busy_until_ns = record.last_ns, record.end_ns
+        self._post(BenchBurst(record))
 
     def _is_over(self, job: RowJob) -> bool:
         return self._job is not job or self._stop.is_set()

@@ -56,8 +56,9 @@ class Chirp(_Section, frozen=True):
         )
         top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
         _require(self.start_hz >= 76e9 and top <= 81.1e9, f"sweep {self.start_hz:.4g}..{top:.5g} Hz must be 76..81 GHz")
-        _require(self.hpf1_khz in HPF_FIRST_KHZ, f"hpf1_khz must be one of {HPF_FIRST_KHZ}")
-        _require(self.hpf2_khz in HPF_SECOND_KHZ, f"hpf2_khz must be one of {HPF_SECOND_KHZ}")
+        none = " or 0: no filter, which only simulated rigs can have"
+        _require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
+        _require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
         a, b = self.linear_samples
         _require(0 <= a < b <= self.samples, f"linear_samples must be a range inside 0..{self.samples}")
 
@@ -252,6 +253,14 @@ class Polarimetry(_Section, frozen=True):
     smooth_px: NonNegative = 1.5
 
 
+class CalibrationFiles(_Section, frozen=True):
+    """Dated files that `polysight calibrate` wrote; "" for none. Relative paths count from the rig file's folder."""
+
+    direct_path: str = ""
+    hpf: str = ""
+    metal: str = ""
+
+
 class Limits(_Section, frozen=True):
     """How much a scan puts up with."""
 
@@ -279,6 +288,7 @@ class Instrument(_Section, frozen=True):
     image: Image = Image()
     polarimetry: Polarimetry = Polarimetry()
     limits: Limits = Limits()
+    calibration: CalibrationFiles = CalibrationFiles()
 
     def __post_init__(self) -> None:
         for role in ("transmit", "receive_h", "receive_v"):
@@ -409,7 +419,9 @@ def load_instrument(path: Path) -> Instrument:
     ConfigError
         naming file, key, value and rule.
     """
-    return decode(read_toml(path), Instrument, str(path))
+    rig = decode(read_toml(path), Instrument, str(path))
+    files = {kind: name and str(path.parent.resolve() / name) for kind, name in to_builtins(rig.calibration).items()}
+    return msgspec.structs.replace(rig, calibration=CalibrationFiles(**files))
 
 
 def to_builtins(config: Any) -> dict[str, Any]:

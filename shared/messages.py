@@ -17,6 +17,7 @@ from shared.errors import ProtocolError, VersionError
 from shared.raster import RasterPlan, Row
 
 WIRE_VERSION = "1.0"
+MOST_PULSES = 256  # of one `Pulse`: it is answered well before anybody's patience ends
 Natural = Annotated[int, msgspec.Meta(ge=0)]
 RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]
@@ -196,6 +197,14 @@ class Abort(Command, frozen=True, kw_only=True):
     reason: str = ""
 
 
+class Pulse(Command, frozen=True, kw_only=True):
+    """One burst on SYNC_IN at rest, outside of any run; nothing moves. Answered with Pulsed once it has been sent."""
+
+    pulses: Annotated[int, msgspec.Meta(ge=1, le=MOST_PULSES)]
+    period_us: float
+    width_us: float
+
+
 class Status(Command, frozen=True, kw_only=True):
     """Answered with StatusReply in any state."""
 
@@ -208,13 +217,13 @@ class Replay(Command, frozen=True, kw_only=True):
     limit: Annotated[int, msgspec.Meta(ge=1, le=10000)] = 1000
 
 
-AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume | Abort | Status | Replay
+AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume | Abort | Status | Replay | Pulse
 
 # --- replies: Pi -> host ----------------------------------------------------------------------------------------------
 
 
 class HelloReply(_Message, frozen=True, kw_only=True):
-    """Who answers, and in which state."""
+    """Who answers, and in which state. `t_unix_ns` is the Pi's wall clock when it answered (0: it does not tell)."""
 
     pi_release: str
     firmware: str
@@ -222,6 +231,8 @@ class HelloReply(_Message, frozen=True, kw_only=True):
     state: State
     scan_id: str
     last_seq: Natural
+    t_unix_ns: Natural = 0
+    in_run: bool = False
 
 
 class Accepted(_Message, frozen=True, kw_only=True):
@@ -263,7 +274,16 @@ class ReplayReply(_Message, frozen=True, kw_only=True):
     last_seq: Natural
 
 
-AnyReply = HelloReply | Accepted | Refused | StatusReply | ReplayReply
+class Pulsed(_Message, frozen=True, kw_only=True):
+    """The burst of a `Pulse`: pulses sent, the longest one (upper bound), the latest edge; `fault` as of a row's."""
+
+    pulses: Natural
+    width_max_ns: Natural
+    jitter_ns: Natural
+    fault: int = 0
+
+
+AnyReply = HelloReply | Accepted | Refused | StatusReply | ReplayReply | Pulsed
 
 M = TypeVar("M")
 

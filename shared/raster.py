@@ -12,6 +12,9 @@ import msgspec
 from shared.config import Burst, Grid, Stage
 from shared.errors import ConfigError
 
+FIRST_PULSE_DELAY_S = 200e-6
+"""From a trigger edge to its first SYNC_IN pulse: the Pi's fixed delay, longer than its usual wake-up."""
+
 
 class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One row of the grid: `points` trigger positions from `x_start_mm`, `step_mm` apart (signed), at `y_mm`.
@@ -75,6 +78,11 @@ def burst_duration_s(burst: Burst) -> float:
     return (burst.pulses - 1) * burst.period_us * 1e-6
 
 
+def burst_middle_s(burst: Burst) -> float:
+    """Time from a trigger edge to the middle of its burst, in seconds."""
+    return FIRST_PULSE_DELAY_S + burst_duration_s(burst) / 2
+
+
 def check_burst_fits(grid: Grid, burst: Burst, stage: Stage) -> None:
     """Refuse a plan whose burst does not end before the next trigger point.
 
@@ -97,6 +105,7 @@ def check_burst_fits(grid: Grid, burst: Burst, stage: Stage) -> None:
 def mean_burst_travel_mm(burst: Burst, stage: Stage) -> float:
     """Distance from a trigger point to the mean position of its burst, along the direction of motion.
 
-    The stage does not stop: 16 pulses 1.5 ms apart at 20 mm/s are centred 0.225 mm after the point.
+    The stage does not stop: 16 pulses 1.5 ms apart at 20 mm/s, the first 0.2 ms after the edge, are centred 0.229 mm
+    after the point.
     """
-    return stage.speed_mm_s * burst_duration_s(burst) / 2
+    return stage.speed_mm_s * burst_middle_s(burst)

@@ -110,6 +110,16 @@ def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket
     )
 
 
+def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+    """SUB socket of somebody who only looks on: a short queue, and the Pi forgets it when it falls silent.
+
+    The Pi queues for each subscriber; ZeroMQ's own heartbeat ends the connection of one that is stopped or cut off.
+    """
+    heartbeat: dict[int, int | bytes] = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}
+    options = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC, **heartbeat}
+    return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)
+
+
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """REP socket of the Pi, bound."""
     return _make(context, zmq.REP, address, key_dir, bind=True)

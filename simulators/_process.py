@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import os
 import signal
@@ -9,6 +10,16 @@ import sys
 import threading
 
 _PR_SET_PDEATHSIG = 1
+
+
+def command_line(module: str, description: str, example: str) -> argparse.ArgumentParser:
+    """A parser for `python -m <module>`; `example` is what could follow that."""
+    return argparse.ArgumentParser(
+        prog=f"python -m {module}",
+        description=description,
+        epilog=f"example:\n  python -m {module} {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
 
 
 def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:

@@ -20,7 +20,7 @@ from threading import Event
 from shared.config import Instrument, load_instrument
 from shared.errors import ConfigError, PolysightError
 from shared.wires import WireClient, WireEdge, WireMotion
-from simulators._process import announce_ready, die_with_parent, stop_requested
+from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
 from simulators.card_endpoint import Clock
 from simulators.card_faults import read_faults
 from simulators.card_sender import Pace
@@ -171,7 +171,11 @@ class CardServer:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m simulators.cards", description="Radars and capture cards.")
+    parser = command_line(
+        "simulators.cards",
+        "Radars and capture cards of a simulated rig; `python -m simulators.rig` starts them.",
+        "--config rig/instrument.toml --wires rig/wires.sock --pattern",
+    )
     parser.add_argument("--config", type=Path, required=True, help="rig file of the simulated rig")
     parser.add_argument("--wires", type=Path, required=True, help="Unix socket of the wires hub")
     parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")

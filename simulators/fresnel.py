@@ -88,8 +88,28 @@ def layered(
     return (z_s * cos - 1) / (z_s * cos + 1), (z_p - cos) / (z_p + cos)
 
 
+def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Complex, Complex]:
+    """What a screen that conducts along one direction alone returns of a wave whose s and p are alike.
+
+    The current J along the strips u = (sin psi, cos psi) in (x, y) makes the total field along u zero; it meets the
+    wave impedances of the two polarisations, 1 / (2 cos) for s and cos / 2 for p in units of free space.
+
+    Returns
+    -------
+    r_s, r_p : complex128, shape of theta_rad; both are -1 times what the wave has along u, split by u
+    """
+    cos, u_x, u_y = np.cos(np.asarray(theta_rad, dtype=np.float64)), np.sin(psi_rad), np.cos(psi_rad)
+    incident = u_y + u_x * cos  # tangential: E_y = 1, E_x = cos(theta)
+    current = incident / (u_y**2 / (2 * cos) + u_x**2 * cos / 2)
+    r_s = -current * u_y / (2 * cos)
+    r_p = -current * u_x * cos / 2 / cos  # tangential E_x back to the wave's amplitude
+    return r_s.astype(np.complex128), r_p.astype(np.complex128)
+
+
 def plate_reflection(plate: Plate, frequency_hz: float, theta_rad: NDArray[np.floating]) -> tuple[Complex, Complex]:
-    """Reflection coefficients (r_s, r_p) of a plate of the scene: metal, half space, slab or stack."""
+    """Reflection coefficients (r_s, r_p) of a plate of the scene: metal, strips, half space, slab or stack."""
+    if plate.strips_deg is not None:
+        return strips(np.radians(plate.strips_deg), theta_rad)
     if plate.metal:
         minus_one = -np.ones(np.shape(theta_rad), dtype=np.complex128)
         return minus_one, minus_one.copy()

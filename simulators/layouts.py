@@ -1,7 +1,6 @@
-"""Writers of simulated scans: this project's scan folder, and the authors' `unsynced/<scan>` folder.
+"""The writer of this project's scan folder, and what every writer of simulated scans needs.
 
-The byte formats are docs/spec/scan-folder.md and the published data set's description; written here independently
-of the host that reads them.
+The byte format is docs/spec/scan-folder.md; written here independently of the host that reads it.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared import __version__
-from shared.config import Board, Instrument, to_builtins
+from shared.config import Instrument, to_builtins
 from shared.errors import DataError
 from shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_kept
-from shared.raster import RasterPlan, Row, burst_duration_s
+from shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s
 from shared.units import NS_PER_S, us_to_ns
 
 Gaps = list[tuple[int, int]]
@@ -51,14 +50,16 @@ def packet_payload_bytes(rig: Instrument) -> int:
     return min(rig.card.packet_bytes - _HEADER_BYTES - 4, 1456)
 
 
-def _blank(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
+def blank(payload: NDArray[np.int16], gaps: Gaps) -> bytes:
+    """The payload's bytes with zeros where packets are lost."""
     raw = bytearray(payload.astype("<i2", copy=False).tobytes())
     for start, stop in gaps:
         raw[start:stop] = bytes(stop - start)
     return bytes(raw)
 
 
-def _new_folder(path: Path) -> None:
+def new_folder(path: Path) -> None:
+    """Make an empty folder. Raises DataError when it holds anything."""
     if path.exists() and any(path.iterdir()):
         raise DataError(f"{path}: the folder is not empty", "an earlier run", "choose another --out, or empty it")
     path.mkdir(parents=True, exist_ok=True)
@@ -74,7 +75,7 @@ class OwnLayout:
 
     def start(self) -> None:
         """Make the folder; note the start in manifest and events. Raises DataError when it is not empty."""
-        _new_folder(self._path)
+        new_folder(self._path)
         self._fact(
             "scan_started",
             format=1,
@@ -92,7 +93,7 @@ class OwnLayout:
         pulses = self._rig.burst.pulses
         boards = {}
         for name, payload in payloads.items():
-            raw = _blank(payload, gaps[name])
+            raw = blank(payload, gaps[name])
             file = Path("raw") / name / f"{row.index:04d}.bin"
             (self._path / file).parent.mkdir(parents=True, exist_ok=True)
             (self._path / file).write_bytes(raw)
@@ -148,7 +149,7 @@ class OwnLayout:
         first_ns = self._now_ns + NS_PER_S
         for i in range(row.points):
             edge_ns = first_ns + i * between_ns
-            pulse_ns = edge_ns + us_to_ns(20.0)
+            pulse_ns = edge_ns + round(FIRST_PULSE_DELAY_S * NS_PER_S)
             self._now_ns = pulse_ns + round(burst_duration_s(burst) * NS_PER_S)
             events.append(
                 Capture(
@@ -184,127 +185,3 @@ class OwnLayout:
 def _index(facts: dict[str, Any]) -> bytes:
     """A row's index: one JSON line, then as many (arrival ns, bytes) pairs as it says: none, nothing arrived."""
     return json.dumps({**facts, "arrivals": 0}, sort_keys=True, separators=(",", ":")).encode() + b"\n"
-
-
-class AuthorsLayout:
-    """The published data set's raw folder: `unsynced/<scan>/<board>/<x>_<y>.bin`, packet logs and three JSON files.
-
-    With `zero_filling` lost packets are zeros in the file, otherwise they are absent from it.
-    """
-
-    def __init__(
-        self, path: Path, rig: Instrument, plan: RasterPlan, scan_id: str, started_s: float, zero_filling: bool = True
-    ) -> None:
-        self.folder = path / "unsynced" / scan_id
-        self._rig, self._plan = rig, plan
-        self._now_s, self._zero_filling = started_s, zero_filling
-
-    def start(self) -> None:
-        """Make the folder and write the three JSON files. Raises DataError when it is not empty."""
-        _new_folder(self.folder)
-        for name, content in (
-            ("data_collection_cfg", self._collection()),
-            ("devices_comm_cfg", self._devices()),
-            ("radar_id", self._radars()),
-        ):
-            (self.folder / f"{name}.json").write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
-
-    def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
-        """One file for each board, named by the grid index where the row starts, and its packet log."""
-        step_s = abs(row.step_mm) / self._rig.stage.speed_mm_s
-        for name, payload in payloads.items():
-            lost = gaps[name]
-            folder = self.folder / name
-            folder.mkdir(exist_ok=True)
-            stem = f"{row.column(0)}_{row.index}"
-            raw = _blank(payload, lost)
-            if not self._zero_filling:
-                ends = [0, *(e for gap in lost for e in gap), len(raw)]
-                kept = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]
-            else:
-                kept = [raw]
-            (folder / f"{stem}.bin").write_bytes(b"".join(kept))
-            (folder / f"{stem}_log.csv").write_text(self._log(len(raw), lost, step_s), encoding="ascii")
-        self._now_s += row.points * step_s + 2.0
-
-    def end(self) -> None:
-        """Nothing more is written."""
-
-    def _log(self, size: int, lost: Gaps, step_s: float) -> str:
-        """One line for each packet that arrived: sequence number, payload bytes, unix time."""
-        full, frame = packet_payload_bytes(self._rig), self._rig.frame_bytes
-        pulses, period_s = self._rig.burst.pulses, self._rig.burst.period_us * 1e-6
-        gone = {start // full for a, b in lost for start in range(a - a % full, b, full)}
-        lines = []
-        for k, start in enumerate(range(0, size, full)):
-            if k in gone:
-                continue
-            stop = min(start + full, size)
-            position, chirp = divmod((stop - 1) // frame, pulses)
-            at_s = self._now_s + position * step_s + chirp * period_s + 2e-4
-            lines.append(f"{k + 1},{stop - start},{at_s:.6f}\n")
-        return "".join(lines)
-
-    def _collection(self) -> dict[str, Any]:
-        rig, h, v = self._rig, *self._rig.receivers
-        tilt = [s.shift_mm for s in h.mount if s.shift_mm is not None][-2]
-        return {
-            "dx": rig.grid.step_x_mm,
-            "dy": rig.grid.step_y_mm,
-            "total_x": rig.grid.columns,
-            "total_y": rig.grid.rows,
-            "moving_direction": "row",
-            "num_trigger": rig.burst.pulses,
-            "period_frame": rig.burst.period_us / 1e3,
-            "num_frame": rig.burst.pulses,
-            "num_chirp": 1,
-            "num_config": 1,
-            "num_adc": rig.chirp.samples,
-            "num_ch": len(rig.antennas.rx_mm),
-            "packet_zero_filling": self._zero_filling,
-            "object_distance": rig.geometry.object_distance_mm,
-            "board_dist": (_last_shift(h) - _last_shift(rig.transmitter)) / 1e3,
-            "txboard_angle_y": _turn(rig.transmitter, "y", -1),
-            "rxboard_v_angle_y": _turn(v, "y", 0),
-            "rxboard_angle_y": _turn(h, "y", -1),
-            "rxboard_angle_z": _turn(h, "z", -1),
-            "rxboard_tilt_offset": list(tilt),
-            "description": f"simulated: {self.folder.name}",
-        }
-
-    def _devices(self) -> dict[str, Any]:
-        c = self._rig.chirp
-        chirp = {
-            "f0": c.start_hz,
-            "slope": c.slope_hz_per_s,
-            "ramp_time": c.ramp_end_us * 1e-6,
-            "adc_start_time": c.adc_start_us * 1e-6,
-            "num_adc": c.samples,
-            "Fs": c.sample_rate_hz,
-            "activated_tx": [self._rig.transmitter.tx_antenna],
-        }
-        return {"activated_radar": list(range(len(self._rig.boards))), "chirp_configs": [chirp]}
-
-    def _radars(self) -> dict[str, Any]:
-        return {
-            str(i): {
-                "idx": i,
-                "name": b.name,
-                "ip": b.card_address,
-                "cfg_port": b.command_port,
-                "data_port": b.data_port,
-            }
-            for i, b in enumerate(self._rig.boards)
-        }
-
-
-def _turn(board: Board, axis: str, which: int) -> float:
-    """A mount's turn about an axis, degrees; 0 when it has none."""
-    turns = [s.turn_deg for s in board.mount if s.about == axis and s.turn_deg is not None]
-    return turns[which] if turns else 0.0
-
-
-def _last_shift(board: Board) -> float:
-    """Last shift of a mount along x, mm: where the board's origin is."""
-    shifts = [s.shift_mm[0] for s in board.mount if s.shift_mm is not None]
-    return shifts[-1] if shifts else 0.0

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.config import Board, Instrument
-from shared.raster import mean_burst_travel_mm, plan_raster
+from shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm, plan_raster
 from shared.units import SPEED_OF_LIGHT_M_S
 from simulators.field import ObjectField, build_field, node_matrix
 from simulators.optics import antennas, direct_factor
@@ -43,6 +43,7 @@ class _ReceivingBoard:
         tau, centre = ant.direct_m / SPEED_OF_LIGHT_M_S, self.field.centre_path_m / SPEED_OF_LIGHT_M_S
         self.middle_hz = float(chirp.slope_hz_per_s * (tau.mean() + centre) / 2)
         amplitude = direct_factor(board, scene) * ant.direct_m[0] / ant.direct_m
+        amplitude = amplitude * 10 ** (-scene.disturbances.direct_loss_db / 20)
         direct = amplitude[:, None] * np.exp(
             2j * np.pi * (f[0] * tau[:, None] + chirp.slope_hz_per_s * np.outer(tau, t))
         )
@@ -174,7 +175,8 @@ class SimulatedRig:
         lost = d.backlash_mm if direction < 0 else 0.0
         if not d.burst_motion:
             return np.full(burst.pulses, direction * mean_burst_travel_mm(burst, stage) + lost)
-        return direction * stage.speed_mm_s * np.arange(burst.pulses) * burst.period_us * 1e-6 + lost
+        after_s = FIRST_PULSE_DELAY_S + np.arange(burst.pulses) * burst.period_us * 1e-6
+        return direction * stage.speed_mm_s * after_s + lost
 
     def _receiving(self, name: str) -> _ReceivingBoard:
         if name not in self._boards:

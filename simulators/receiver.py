@@ -35,7 +35,7 @@ def pulse_uniform(key: int, pulses: NDArray[np.int64]) -> Real:
 def sync_delay_s(d: Disturbances, seed: int, board: Board, pulses: NDArray[np.int64]) -> Real:
     """From a SYNC_IN edge to the start of the board's chirp: fixed latency plus its own clock's sampling, [pulse]."""
     jitter = pulse_uniform(stream_key(seed, "sync", board.name), pulses)
-    return 1e-9 * (d.sync_latency_ns + d.sync_uncertainty_ns * jitter)
+    return 1e-9 * (d.sync_latency_ns + getattr(d.sync_skew_ns, board.role) + d.sync_uncertainty_ns * jitter)
 
 
 def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import ConfigError, DataError, PolysightError
-from simulators._process import announce_ready, die_with_parent, stop_requested
+from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
 from simulators.card_endpoint import CardEndpoint, Clock
 from simulators.card_faults import read_faults
 from simulators.card_sender import Pace
@@ -105,7 +105,7 @@ def scan_rows(scan: Path, board: str, row: int | None) -> list[Path]:
         raise DataError(
             f"{manifest}: no committed row {'' if row is None else row} of board {board}",
             "the scan has none, or the board has another name",
-            "`polysight validate` lists what a scan holds",
+            f"`polysight validate {scan}` lists what a scan holds",
         )
     return [files[r] for r in rows]
 
@@ -169,14 +169,18 @@ class Player:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m simulators.replay", description=str(__doc__).partition("\n")[0])
+    parser = command_line(
+        "simulators.replay", str(__doc__).partition("\n")[0], "scans/one --board RH --row 12 --rate-mbit 40"
+    )
     parser.add_argument("source", type=Path, help="a .bin file, or a scan folder, each row of which fills one record")
     parser.add_argument("--board", help="board of the scan folder")
     parser.add_argument("--row", type=int, help="only this row of the scan folder")
     parser.add_argument("--card-address", default="127.0.0.180", help="of this machine (default: %(default)s)")
     parser.add_argument("--host-address", default="127.0.0.30", help="who records (default: %(default)s)")
-    parser.add_argument("--command-port", type=int, default=4096)
-    parser.add_argument("--data-port", type=int, default=4098)
+    parser.add_argument(
+        "--command-port", type=int, default=4096, help="of the card and of who records (default: %(default)s)"
+    )
+    parser.add_argument("--data-port", type=int, default=4098, help="where the data go (default: %(default)s)")
     parser.add_argument("--rate-mbit", type=float, default=50.0, help="LVDS data rate in Mbit/s (default: %(default)s)")
     parser.add_argument("--loop", action="store_true", help="play it again and again until record stop")
     parser.add_argument("--frames", type=int, help="end after so many frames")

@@ -9,7 +9,6 @@ when one process ends by itself.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -24,7 +23,7 @@ import tomli_w
 
 from shared.config import Instrument, decode, load_instrument, to_builtins
 from shared.errors import ConfigError, DeviceError, PolysightError
-from simulators._process import announce_ready, die_with_parent, stop_requested
+from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
 from simulators.loopback import on_free_subnet
 from simulators.scene import Scene, apply_scene, load_scene
 from simulators.simulate import truth
@@ -303,7 +302,11 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
 
 def main(argv: list[str] | None = None) -> int:
     """Run a simulated rig until SIGTERM or SIGINT."""
-    parser = argparse.ArgumentParser(prog="python -m simulators.rig", description="A whole simulated rig.")
+    parser = command_line(
+        "simulators.rig",
+        "A whole simulated rig; prints `ready FILE`, the rig file that reaches it, and runs until Ctrl-C.",
+        "--config instrument.toml --scene examples/metal-plate.toml --dir out/rig --time-scale 30 --with-pi",
+    )
     parser.add_argument("--config", type=Path, required=True, help="rig file to begin from")
     parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")
     parser.add_argument("--dir", type=Path, required=True, help="folder of this rig: its rig file, logs, serial port")

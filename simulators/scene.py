@@ -53,7 +53,7 @@ class Plate(_Table, frozen=True):
     `centre_mm` counts from the image centre (specular midpoint of TX and H at stage offset zero). `permittivity` is
     [eps', eps''] of eps' - j eps''; without `thickness_mm` the plate is a half space (one interface). Instead of it,
     `layers` is a stack in the order the wave meets them, a liquid behind a wall say; air follows the last one unless
-    it is a half space.
+    it is a half space. Metal with `strips_deg` is ideal thin strips, turned by so much from the vertical towards +x.
     """
 
     name: str
@@ -63,8 +63,10 @@ class Plate(_Table, frozen=True):
     metal: bool = False
     thickness_mm: Positive | None = None
     layers: tuple[Layer, ...] = ()
+    strips_deg: float | None = None
 
     def __post_init__(self) -> None:
+        _require(self.strips_deg is None or self.metal, "strips_deg goes with metal = true")
         kinds = (self.metal, self.permittivity is not None, bool(self.layers))
         _require(sum(kinds) == 1, "a plate has one of permittivity = [..], metal = true or [[plates.layers]]")
         _require(
@@ -128,6 +130,8 @@ class Disturbances(_Table, frozen=True):
     adc_full_scale: Positive = 64.0
     packet_loss: Fraction = 0.0
     backlash_mm: float = 0.0
+    sync_skew_ns: PerRole = PerRole()
+    direct_loss_db: NonNegative = 0.0
 
 
 OFF: dict[str, Any] = {
@@ -149,6 +153,8 @@ OFF: dict[str, Any] = {
     "adc_full_scale": 4.0,  # finer steps: 8192 counts for the direct path
     "packet_loss": 0.0,
     "backlash_mm": 0.0,
+    "sync_skew_ns": {},
+    "direct_loss_db": 0.0,
 }
 
 
@@ -233,7 +239,8 @@ def load_scene(path: Path) -> Scene:
 def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
     """The rig with the scene's own grid, burst, image, stage and object distance.
 
-    Applying the same scene again changes nothing.
+    What the scene switches off, the filter and leakage, this rig does not have: its file says so, or processing would
+    take away what was never there. Applying the same scene again changes nothing.
 
     Raises
     ------
@@ -245,4 +252,9 @@ def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
         table[name] = {**table[name], **getattr(scene, name)}
     if scene.object_distance_mm is not None:
         table["geometry"] = {**table["geometry"], "object_distance_mm": scene.object_distance_mm}
+    if not scene.disturbances.hpf:
+        table["chirp"] = {**table["chirp"], "hpf1_khz": 0.0, "hpf2_khz": 0.0}
+    for key in ("leakage_h", "leakage_v"):
+        if not any(getattr(scene.disturbances, key)):
+            table["polarimetry"] = {**table["polarimetry"], key: [0.0, 0.0]}
     return decode(table, Instrument, f"{rig.name} with scene {scene.name}")

@@ -13,12 +13,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import tomli_w
 from numpy.typing import NDArray
 
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Grid, Instrument, load_instrument, to_builtins
 from shared.geometry import incidence_deg, specular_midpoint_m
 from shared.raster import Row, check_burst_fits, mean_burst_travel_mm, plan_raster
-from simulators.layouts import AuthorsLayout, Gaps, Layout, OwnLayout, packet_payload_bytes, versions
+from simulators.authors_layout import AuthorsLayout, Skipped
+from simulators.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
 from simulators.radar import SimulatedRig
 from simulators.receiver import stream_key
 from simulators.scene import Scene, apply_scene, load_scene
@@ -40,7 +42,8 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
             "centre_m": [centre[0] + p.centre_mm[0] / 1e3, centre[1] + p.centre_mm[1] / 1e3, centre[2]],
             "size_mm": list(p.size_mm),
             "permittivity": None if p.permittivity is None else list(p.permittivity),
-            "metal": p.metal,
+            "metal": p.metal and p.strips_deg is None,
+            "strips_deg": p.strips_deg,
             "thickness_mm": p.thickness_mm,
             "layers": [msgspec.to_builtins(layer) for layer in p.layers],
         }
@@ -103,6 +106,8 @@ def simulate(
     zero_filling: bool = True,
     cache_dir: Path | None = None,
     progress: Progress | None = None,
+    by_columns: bool = False,
+    skipped: Skipped | None = None,
 ) -> Path:
     """Write a scan of a scene.
 
@@ -124,6 +129,8 @@ def simulate(
         Where object fields are kept between runs; None keeps nothing.
     progress
         Called with rows done and rows in all.
+    by_columns, skipped
+        Authors' layout only: see :class:`simulators.authors_layout.AuthorsLayout`.
 
     Returns
     -------
@@ -136,10 +143,11 @@ def simulate(
     DataError
         when the folder is not empty.
     """
-    radar = SimulatedRig(rig, scene, seed, cache_dir)
+    radar = SimulatedRig(rig, _wider(scene, rig) if by_columns else scene, seed, cache_dir)
     rig = apply_scene(rig, scene)
-    check_burst_fits(rig.grid, rig.burst, rig.stage)
-    plan = plan_raster(rig.grid)
+    grid = _by_columns(rig.grid) if by_columns else rig.grid
+    check_burst_fits(grid, rig.burst, rig.stage)
+    plan = plan_raster(grid)
     started_s = time.time() if started_s is None else started_s
     scan_id = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
     writer: Layout
@@ -148,11 +156,12 @@ def simulate(
         folder, boards = out, rig.recorded
         writer = OwnLayout(out, rig, plan, scan_id, stamp)
     else:
-        writer = AuthorsLayout(out, rig, plan, scan_id, started_s, zero_filling)
+        writer = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
         folder, boards = writer.folder, rig.boards
     writer.start()
     for row in plan:
         x, y = row_offsets_mm(radar, row)
+        x, y = (y, x) if by_columns else (x, y)
         first = row.index * len(x)
         payloads = {b.name: radar.chirps(b.name, x, y, first) for b in boards}
         writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
@@ -161,7 +170,20 @@ def simulate(
     writer.end()
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
     (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    if layout == "authors":  # their files tell neither geometry nor filter nor leakage; a scan folder's manifest does
+        (folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
     return folder
+
+
+def _by_columns(grid: Grid) -> Grid:
+    """The grid whose rows are the columns."""
+    return Grid(columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm)
+
+
+def _wider(scene: Scene, rig: Instrument) -> Scene:
+    """The scene with a row more above and below, for bursts that travel along y."""
+    grid = to_builtins(apply_scene(rig, scene).grid)
+    return msgspec.structs.replace(scene, grid={**grid, "rows": grid["rows"] + 2})
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -173,6 +195,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--layout", choices=("own", "authors"), default="own", help="scan folder, or the published data set's"
     )
     parser.add_argument("--seed", type=int, default=None, help="instead of the scene's seed")
+    parser.add_argument("--columns", action="store_true", help="authors' layout: taken column by column")
     parser.add_argument("--absent", action="store_true", help="authors' layout: lost packets are absent, not zeros")
     parser.add_argument("--json", action="store_true", help="one JSON line instead of words")
 
@@ -188,7 +211,14 @@ def run(args: argparse.Namespace) -> int:
 
     quiet = args.json or not sys.stderr.isatty()
     folder = simulate(
-        rig, scene, args.out, args.layout, args.seed, zero_filling=not args.absent, progress=None if quiet else show
+        rig,
+        scene,
+        args.out,
+        args.layout,
+        args.seed,
+        zero_filling=not args.absent,
+        progress=None if quiet else show,
+        by_columns=args.columns and args.layout == "authors",
     )
     seconds = time.perf_counter() - began
     if args.json:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from shared.config import Board, Instrument
 from shared.errors import ConfigError
-from shared.raster import burst_duration_s, plan_raster
+from shared.raster import burst_middle_s, plan_raster
 from shared.units import us_to_ns
 from shared.wires import WireMotion
 from simulators.radar_board import RadarBoard
@@ -109,7 +109,7 @@ class StageTrack:
     """
 
     def __init__(self, rig: Instrument, burst_motion: bool = True) -> None:
-        self._middle_ns = None if burst_motion else round(burst_duration_s(rig.burst) / 2 * 1e9)
+        self._middle_ns = None if burst_motion else round(burst_middle_s(rig.burst) * 1e9)
         self._plan, self._burst = plan_raster(rig.grid), rig.burst
         self._triggers: list[int] = []
         self._centre_mm = (rig.stage.centre_x_mm, rig.stage.centre_y_mm)

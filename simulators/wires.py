@@ -7,7 +7,6 @@ cut off, with a message, and notices by its closed connection.
 
 from __future__ import annotations
 
-import argparse
 import selectors
 import socket
 import sys
@@ -17,7 +16,7 @@ from threading import Event
 
 from shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError
 from shared.wires import WireMotion, parse
-from simulators._process import announce_ready, die_with_parent, stop_requested
+from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
 
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20
@@ -74,6 +73,7 @@ class WireHub:
         self._parties: dict[socket.socket, _Party] = {}
         self._accepted = 0
         self._last_motion = b""
+        self._cut: set[bytes] = set()
         self.relayed = 0
 
     def serve(self, stop: Event, poll_s: float = 0.1) -> None:
@@ -136,7 +136,7 @@ class WireHub:
                 if not wanted:
                     raise ProtocolError(f"not a wire line: {line!r}")
                 for p in others:
-                    if wanted in p.lines:
+                    if wanted in p.lines and wanted not in self._cut:
                         p.pending += line + b"\n"
                         self.relayed += 1
             elif tag == b"M ":
@@ -149,6 +149,9 @@ class WireHub:
                         self.relayed += 1
             elif tag == b"L " and all(word.isdigit() for word in line[2:].split()):
                 sender.lines.update(line[2:].split())
+                sender.pending += b"K\n"
+            elif tag == b"X " and len(fields := line.split(b" ")) == 3 and fields[2] in (b"0", b"1"):
+                (self._cut.add if fields[2] == b"1" else self._cut.discard)(fields[1])
                 sender.pending += b"K\n"
             elif line == b"W":
                 sender.motion = True
@@ -209,7 +212,7 @@ def _listen(path: Path) -> socket.socket:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the hub until SIGTERM or SIGINT."""
-    parser = argparse.ArgumentParser(prog="python -m simulators.wires", description="Hub of the simulated wires.")
+    parser = command_line("simulators.wires", "Hub of the simulated wires.", "--socket out/wires.sock")
     parser.add_argument("--socket", type=Path, required=True, help="Unix socket to serve")
     args = parser.parse_args(argv)
     stop = stop_requested()

@@ -2,6 +2,8 @@
 # Debian packages the tests use (with `kernel`: and those of `make test-uml`): installed when root or passwordless sudo is there, else named with how to get them.
 set -u
 missing=()
+lean=()  # installed without what Debian recommends beside them: a browser would bring half a desktop
+command -v chromium >/dev/null || lean+=(chromium fonts-dejavu-core)
 command -v g++ >/dev/null || missing+=(g++)
 command -v make >/dev/null || missing+=(make)
 command -v gcc >/dev/null || missing+=(gcc libc6-dev)
@@ -15,15 +17,19 @@ if [ "${1-}" = kernel ]; then
   for tool in flex bison bc; do command -v $tool >/dev/null || missing+=($tool); done
   command -v xz >/dev/null || missing+=(xz-utils)
 fi
-[ ${#missing[@]} -eq 0 ] && exit 0
+[ ${#missing[@]} -eq 0 ] && [ ${#lean[@]} -eq 0 ] && exit 0
 as_root=()
 if [ "$(id -u)" -ne 0 ]; then
   if sudo -n true 2>/dev/null; then as_root=(sudo -n); else as_root=(false); fi
 fi
 if [ "${as_root[0]-}" != false ] && command -v apt-get >/dev/null; then
-  echo "installing ${missing[*]}"
+  echo "installing ${missing[*]} ${lean[*]}"
   "${as_root[@]}" apt-get update -qq >/dev/null 2>&1
-  if "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "${missing[@]}" >/dev/null 2>&1; then exit 0; fi
+  get() { [ $# -eq 1 ] || "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "$@" >/dev/null 2>&1; }
+  if get --install-recommends "${missing[@]}"; then missing=(); fi
+  if get --no-install-recommends "${lean[@]}"; then lean=(); fi
+  [ ${#missing[@]} -eq 0 ] && [ ${#lean[@]} -eq 0 ] && exit 0
 fi
+missing+=("${lean[@]}")
 echo "Not installed: ${missing[*]}. The tests that need them are skipped and counted below." >&2
 echo "To run them too: sudo apt-get install ${missing[*]}" >&2

@@ -41,7 +41,7 @@ class Synchroniser:
         f = np.fft.fftfreq(chirp.samples, 1 / t)
         f = np.where(f < 0, f + t, f) if chirp.if_mode == "complex1x" else f
         h = np.ones(f.shape, complex)
-        for corner_hz in (chirp.hpf1_khz * 1e3, chirp.hpf2_khz * 1e3):
+        for corner_hz in (khz * 1e3 for khz in (chirp.hpf1_khz, chirp.hpf2_khz) if khz):
             h *= (1j * f / corner_hz) / (1 + 1j * f / corner_hz)
         self._unfilter = (h.conj() / np.maximum(np.abs(h) ** 2, 1 / 16)).astype(self._type)
 

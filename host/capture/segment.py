@@ -19,8 +19,19 @@ from numpy.typing import NDArray
 from shared.errors import DataError, DeviceError
 
 PAIR = np.dtype("<i8")
-_FULL = ("the disk is full or fails", "free space, then `polysight resume` takes the row again")
-_DAMAGED = ("the file is damaged or truncated", "`polysight validate` of its scan folder names every damaged file")
+
+
+def _scan_of(path: Path) -> Path:
+    """The scan folder of `SCAN/raw/BOARD/ROW.*`; of a file elsewhere, its own folder."""
+    return path.parents[2] if path.parent.parent.name == "raw" else path.parent
+
+
+def _full(path: Path) -> tuple[str, str]:
+    return "the disk is full or fails", f"free space, then `polysight resume {_scan_of(path)}` takes the row again"
+
+
+def _damaged(path: Path) -> tuple[str, str]:
+    return "the file is damaged or truncated", f"`polysight validate {_scan_of(path)}` names every damaged file"
 
 
 class Segment:
@@ -68,7 +79,7 @@ class Segment:
             raise DeviceError(
                 f"{path}: cannot reserve {size} bytes: {e.strerror}",
                 "the disk is full or read-only",
-                "free space, or choose another folder; `polysight resume` goes on from the last committed row",
+                f"free space; `polysight resume {_scan_of(path)}` then goes on from the last committed row",
             ) from None
         except MemoryError:
             raise DeviceError(f"{path}: no memory for a row of {size} bytes", "the row is larger than memory") from None
@@ -85,7 +96,7 @@ class Segment:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except OSError as e:
-            raise DeviceError(f"{self.path}: cannot be made durable: {e.strerror}", *_FULL) from None
+            raise DeviceError(f"{self.path}: cannot be made durable: {e.strerror}", *_full(self.path)) from None
         finally:
             self.close()
         return crc
@@ -110,7 +121,7 @@ def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) 
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
-        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *_FULL) from None
+        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *_full(path)) from None
     return zlib.crc32(raw)
 
 
@@ -121,7 +132,7 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
         facts = json.loads(head)
         pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: not a readable row index: {e}", *_DAMAGED) from None
+        raise DataError(f"{path}: not a readable row index: {e}", *_damaged(path)) from None
     if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
-        raise DataError(f"{path}: the row index does not hold what it says", *_DAMAGED)
+        raise DataError(f"{path}: the row index does not hold what it says", *_damaged(path))
     return facts, pairs

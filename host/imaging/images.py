@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.signal
@@ -57,6 +57,12 @@ class ChannelImages:
     valid: NDArray[np.bool_]
     rx_calibration: dict[str, NDArray[np.complex128]]
     notices: tuple[str, ...] = ()
+
+    def transposed(self) -> ChannelImages:
+        """The images with x and y swapped."""
+        pixels = ("h", "v", "h_raw", "v_raw", "h_footprint", "v_footprint", "valid")
+        turned = {name: np.ascontiguousarray(getattr(self, name).T) for name in pixels}
+        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m)
 
 
 class ImageBuilder:
@@ -134,7 +140,8 @@ class ImageBuilder:
         for _, weight, _ in (h, v):
             strong = np.abs(weight) >= _VISIBLE * np.abs(weight).max()
             # The footprint's rim ripples with the row spacing: the majority of the neighbourhood decides, not stripes.
-            visible &= ndimage.median_filter(strong, size=_NEIGHBOURS, mode="nearest") & (weight != 0)
+            share = ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
+            visible &= (share > 0.5) & (weight != 0)
         flat = [np.divide(raw, w, out=np.zeros_like(raw), where=visible) for raw, w, _ in (h, v)]
         calibration = {name: board.rx_calibration() for name, board in self.boards.items()}
         notices = tuple(f"{name}: {notice}" for name, (_, _, notice) in made.items() if notice)

@@ -61,15 +61,18 @@ class IncrementalImager(RowSpectra):
         start_m
             Stage offset of its first column.
         """
-        xp, (rx, m) = self.xp, self.aperture.shape[:2]
         ramp = self.ramps(np.array([start_m]))[0, :]
-        lines = self.of_rows(samples, ramp)
+        white = self.of_rows(self.xp.astype(weights, self.xp.complex64), ramp)
+        self.add_spectra(index, self.of_rows(samples, ramp), white)
+
+    def add_spectra(self, index: int, lines: Any, white: Any) -> None:
+        """:meth:`add_row` of a row that is transformed already, [rx, frequency, k], and its weights, [k]."""
+        xp, (rx, m) = self.xp, self.aperture.shape[:2]
         by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
             by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
         at = self._lags(index)
         self._sum += xp.matmul(self._kernels[:, at, :], xp.matmul(self._components, by_rx))
-        white = self.of_rows(xp.astype(weights, xp.complex64), ramp)
         self._constant += self._echo_kernel[:, at] * white[:, None]
 
     def image_of_sum(self, factors: Any) -> Any:

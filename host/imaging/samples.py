@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from numpy.typing import NDArray
 from host.imaging.aperture import Aperture, irregular, row_starts_m
 from host.imaging.footprint import mirror_reduced
 from host.imaging.grid import Antennas, ImageGrid, row_offsets_m
-from host.imaging.imager import choose_imager
+from host.imaging.imager import Imager, choose_imager
 from host.imaging.incremental import SLACK_M, IncrementalImager
+from host.imaging.motion import burst_filters, undo_burst_motion
 from host.imaging.reduce import Reduction
+from host.imaging.spectral import SpectralImager
 from host.sync.chain import SyncedRow
 from shared.config import Board, Instrument
 from shared.errors import DataError
@@ -54,6 +57,7 @@ class BoardSamples:
         self._reduction, self._linear = reduction, slice(*rig.chirp.linear_samples)
         maps = np.vstack([reduction.matrix, reduction.direct])
         self._maps = np.ascontiguousarray(maps[:, self._linear], np.complex64)
+        self._filters = burst_filters(rig)
         self._antennas = Antennas.of(rig, board)
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
         rows = [row_offsets_m(rig, row)[:: row.direction] for row in self._plan]
@@ -64,10 +68,14 @@ class BoardSamples:
         self._direct = np.zeros((rx, *shape), np.complex64)
         self.valid = np.zeros(shape, bool)
         regular = irregular(self.aperture) is None
+        self._final: SpectralImager | None = None
+        self._spectra = np.zeros(0, np.complex64)  # of the rows, along x: what the final image needs of each
+        self._stale = set(range(shape[0]))  # rows whose spectra are not those of their samples
+        self._moved = False  # rows are not where the live image's lattice was made for
         self._live = None
         if live and regular:
             self._live = IncrementalImager(self.aperture, self.mirror)
-            choose_imager(self.aperture)  # its kernels are made now, not after the last row
+            self._prepare()  # kernels are made now, not after the last row
 
     @property
     def aperture(self) -> Aperture:
@@ -114,26 +122,52 @@ class BoardSamples:
             )
         self._show(index, -1)
         forward = slice(None, None, self._plan.row(index).direction)
-        reduced = np.matmul(self._maps, row.samples[..., self._linear].mT)[..., forward]
+        reduced = np.matmul(self._maps, row.samples[..., self._linear].mT)
+        if row.turn is not None:
+            reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
+        reduced = reduced[..., forward]
         self.valid[index] = row.valid[forward]
         self._cube[:, :, index] = reduced[:, :-1] * self.valid[index]
         self._direct[:, index] = reduced[:, -1] * self.valid[index]
         if offsets_m is not None:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
+            self._final, self._moved = None, True
             moved = abs(row_starts_m(self._offsets)[index] - self._planned[index])
             if moved > SLACK_M or irregular(self.aperture) is not None:
                 self._live = None
+        self._stale.add(index)
         self._show(index, 1)
+
+    def _prepare(self) -> None:
+        """Make the imager of all rows where there is a fast one; it is kept while they stay where they are."""
+        if self._final is None and irregular(self.aperture) is None:
+            self._final = SpectralImager(self.aperture, slack_m=SLACK_M)  # the live one's lattice: both share spectra
+            self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
+            self._stale = set(range(len(self.valid)))
+
+    def _transformed(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
+        """A row's spectra, [rx, frequency, k]; each row by itself, so that the same rows give the same bits."""
+        if index in self._stale:
+            row = self._cube[:, :, index] * self.weights[index]
+            self._spectra[:, :, index] = imager.spectra_of_row(row, index)
+            self._stale.remove(index)
+        return self._spectra[:, :, index]
 
     def keep(self, positions: NDArray[np.bool_]) -> None:
         """Mask every position [row, column] that is not to be kept, as if it had not been scanned."""
         self.valid &= positions
         self._live = None
+        self._stale = set(range(len(self.valid)))
 
     def _show(self, index: int, sign: int) -> None:
         """Add a row to the live image, or take it away."""
         weights = sign * self.weights[index]
-        if self._live is not None and weights.any():
+        if self._live is None or not weights.any():
+            return
+        if self._final is not None and not self._moved:
+            white = self._final.spectra_of_row(weights.astype(np.complex64), index)
+            self._live.add_spectra(index, sign * self._transformed(self._final, index), white)
+        else:
             start = float(row_starts_m(self._offsets)[index])
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
 
@@ -167,16 +201,22 @@ class BoardSamples:
         grid
             Other pixels than the rig file's; they must lie inside the range gate.
         """
-        grid = self._grid if grid is None else grid
-        aperture = Aperture(self._antennas, self._offsets, self._reduction.frequencies_hz, grid)
-        imager, notice = choose_imager(aperture)
-        if notice:
-            _log.warning("%s: %s", self.board.name, notice)
-        gains = (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
-        samples = self._cube * (gains * self.weights)
-        image: Any = imager.image(samples) / self.count
+        gains, notice = (1 / self.rx_calibration()).astype(np.complex64), None
+        if grid is None:
+            self._prepare()
+        if grid is None and self._final is not None:
+            for index in range(len(self.valid)):
+                self._transformed(self._final, index)
+            imager: Imager = self._final
+            image: Any = self._final.image_of_spectra(self._spectra, gains)
+        else:
+            aperture = replace(self.aperture, grid=self._grid if grid is None else grid)
+            imager, notice = choose_imager(aperture)
+            if notice:
+                _log.warning("%s: %s", self.board.name, notice)
+            image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
         footprint: Any = imager.constant(self.mirror.astype(np.complex64), self.weights) / self.count
-        return image.astype(np.complex64), footprint.astype(np.complex64), notice
+        return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
 
 
 def _stranger(what: str) -> DataError:

@@ -86,9 +86,10 @@ class RowSpectra:
 class SpectralImager(RowSpectra):
     """All rows at once: a 2-D product for each RX and frequency, one inverse transform."""
 
-    def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None) -> None:
-        super().__init__(aperture, xp, device)
+    def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
+        super().__init__(aperture, xp, device, slack_m)
         self._ramps = self.ramps(row_starts_m(aperture.offsets_m))
+        self._echo: Any = None  # the last constant echo, and its kernel
         sizes, rows, lines = self.lattice, aperture.offsets_m.shape[0], aperture.grid.shape[0]
         self._last = sizes.row_stride * (rows - 1)  # where the first row of pixels comes out
         self._repeat = self.put(np.arange(sizes.size_y) % (sizes.size_y // sizes.row_stride))
@@ -104,16 +105,35 @@ class SpectralImager(RowSpectra):
         channels = self.xp.reshape(samples, (rx * m, rows, columns))
         total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
         for c in range(rx * m):
-            total += self._kernels[c, :, :] * self._spectrum(channels[c, :, :])
+            total += self._kernels[c, :, :] * self._along_y(self.of_rows(channels[c, :, :], self._ramps))
+        return self._inverse(total)
+
+    def spectra_of_row(self, samples: Any, index: int) -> Any:
+        """A row [..., column] ready for :meth:`image_of_spectra`: its spectra [..., k]."""
+        return self.of_rows(samples, self._ramps[index, :])
+
+    def image_of_spectra(self, spectra: Any, factors: Any) -> Any:
+        """:meth:`image` of rows that are transformed along x already [rx, frequency, row, k], with a factor an RX."""
+        rx, m = self.aperture.shape[:2]
+        total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+        for r in range(rx):
+            part = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+            for c in range(m):
+                part += self._kernels[r * m + c, :, :] * self._along_y(spectra[r, c, :, :])
+            total += part * factors[r]
         return self._inverse(total)
 
     def constant(self, echo: Any, weights: Any) -> Any:
         """Image of an echo [rx, frequency] that is the same at every position, times weights [row, column]."""
-        channels = self.xp.reshape(echo, (-1,))
-        total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
-        for c in range(channels.shape[0]):
-            total += self._kernels[c, :, :] * channels[c]
-        return self._inverse(total * self._spectrum(self.xp.astype(weights, self.xp.complex64)))
+        xp, echo = self.xp, self.xp.asarray(echo, dtype=self.xp.complex64)
+        if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
+            channels = xp.reshape(echo, (-1,))
+            total = xp.zeros(self._kernels.shape[1:], dtype=xp.complex64, device=self.device)
+            for c in range(channels.shape[0]):
+                total += self._kernels[c, :, :] * channels[c]
+            self._echo = (echo, total)
+        white = self._along_y(self.of_rows(xp.astype(weights, xp.complex64), self._ramps))
+        return self._inverse(self._echo[1] * white)
 
     def samples(self, image: Any) -> Any:
         """Forward model, the adjoint of :meth:`image`: what pixels [ny, nx] answer, [rx, frequency, row, column]."""
@@ -129,10 +149,10 @@ class SpectralImager(RowSpectra):
             out.append(self.to_rows(xp.take(product, self._rows, axis=0), self._ramps))
         return xp.reshape(xp.stack(out), self.aperture.shape)
 
-    def _spectrum(self, rows: Any) -> Any:
-        """2-D spectrum of one channel [row, column] on the lattice, [ky, k]; a row distance of s repeats s times."""
+    def _along_y(self, lines: Any) -> Any:
+        """2-D spectrum on the lattice [ky, k], of the rows' spectra [row, k]; a row distance of s repeats s times."""
         count = self._repeat.shape[0] // self.lattice.row_stride
-        whole = self._fft.fft(self.of_rows(rows, self._ramps), n=count, axis=0)
+        whole = self._fft.fft(lines, n=count, axis=0)
         return whole if self.lattice.row_stride == 1 else self.xp.take(whole, self._repeat, axis=0)
 
     def _inverse(self, total: Any) -> Any:

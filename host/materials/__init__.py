@@ -1,8 +1,9 @@
 """Materials: patches, permittivity, the reference library and the classifier."""
 
 from host.materials.analyse import MaterialsResult, PatchResult, analyse, image_centre_mm, pixel_accuracy
-from host.materials.classify import UNKNOWN, Classifier, Verdict, Weights
-from host.materials.fit import Fit, fit_library, fit_weights
+from host.materials.classify import UNKNOWN, Classifier, NamedPatch, Verdict
+from host.materials.fit import fit_library
+from host.materials.knn import Fit, Weights, fit_weights
 from host.materials.labels import patches_from_labels, read_labels, write_labels
 from host.materials.library import Entry, Library
 from host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
@@ -20,6 +21,7 @@ __all__ = [
     "Library",
     "MaterialsResult",
     "MetalReference",
+    "NamedPatch",
     "Patch",
     "PatchResult",
     "Permittivity",

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.classify import Classifier, Verdict, vote
+from host.materials.classify import Classifier, Verdict, features_of
 from host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
 from host.materials.permittivity import Permittivity, estimate_permittivity, inverse_spread
-from host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment
+from host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
 from host.materials.truth import TruthPlate, match
-from host.polarimetry import Calibrated, calibrate, correct_leakage, ratio, smooth
+from host.polarimetry import Calibrated, PlaneReference, calibrate, correct_leakage, ratio, smooth
 
 Image = npt.NDArray[np.complexfloating]
+FILLED = 0.1
+"""|H| relative to metal over an image without edges from which on one material fills it, rather than none."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class MaterialsResult:
         What each patch is.
     theta_rad
         Incidence angle, a number or [ny, nx].
+    bands
+        Patch number to its ratios in sub-bands of the sweep (:mod:`host.materials.subbands`); empty when not asked for.
     """
 
     calibrated: Calibrated
@@ -60,10 +64,25 @@ class MaterialsResult:
     segmentation: Segmentation
     patches: tuple[PatchResult, ...]
     theta_rad: npt.NDArray[np.float64]
+    bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
 
     def rows(self) -> list[dict[str, Any]]:
         """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""
-        return [_row(r, self.metal, float(np.degrees(np.mean(self.theta_rad)))) for r in self.patches]
+        return [self._row(r) for r in self.patches]
+
+    def incidence_deg(self, patch: Patch) -> float:
+        """Mean incidence angle over a patch's interior, degrees."""
+        inside = self.theta_rad[patch.interior] if self.theta_rad.ndim and patch.interior.any() else self.theta_rad
+        return float(np.degrees(np.mean(inside)))
+
+    def _row(self, r: PatchResult) -> dict[str, Any]:
+        row = _row(r, self.metal, self.incidence_deg(r.patch))
+        level = np.abs(self.h[r.patch.interior])
+        level = level[np.isfinite(level)]
+        row["amplitude_h"] = round(float(np.median(level)), 6) if level.size else None
+        if r.patch.label in self.bands:
+            row["bands"] = self.bands[r.patch.label]
+        return row
 
 
 def analyse(
@@ -82,6 +101,7 @@ def analyse(
     plates: Sequence[TruthPlate] = (),
     settings: SegmentSettings | None = None,
     segmentation: Segmentation | None = None,
+    reference: PlaneReference | None = None,
 ) -> MaterialsResult:
     """Find the patches of an image pair and say what they are.
 
@@ -107,48 +127,77 @@ def analyse(
         The truth, where known: only carried along to the results, never used for them.
     settings, segmentation
         How to segment; or patches that are already known (boxes drawn by hand).
+    reference
+        Metal scanned on its own, instead of a metal region in this scene; where it is not valid nothing is looked at.
 
     Raises
     ------
     DataError
         when there is no metal reference, or the image is empty.
     """
-    found = segmentation if segmentation is not None else segment(h, v, x_m, y_m, valid, settings)
-    if metal_box_mm is not None:
+    if reference is not None:
+        reference.check_axes(x_m, y_m)
+        valid = reference.valid if valid is None else valid & reference.valid
+        segmentation = None if segmentation is None else _within(segmentation, reference.valid)
+        even = reference.apply(h, v)
+        found = segmentation or segment(even.h, even.v, x_m, y_m, valid, settings)
+        if not found.patches and float(np.median(np.abs(even.h[valid]))) > FILLED:
+            found = whole_plane(valid, x_m, y_m, (settings or SegmentSettings()).margin_mm)
+    else:
+        found = segmentation or segment(h, v, x_m, y_m, valid, settings)
+    if reference is not None:
+        metal = MetalReference(reference.valid, None, reference.how)
+    elif metal_box_mm is not None:
         metal = metal_in_box(metal_box_mm, found, x_m, y_m, valid)
     elif metal_label is not None:
         metal = metal_by_label(metal_label, found)
     else:
-        metal = find_metal(h, v, found)
-    raw = calibrate(h, v, metal.mask)
-    ch, cv = correct_leakage(raw.h, raw.v, *leakage)
-    calibrated = Calibrated(ch, cv, ratio(ch, cv), raw.metal_h, raw.metal_v)
-    sh, sv = _smooth_inside(ch, found, smooth_px), _smooth_inside(cv, found, smooth_px)
+        metal = find_metal(h, v, found, float(np.mean(np.asarray(theta_rad))), leakage)
+    calibrated = to_metal(h, v, metal, leakage, reference)
+    sh, sv = (smooth_inside(c, found, smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
     theta = np.asarray(theta_rad, np.float64)
     truth = match(found.patches, plates)
-    reference_std = inverse_spread(sh[metal.mask], sv[metal.mask])
-    reference_std = reference_std if np.isfinite(reference_std) else 0.0
+    reference_std = reference_error(sh, sv, metal, reference)
+    inside = [patch.interior for patch in found.patches]
+    named = classifier.scan([features_of(sh[at], sv[at], sp[at]) for at in inside]) if classifier else None
     results = []
-    for patch in found.patches:
+    for i, patch in enumerate(found.patches):
         at = patch.interior
         angle = theta[at] if theta.ndim else theta
-        names = distance = None
-        if classifier is not None:
-            names, distance = classifier.pixels(np.abs(sh[at]), np.abs(sv[at]), sp[at])
         results.append(
             PatchResult(
                 patch,
                 estimate_permittivity(sh[at], sv[at], angle, reference_std),
-                None if names is None or distance is None else vote(names, distance),
-                names,
+                named[i].verdict if named else None,
+                named[i].names if named else None,
                 truth.get(patch.label),
             )
         )
     return MaterialsResult(calibrated, sh, sv, sp, metal, found, tuple(results), theta)
 
 
-def _smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
+def to_metal(
+    h: Image, v: Image, metal: MetalReference, leakage: tuple[complex, complex], reference: PlaneReference | None
+) -> Calibrated:
+    """Both channels relative to metal, in the scene or scanned on its own, with leakage removed."""
+    raw = calibrate(h, v, metal.mask) if reference is None else reference.apply(h, v)
+    ch, cv = correct_leakage(raw.h, raw.v, *leakage)
+    return Calibrated(ch, cv, ratio(ch, cv), raw.metal_h, raw.metal_v)
+
+
+def reference_error(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
+    """Relative standard error of the metal reference: how far its own pixels lie from it."""
+    spread = inverse_spread(h[metal.mask], v[metal.mask]) if reference is None else reference.spread
+    return spread if np.isfinite(spread) else 0.0
+
+
+def _within(found: Segmentation, valid: npt.NDArray[np.bool_]) -> Segmentation:
+    """The same patches, their interiors cut to the pixels that are valid."""
+    return replace(found, patches=tuple(replace(p, interior=p.interior & valid) for p in found.patches))
+
+
+def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
     """Gaussian filter over the patches' interiors only; not a number elsewhere."""
     inside = np.zeros(image.shape, bool)
     for patch in found.patches:

@@ -150,4 +150,6 @@ def _pixels(values: Any) -> npt.NDArray[np.complex128]:
 
 
 def _number(value: Any) -> float | None:
+    if isinstance(value, str):  # "3 mm"
+        value = value.lower().removesuffix("mm").strip()
     return None if value is None or value == "" else float(value)

@@ -1,60 +1,21 @@
-"""Weighted k-nearest-neighbour classification on |H|, |V| and complex P (section 6.3 of the paper).
-
-The distance of two pixels is lambda_H |d|H|| + lambda_V |d|V|| + lambda_P d_P. The paper uses |dP| for d_P. Two other
-measures of the same quantity are offered, because errors of a ratio are not additive:
-
-* `inverse`: |d(1/P)|. 1/P = V/H stays below 1 for every dielectric, while P grows without bound near the Brewster angle
-  and there its noise swamps the distance.
-* `log`: |d ln P| = sqrt((d ln|P|)^2 + (d arg P)^2). A gain error of a few percent is the same distance for every
-  material; materials of nearly the same permittivity differ by 4 to 10 % in P.
-
-Which measure and which weights are used is decided by cross-validation on the library, whole scans left out.
-"""
+"""Naming the pixels and patches of a scan by a reference library."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from host.materials.knn import PaperKnn, Weights
 from host.materials.library import Library
+from host.materials.models import MODELS, PAPER, SHORT
+from host.materials.samples import Real, Samples, feature_matrix, usable
 from shared.errors import DataError
 
-Measure = Literal["paper", "inverse", "log"]
-MEASURES: tuple[Measure, ...] = get_args(Measure)
 UNKNOWN = "unknown"
-Real = npt.NDArray[np.float64]
-Features = tuple[Real, Real, npt.NDArray[np.complex128]]
-_CHUNK = 512
-
-
-@dataclass(frozen=True)
-class Weights:
-    """lambda_H, lambda_V, lambda_P, how P is compared, and the number of neighbours."""
-
-    h: float = 1.0
-    v: float = 1.0
-    p: float = 1.0
-    measure: Measure = "log"
-    neighbours: int = 15
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the library file."""
-        return {"h": self.h, "v": self.v, "p": self.p, "measure": self.measure, "neighbours": self.neighbours}
-
-    @staticmethod
-    def from_dict(raw: dict[str, Any]) -> Weights:
-        """Inverse of :meth:`to_dict`. Raises DataError."""
-        try:
-            w = Weights(float(raw["h"]), float(raw["v"]), float(raw["p"]), raw["measure"], int(raw["neighbours"]))
-        except (KeyError, TypeError, ValueError) as e:
-            raise DataError(f"the library's weights cannot be read: {e}", "made by another version") from None
-        if w.measure not in MEASURES or min(w.h, w.v, w.p) < 0 or w.neighbours < 1:
-            raise DataError(f"the library's weights make no sense: {raw}", "made by another version")
-        return w
 
 
 @dataclass(frozen=True)
@@ -64,15 +25,15 @@ class Verdict:
     Attributes
     ----------
     name
-        Material with most votes, or "unknown".
+        Material, or "unknown".
     confidence
-        Its share of the votes.
+        How sure: the probability of that name, or for the KNN the share of its pixels.
     votes
-        Share of each material that got any, largest first.
+        Share of the pixels called so on their own, of each name that got any, largest first.
     distance
-        Median distance of the pixels to their neighbours, in units of the material's own threshold: above 1 is unknown.
+        Distance to the material, in units of its threshold: above 1 is unknown.
     pixels
-        Pixels that voted.
+        Usable pixels.
     """
 
     name: str
@@ -82,40 +43,13 @@ class Verdict:
     pixels: int
 
 
-def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128], measure: Measure) -> Real:
-    """Distance of ratios P, broadcast; see the module's text for the measures."""
-    if measure == "paper":
-        return np.abs(a - b)
-    if measure == "inverse":
-        return np.abs(1 / a - 1 / b)
-    quotient = a / b
-    return np.hypot(np.log(np.abs(quotient)), np.angle(quotient))
+@dataclass(frozen=True)
+class NamedPatch:
+    """Names of a patch's pixels [n], their distances over the threshold [n], and the patch's verdict."""
 
-
-def channel_distances(a: Features, b: Features, measure: Measure) -> tuple[Real, Real, Real]:
-    """The three distances of every pixel of `a` to every pixel of `b`, float64 [na, nb] each."""
-    return (
-        np.abs(a[0][:, None] - b[0][None, :]),
-        np.abs(a[1][:, None] - b[1][None, :]),
-        ratio_distance(a[2][:, None], b[2][None, :], measure),
-    )
-
-
-def usable(features: Features) -> npt.NDArray[np.bool_]:
-    """Pixels whose features are all finite and whose ratio is not zero, bool [n]."""
-    h, v, p = features
-    return np.isfinite(h) & np.isfinite(v) & np.isfinite(p) & (p != 0)
-
-
-def neighbours_vote(distance: Real, names: npt.NDArray, k: int) -> tuple[npt.NDArray, Real]:
-    """Distance-weighted vote of the k nearest, and their mean distance, from a distance matrix [queries, library]."""
-    k = min(k, names.size)
-    from sklearn.neighbors import KNeighborsClassifier  # here: it loads for a second, which most commands need not wait
-
-    knn = KNeighborsClassifier(n_neighbors=k, weights="distance", metric="precomputed")
-    knn.fit(np.zeros((names.size, names.size)), names)
-    near = np.partition(distance, k - 1, axis=1)[:, :k].mean(axis=1)
-    return np.asarray(knn.predict(distance)), near
+    names: npt.NDArray[np.str_]
+    distance: Real
+    verdict: Verdict
 
 
 class Classifier:
@@ -124,38 +58,82 @@ class Classifier:
     Parameters
     ----------
     library
-        Reference patches; its `fit` gives the weights when they are not passed.
+        Reference patches; what was fitted on them says which model names.
     weights
-        Overrides the library's own.
+        Of the paper's KNN, which they select; instead of the library's own.
+    model
+        A key of `MODELS` or `SHORT`, instead of the model chosen for the library.
+    angles_deg
+        Incidence angle of the scan, or of several scans of the same patches in their order; needed where the library
+        holds more than one.
 
     Raises
     ------
     DataError
-        when the library is empty or its weights cannot be read.
+        when the library is empty, holds no patch at an angle, or its fit cannot be read.
     """
 
-    def __init__(self, library: Library, weights: Weights | None = None) -> None:
+    def __init__(
+        self,
+        library: Library,
+        weights: Weights | None = None,
+        model: str | None = None,
+        angles_deg: Sequence[float] | None = None,
+    ) -> None:
         if not library.entries:
             raise DataError("the material library is empty", "nothing was trained", "polysight train")
-        if weights is None:
-            weights = Weights.from_dict(library.fit["weights"]) if "weights" in library.fit else Weights()
-        self.library, self.weights = library, weights
-        features = library.pixels()
-        keep = usable(features)
-        self._features: Features = (features[0][keep], features[1][keep], features[2][keep])
-        self._names = library.of_pixels("name")[keep]
-        thresholds = library.fit.get("thresholds", {})
-        self.thresholds = {n: float(thresholds.get(n, np.inf)) for n in library.names}
+        if angles_deg is None and len(library.angles_deg) > 1:
+            raise DataError(
+                f"the library holds incidence angles {', '.join(f'{a:g}' for a in library.angles_deg)} degrees",
+                "reflections under different angles are not compared",
+                "say which angle the scan has",
+            )
+        parts = [library.at(a) for a in angles_deg or library.angles_deg]
+        fit = parts[0].fit if len(parts) == 1 else library.fit_of([p.angles_deg[0] for p in parts])
+        self.library, self.fit, self.angles_deg = library, fit, tuple(p.angles_deg[0] for p in parts)
+        self.model = PAPER if weights else _model_name(model or fit.get("model", PAPER))
+        if self.model == PAPER:
+            if weights is None:
+                weights = Weights.from_dict(fit["weights"]) if "weights" in fit else Weights()
+            self._model = PaperKnn(weights=weights, thresholds=fit.get("thresholds"))
+        else:
+            self._model = MODELS[self.model]("H+V+P")
+        samples = Samples.of(parts[0])
+        for part in parts[1:]:
+            samples = samples.joined(Samples.of(part))
+        self._model.fit(samples)
+        self._width = max(len(UNKNOWN), *(len(n) for n in library.names))
 
-    def distances(self, query: Features) -> Real:
-        """Weighted distances of query pixels to the library's pixels, float64 [n, library pixels]."""
-        h, v, p = channel_distances(query, self._features, self.weights.measure)
-        return self.weights.h * h + self.weights.v * v + self.weights.p * p
+    def scan(self, patches: Sequence[Real]) -> list[NamedPatch]:
+        """Name the patches of one scan, or of several scans of the same patches, together.
+
+        Parameters
+        ----------
+        patches
+            Features of each patch's pixels, [n, 4 * angles] (:func:`host.materials.samples.feature_matrix`); pixels
+            that are not finite are unknown.
+        """
+        good = [usable(x) for x in patches]
+        number = np.concatenate([np.full(int(g.sum()), i) for i, g in enumerate(good)] or [np.zeros(0, int)])
+        if number.size == 0:
+            return [self._named(g, None, None, UNKNOWN, 0.0, np.inf) for g in good]
+        found = self._model.by_scan(np.concatenate([x[g] for x, g in zip(patches, good, strict=True)]), number)
+        out = []
+        for i, g in enumerate(good):
+            row = int(np.searchsorted(found.patches, i))
+            if not g.any():
+                out.append(self._named(g, None, None, UNKNOWN, 0.0, np.inf))
+                continue
+            at, far = number == i, float(found.distance[row])
+            name = str(found.names[row]) if far <= 1 else UNKNOWN
+            confidence = float(found.confidence[row])
+            out.append(self._named(g, found.pixel_names[at], found.pixel_distance[at], name, confidence, far))
+        return out
 
     def pixels(
         self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike
     ) -> tuple[npt.NDArray[np.str_], npt.NDArray[np.float64]]:
-        """Name pixels.
+        """Name pixels, each by nothing but itself; for libraries of one angle.
 
         Parameters
         ----------
@@ -167,39 +145,46 @@ class Classifier:
         Returns
         -------
         names
-            str [n]; "unknown" where the nearest neighbours are farther than the material's threshold, or where the
-            pixel is not finite.
+            str [n]; "unknown" beyond the threshold, or where the pixel is not finite.
         distance
-            float64 [n], mean distance of the neighbours over the threshold of the material they vote for; infinite
-            where not finite.
+            float64 [n], distance over the threshold; infinite where not finite.
         """
-        query: Features = (
-            np.abs(np.asarray(h)).astype(np.float64).ravel(),
-            np.abs(np.asarray(v)).astype(np.float64).ravel(),
-            np.asarray(p, np.complex128).ravel(),
-        )
-        good = np.flatnonzero(usable(query))
-        width = max(len(UNKNOWN), *(len(n) for n in self.library.names))
-        names = np.full(query[0].size, UNKNOWN, f"<U{width}")
-        relative = np.full(query[0].size, np.inf)
-        for start in range(0, good.size, _CHUNK):
-            at = good[start : start + _CHUNK]
-            d = self.distances((query[0][at], query[1][at], query[2][at]))
-            found, near = neighbours_vote(d, self._names, self.weights.neighbours)
-            scaled = near / np.array([self.thresholds[str(n)] for n in found])
-            names[at] = np.where(scaled <= 1, found, UNKNOWN)
-            relative[at] = scaled
-        return names, relative
+        x = features_of(h, v, p)
+        good = usable(x)
+        if not good.any():
+            found = self._named(good, None, None, UNKNOWN, 0.0, np.inf)
+        else:
+            found = self._named(good, *self._model.by_pixel(x[good]), UNKNOWN, 0.0, np.inf)
+        return found.names, found.distance
 
     def patch(self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Verdict:
-        """Name one patch by the majority of its pixels; features as :meth:`pixels`."""
-        return vote(*self.pixels(h, v, p))
+        """Name one patch on its own; features as :meth:`pixels`."""
+        return self.scan([features_of(h, v, p)])[0].verdict
+
+    def _named(
+        self, good: npt.NDArray[np.bool_], names: Any, distance: Any, name: str, confidence: float, far: float
+    ) -> NamedPatch:
+        every = np.full(good.size, UNKNOWN, f"<U{self._width}")
+        relative = np.full(good.size, np.inf)
+        if names is not None:
+            every[good], relative[good] = np.where(distance <= 1, names, UNKNOWN), distance
+        kinds, count = np.unique(every, return_counts=True)
+        order = sorted(zip(kinds, count, strict=True), key=lambda i: (-i[1], i[0]))
+        votes = {str(k): c / every.size for k, c in order}
+        return NamedPatch(every, relative, Verdict(name, confidence, votes, far, int(good.sum())))
 
 
-def vote(names: npt.NDArray[np.str_], distance: Real) -> Verdict:
-    """Majority of pixel names; "unknown" counts as a name. An empty patch is unknown with confidence 0."""
-    if names.size == 0:
-        return Verdict(UNKNOWN, 0.0, {}, float("inf"), 0)
-    shares = {str(n): c / names.size for n, c in sorted(Counter(names.tolist()).items(), key=lambda i: (-i[1], i[0]))}
-    best = next(iter(shares))
-    return Verdict(best, shares[best], shares, float(np.median(distance)), int(names.size))
+def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
+    """Features [n, 4] of pixels, not finite where one of them cannot be used."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
+
+
+def _model_name(given: str) -> str:
+    name = SHORT.get(given, given)
+    if name not in MODELS:
+        raise DataError(
+            f"no classifier is called {given!r}", "the library was made by another version, or the name is wrong",
+            f"one of {', '.join(SHORT)}",
+        )  # fmt: skip
+    return name

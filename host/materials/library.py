@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from shared.errors import DataError
 
 FORMAT = "polysight-library-1"
+SAME_ANGLE_DEG = 1.0
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Library:
-    """Entries, and what was fitted on them (weights of the classifier; empty when nothing was)."""
+    """Entries, and what was fitted on them (`host.materials.fit`; empty when nothing was)."""
 
     entries: tuple[Entry, ...]
     fit: dict[str, Any] = field(default_factory=dict)
@@ -79,6 +80,40 @@ class Library:
     def scans(self) -> tuple[str, ...]:
         """Scans, sorted."""
         return tuple(sorted({e.scan for e in self.entries}))
+
+    @property
+    def angles_deg(self) -> tuple[float, ...]:
+        """Incidence angles, rounded to a tenth of a degree; entries within `SAME_ANGLE_DEG` count as one angle."""
+        out: list[list[float]] = []
+        for angle in sorted(e.incidence_deg for e in self.entries):
+            if out and angle - out[-1][0] <= SAME_ANGLE_DEG:
+                out[-1].append(angle)
+            else:
+                out.append([angle])
+        return tuple(round(sum(a) / len(a), 1) for a in out)
+
+    def at(self, angle_deg: float) -> Library:
+        """The entries seen under an angle, with what was fitted on them.
+
+        Raises DataError when there are none: |P| changes by a tenth in a degree, other angles do not help.
+        """
+        near = [a for a in self.angles_deg if abs(a - angle_deg) <= SAME_ANGLE_DEG]
+        if not near:
+            raise DataError(
+                f"the library holds no patch at {angle_deg:.1f} degrees of incidence",
+                f"its patches were seen under {', '.join(f'{a:g}' for a in self.angles_deg)} degrees",
+                "train a library at this angle, or process without naming: --model none",
+            )
+        angle = min(near, key=lambda a: abs(a - angle_deg))
+        mine = tuple(e for e in self.entries if abs(e.incidence_deg - angle) <= SAME_ANGLE_DEG)
+        return Library(mine, self.fit_of([angle]), self.note)
+
+    def fit_of(self, angles_deg: Sequence[float]) -> dict[str, Any]:
+        """What was fitted for an angle, or for several together; empty when nothing was."""
+        angles = self.fit.get("angles")
+        if angles is None:
+            return self.fit if len(angles_deg) == 1 else {}
+        return dict(angles.get("+".join(f"{a:g}" for a in sorted(angles_deg)), {}))
 
     @property
     def simulated(self) -> bool:

@@ -1,8 +1,10 @@
 """Patches in the image, without being told their number.
 
-Plates parallel to the stage are mirrors: bright where they are, dark where nothing is. Their levels differ by more than
-10 dB (wood against metal), so one threshold on the amplitude finds them but not their edges: each region found is cut
-again at half of its own amplitude, which is where the edge of a band-limited step lies.
+Plates parallel to the stage are mirrors: bright where they are, dark where nothing is. Speckle is additive noise in dB,
+and plates are flat there with steps between: total variation takes the one and leaves the other. Their levels differ by
+more than 10 dB (wood against metal), so one threshold finds the bright ones and another, on what is left, the dim ones.
+No threshold finds the edges: each region is cut again at half of its own amplitude, where the edge of a band-limited
+step lies.
 """
 
 from __future__ import annotations
@@ -12,12 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
-from skimage import filters, measure, morphology
+from skimage import filters, measure, morphology, restoration
 
 from shared.errors import DataError
 
 Mask = npt.NDArray[np.bool_]
 Box = tuple[float, float, float, float]
+_LEAST_WEIGHT = 0.1  # dB
+_TURNS = 3  # thresholds: metal, dielectrics, the dimmest
 
 
 @dataclass(frozen=True)
@@ -31,18 +35,25 @@ class SegmentSettings:
     margin_mm
         How far inside the outline the statistics start: about twice the resolution, beyond the edge's ringing.
     smooth_px
-        Gaussian on the power before thresholding.
+        Gaussian on the power, before it is taken in dB.
+    speckle_db
+        Largest weight of the total variation (Chambolle). It is as large as the speckle on the plates themselves: more
+        would fill the narrow gaps between plates.
     floor_db
         Levels below this, relative to the brightest, count as equally dark.
+    dimmest_db
+        What is left beside the bright patches and lies below this, relative to the brightest, are their sidelobes.
     least_contrast_db
-        Bright and dark must differ by this much, or the image holds no patches.
+        Bright and dark must differ by this much, or there are no (more) patches.
     """
 
     smallest_mm: float = 14.0
     margin_mm: float = 9.0
     smooth_px: float = 1.0
+    speckle_db: float = 3.0
     floor_db: float = -32.0
-    least_contrast_db: float = 7.0
+    dimmest_db: float = -24.0
+    least_contrast_db: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -127,19 +138,18 @@ def make_patch(
 
 
 def level_db(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating], usable: Mask, smooth_px: float):
-    """Smoothed amplitude of both channels together in dB below the brightest, float64 [ny, nx].
+    """Smoothed level of the channel that shows more, in dB below that channel's brightest, float64 [ny, nx].
 
-    Each channel is first scaled by its own brightest part, so that an unknown gain between H and V has no influence.
+    Each channel is scaled by its own brightest part, so that an unknown gain between H and V has no influence. The
+    larger of them, not their sum: where V nearly vanishes it brings nothing but its noise.
     """
     power = np.zeros(h.shape)
     for channel in (h, v):
-        p = np.where(usable, np.abs(channel).astype(np.float64) ** 2, 0.0)
+        p = ndimage.gaussian_filter(np.where(usable, np.abs(channel).astype(np.float64) ** 2, 0.0), smooth_px)
         top = float(np.percentile(p[usable], 99.5))
         if top > 0:
-            power += p / top
-    power = ndimage.gaussian_filter(power, smooth_px)
-    top = float(np.percentile(power[usable], 99.5))
-    return 10 * np.log10(np.maximum(power / top, 1e-12)) if top > 0 else np.full(h.shape, -120.0)
+            power = np.maximum(power, p / top)
+    return 10 * np.log10(np.maximum(power, 1e-12))
 
 
 def segment(
@@ -152,9 +162,10 @@ def segment(
 ) -> Segmentation:
     """Find the patches of an image pair.
 
-    Otsu's threshold on the level in dB, morphological opening, connected components (scikit-image), each cut again at
-    half of its own amplitude; what is left of a component after that is looked at again, so that a dim plate that hangs
-    on a bright one's skirt is found too.
+    Total variation against speckle, Otsu's threshold on the level in dB, morphological opening, connected components
+    (scikit-image), each cut again at half of its own amplitude; what is left of a component after that is looked at
+    again, so that a dim plate that hangs on a bright one's skirt is found too. Then the same on what lies away from the
+    patches found, until bright and dark cannot be told apart.
 
     Parameters
     ----------
@@ -185,17 +196,10 @@ def segment(
         usable &= valid
     if not usable.any():
         raise DataError("the image has no valid pixel", "nothing was recorded there, or all of it was masked")
-    level = np.maximum(level_db(h, v, usable, cfg.smooth_px), cfg.floor_db)
-    labels = np.zeros(h.shape, np.int32)
-    inside = level[usable]
-    threshold = float(filters.threshold_otsu(inside)) if np.ptp(inside) > 0 else 0.0
-    bright = inside > threshold
-    if not bright.any() or bright.all() or not _separate(inside, bright, cfg.least_contrast_db):
-        return Segmentation(labels, (), threshold)
-
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
-    radius = max(1, round((cfg.smallest_mm / pixel_mm - 1) / 2))
-    masks = _cut(10 ** (level / 20), (level > threshold) & usable, radius)
+    level = np.maximum(level_db(h, v, usable, cfg.smooth_px), cfg.floor_db)
+    masks, threshold = _regions(_without_speckle(level, usable, cfg, pixel_mm), usable, cfg, pixel_mm)
+    labels = np.zeros(h.shape, np.int32)
     y = axis_mm(y_m)
     row_pitch = max(2 * cfg.smallest_mm, 1.0)
 
@@ -210,14 +214,72 @@ def segment(
     return Segmentation(labels, tuple(patches), threshold)
 
 
-def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: float) -> bool:
-    """Whether two classes are there: their distance, and the share of variance between them.
+def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float) -> Segmentation:
+    """All usable pixels as one patch: a material that fills the image, so that nothing dark is left to tell it from."""
+    patch = make_patch(1, usable, x_m, y_m, margin_mm, usable)
+    return Segmentation(usable.astype(np.int32), (patch,), float("-inf"))
 
-    Otsu also splits a single normal distribution, with 2/pi = 0.64 of the variance between the halves.
+
+def _without_speckle(
+    level: npt.NDArray[np.float64], usable: Mask, cfg: SegmentSettings, pixel_mm: float
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The level in dB after total variation: with the weight that the bright plates' speckle asks; with a middle one.
+
+    The second is for the dim plates that are left: they have more speckle than bright ones, and no bright neighbour.
+    """
+
+    def even(weight: float) -> npt.NDArray[np.float64]:
+        return np.asarray(restoration.denoise_tv_chambolle(level, weight=weight, max_num_iter=100))
+
+    strongest = even(cfg.speckle_db)
+    inside = strongest[usable]
+    if np.ptp(inside) == 0:
+        return strongest, strongest
+    bright = (strongest > filters.threshold_otsu(inside)) & usable
+    middle = np.asarray(ndimage.distance_transform_edt(bright)) > cfg.margin_mm / pixel_mm
+    if not middle.any():
+        return strongest, strongest
+    difference = (level - strongest)[middle]
+    speckle = 1.4826 * float(np.median(np.abs(difference - np.median(difference))))
+    return even(min(cfg.speckle_db, max(speckle, _LEAST_WEIGHT))), even(cfg.speckle_db / 2)
+
+
+def _regions(
+    levels: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]], usable: Mask, cfg: SegmentSettings, pixel_mm: float
+) -> tuple[list[Mask], float]:
+    """Masks of all patches, bright ones first, and the first threshold in dB."""
+    radius = max(1, round((cfg.smallest_mm / pixel_mm - 1) / 2))
+    around = np.asarray(morphology.disk(max(1, round(cfg.margin_mm / pixel_mm))), bool)
+    found: list[Mask] = []
+    rest, first = usable.copy(), 0.0
+    for turn in range(_TURNS):
+        level = levels[0] if turn == 0 else np.maximum(levels[1], cfg.dimmest_db)
+        inside = level[rest]
+        if inside.size == 0 or np.ptp(inside) == 0:
+            break
+        threshold = float(filters.threshold_otsu(inside))
+        first = threshold if turn == 0 else first
+        bright = inside > threshold
+        if not bright.any() or bright.all() or not _separate(inside, bright, cfg.least_contrast_db):
+            break
+        new = _cut(10 ** (level / 20), (level > threshold) & rest, radius)
+        if not new:
+            break
+        found += new
+        rest &= ~np.asarray(ndimage.binary_dilation(np.logical_or.reduce(new), around), bool)
+    return found, first
+
+
+def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: float) -> bool:
+    """Whether two classes are there: their distance, and that it is not one class cut in two.
+
+    Otsu also splits a single normal distribution, with 2/pi = 0.64 of the variance between the halves. One small patch
+    has little of the variance, but stands far above the spread of the dark.
     """
     w = float(bright.mean())
     gap = float(level[bright].mean() - level[~bright].mean())
-    return gap >= least_contrast_db and w * (1 - w) * gap**2 >= 0.70 * float(level.var())
+    two = w * (1 - w) * gap**2 >= 0.70 * float(level.var()) or gap >= 4 * float(level[~bright].std())
+    return gap >= least_contrast_db and two
 
 
 def _cut(amplitude: npt.NDArray[np.float64], mask: Mask, radius: int) -> list[Mask]:

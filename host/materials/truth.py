@@ -19,7 +19,7 @@ from shared.errors import DataError
 class TruthPlate:
     """A rectangular plate.
 
-    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal and for stacks of layers.
+    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers.
     """
 
     name: str
@@ -64,7 +64,7 @@ def _plate(raw: Mapping[str, Any]) -> TruthPlate:
     w, h = (float(s) for s in raw["size_mm"])
     eps = None
     metal = bool(raw.get("metal", False))
-    if not metal and not raw.get("layers"):
+    if not metal and not raw.get("layers") and raw.get("strips_deg") is None:
         re, loss = raw["permittivity"]
         eps = complex(float(re), -float(loss))
     thickness = raw.get("thickness_mm")

@@ -17,23 +17,52 @@ from host.polarimetry.fresnel import (
     permittivity_from_ratio,
     ratio_from_permittivity,
 )
-from host.polarimetry.incidence import effective_incidence_map, incidence_map, specular_incidence_rad
+from host.polarimetry.incidence import (
+    Incidence,
+    IncidenceChoice,
+    effective_incidence_map,
+    incidence_choice,
+    incidence_map,
+    specular_incidence_rad,
+)
+from host.polarimetry.leakage import (
+    Leakage,
+    Standard,
+    common_direction,
+    estimate_axial_ratio,
+    estimate_leakage,
+    leakage_from_images,
+    strips_wave,
+)
+from host.polarimetry.reference import PlaneReference, plane_reference
 
 __all__ = [
     "Calibrated",
+    "Incidence",
+    "IncidenceChoice",
+    "Leakage",
+    "PlaneReference",
+    "Standard",
     "axial_ratio_from_known",
     "brewster_angle_rad",
     "calibrate",
     "calibrate_by_reference",
+    "common_direction",
     "correct_leakage",
     "effective_incidence_map",
+    "estimate_axial_ratio",
+    "estimate_leakage",
     "fresnel",
+    "incidence_choice",
     "incidence_map",
+    "leakage_from_images",
     "multilayer",
     "multilook_ratio",
     "permittivity_from_ratio",
+    "plane_reference",
     "ratio",
     "ratio_from_permittivity",
     "smooth",
     "specular_incidence_rad",
+    "strips_wave",
 ]

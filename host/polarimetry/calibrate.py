@@ -12,6 +12,7 @@ orientation cannot tell leakage from gain**. Leakage therefore is given, or foun
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -149,7 +150,7 @@ def axial_ratio_from_known(measured_p: complex, true_p: complex) -> complex:
     return (measured_p - true_p) / (1 - measured_p * true_p)
 
 
-def smooth(image: Image, sigma_px: float) -> Image:
+def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
     """2-D Gaussian filter of a complex or real image [ny, nx] against speckle (section 9.1 of the paper).
 
     Pixels that are not finite do not spread: the filter is normalised by the weight of the finite ones, and they stay

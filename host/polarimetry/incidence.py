@@ -11,6 +11,9 @@ different angles; near the border of the scanned aperture only part of that zone
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any, Literal
+
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, signal
@@ -20,6 +23,8 @@ from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
+Incidence = Literal["one", "pixel"]
+"""One angle for the image (the specular one), or each pixel's own (:func:`effective_incidence_map`)."""
 
 
 def _half_bistatic(rig: Instrument, board_index: int, points_m: Real) -> tuple[Real, Real]:
@@ -91,3 +96,38 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         lit = den > 1e-3 * float(weight.sum())
         total += float(specular) + np.where(lit, num / np.where(lit, den, 1.0), 0.0)
     return total / len(rig.receivers)
+
+
+@dataclass(frozen=True)
+class IncidenceChoice:
+    """Both angles of every pixel, float64 [ny, nx] radians, and which of them is used."""
+
+    choice: Incidence
+    one_rad: Real
+    pixel_rad: Real
+
+    @property
+    def used_rad(self) -> Real:
+        """The one that was chosen."""
+        return self.one_rad if self.choice == "one" else self.pixel_rad
+
+    @property
+    def other_rad(self) -> Real:
+        """The one that was not."""
+        return self.pixel_rad if self.choice == "one" else self.one_rad
+
+    def facts(self, valid: npt.NDArray[np.bool_]) -> dict[str, Any]:
+        """How far they are apart over the valid pixels, for quality.json; degrees."""
+        pixel = np.degrees(self.pixel_rad[valid]) if valid.any() else np.degrees(self.pixel_rad).ravel()
+        one = float(np.degrees(self.one_rad.flat[0]))
+        return {
+            "used": "one number for the image" if self.choice == "one" else "by pixel",
+            "one_deg": round(one, 4),
+            "pixel_deg": [round(float(q), 4) for q in (pixel.min(), np.median(pixel), pixel.max())],
+            "largest_difference_deg": round(float(np.abs(pixel - one).max()), 4),
+        }
+
+
+def incidence_choice(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike, choice: Incidence) -> IncidenceChoice:
+    """One number for the image and each pixel's own angle, of which `choice` is to be used."""
+    return IncidenceChoice(choice, incidence_map(rig, x_m, y_m), effective_incidence_map(rig, x_m, y_m))

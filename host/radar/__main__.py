@@ -50,16 +50,27 @@ def _board(rig: Instrument, name: str, image: Path | None) -> str:
 
 def main() -> int:
     """Run a command; 0 only when it worked."""
-    parser = argparse.ArgumentParser(prog="python -m host.radar", description=__doc__)
-    parser.add_argument("what", choices=("plan", "check", "firmware"))
-    parser.add_argument("rig", type=Path)
-    parser.add_argument("board", nargs="?", default="")
-    parser.add_argument("image", nargs="?", type=Path)
+    parser = argparse.ArgumentParser(
+        prog="python -m host.radar",
+        description=__doc__,
+        epilog="example:\n  python -m host.radar check instrument.toml RH",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("what", choices=("plan", "check", "firmware"), help="what to do; only plan touches no board")
+    parser.add_argument("rig", type=Path, metavar="RIG", help='rig file with control = "native"')
+    parser.add_argument("board", nargs="?", default="", metavar="BOARD", help="name of the board, e.g. RH")
+    parser.add_argument("image", nargs="?", type=Path, metavar="IMAGE", help="TI's firmware image, for firmware")
     args = parser.parse_args()
     if (args.what == "firmware") != (args.image is not None):
         parser.error("firmware needs BOARD and IMAGE, the others no IMAGE")
     try:
         rig = load_instrument(args.rig)
+        if not rig.radar.native:
+            raise ConfigError(
+                f"{args.rig}: no boards under [radar] native",
+                f'control is "{rig.radar.control}": something else configures these radars',
+                'control = "native", native = { NAME = { usb_serial = "..." } }; see docs/how-to/radar-bring-up.md',
+            )
         if args.what != "plan":
             require(rig, rig.grid.columns * rig.burst.pulses)
         told = _plan(rig) if args.what == "plan" else _board(rig, args.board, args.image)

@@ -69,7 +69,7 @@ class LineServers(RadarControl):
                 raise DeviceError(
                     f"{board}: its control server at {self._servers[board]} does not read its lines",
                     "the program there hangs: what was sent to it for many rows fills its connection",
-                    "start it again, then `polysight resume`",
+                    "start it again, then `polysight resume SCAN`",
                 ) from None
             except ConnectionError:
                 self._reset.add(board)
@@ -133,7 +133,7 @@ class LineServers(RadarControl):
                     f"{board}: its control server at {self._servers[board]} has not taken the line within"
                     f" {self._timeout_s:g} s",
                     "the connection is half-open: that machine was switched off, or the network is cut",
-                    "check that machine and the cable, then `polysight resume`",
+                    "check that machine and the cable, then `polysight resume SCAN`",
                 )
 
     def _unreachable(self, board: str, e: OSError) -> DeviceError:

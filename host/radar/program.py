@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from host.radar import commands as c
-from shared.config import Board, Instrument
+from shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instrument
 
 TRIGGER_MARGIN_US = 200.0
 """From the end of a frame's period to the next pulse: 150 us at least, 300 us at most recommended (ICD 93)."""
@@ -75,8 +75,8 @@ def program(rig: Instrument, board: Board) -> Program:
                 chirp.ramp_end_us,
                 chirp.samples,
                 chirp.sample_rate_hz,
-                chirp.hpf1_khz,
-                chirp.hpf2_khz,
+                chirp.hpf1_khz or HPF_FIRST_KHZ[0],  # 0: a simulated rig without filter, its radars have none to set
+                chirp.hpf2_khz or HPF_SECOND_KHZ[0],
                 rig.radar.rx_gain_db,
                 rig.radar.rf_gain_target_db,
                 rig.radar.tx_backoff_db,

@@ -34,7 +34,7 @@ _LOOK_S = 0.5e-3
 _INTERRUPT_LOW_S = 0.1
 _SYNC_SEARCH_BYTES = 252
 _FLUSH_BYTES = 244  # of a message whose header is not to be believed: so many bytes bring the device back in step
-_DO = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume`"
+_DO = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume SCAN`"
 
 
 class WordLink(Protocol):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials import Library, MaterialsResult, TruthPlate, pixel_accuracy
+from host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
 from host.report.context import ReportContext
 
 
@@ -21,7 +21,7 @@ def context_of(
     simulated: bool,
     valid: npt.NDArray[np.bool_] | None = None,
     plates: Sequence[TruthPlate] = (),
-    library: Library | None = None,
+    named_by: str = "",
     quality: dict[str, Any] | None = None,
     config: dict[str, Any] | None = None,
     provenance: dict[str, Any] | None = None,
@@ -43,7 +43,7 @@ def context_of(
         truth=[{"name": t.name, "box_mm": t.box_mm, "permittivity": t.permittivity} for t in plates] or None,
         metal_how=result.metal.how,
         pixel_accuracy=pixel_accuracy(result),
-        library_note=library_sentence(library) if library else "",
+        library_note=named_by,
         quality=quality or {},
         config=config or {},
         provenance=provenance or {},
@@ -51,22 +51,27 @@ def context_of(
     )
 
 
-def library_sentence(library: Library) -> str:
-    """One or two sentences: what the library holds, and how well it names scans it has not seen."""
+def classifier_sentence(classifier: Classifier) -> str:
+    """What names, how it was chosen, and how well it names scans it has not seen."""
+    library, fit = classifier.library, classifier.fit
     kind = "simulated " if library.simulated else ""
-    out = (
-        f"weighted KNN on |H|, |V| and complex P; library of {len(library.names)} materials from {len(library.scans)} "
-    )
-    out += f"{kind}scans."
-    fit = library.fit
-    if "patch_accuracy" in fit:
+    angles = " and ".join(f"{a:g}" for a in classifier.angles_deg)
+    out = f"{classifier.model} on |H|, |V| and complex P"
+    judged = fit.get("judged", {}).get(classifier.model)
+    if judged:
+        chosen = fit.get("model") == classifier.model
+        out += f", {'chosen' if chosen else 'asked for; not the one chosen'} by leaving whole scans out"
+    out += f"; library of {len(library.names)} materials from {len(library.scans)} {kind}scans, {angles} degrees."
+    if judged:
         out += (
-            f" On scans left out of the library it names {100 * fit['pixel_accuracy']:.1f} % of the pixels and "
-            f"{100 * fit['patch_accuracy']:.1f} % of the patches right"
+            f" On scans left out of the library it names {100 * judged['pixels']:.1f} % of the pixels and "
+            f"{100 * judged['patches']:.1f} % of the patches right"
         )
+        if "pixels_split_by_pixel" in judged:
+            out += f" (split by pixel, which is optimistic: {100 * judged['pixels_split_by_pixel']:.1f} %)"
         channel = fit.get("by_channel", {})
         if {"h", "v", "p"} <= set(channel):
             alone = ", ".join(f"{k.upper()} {100 * channel[k]:.0f} %" for k in "hvp")
-            out += f" (pixels by one channel alone: {alone})"
+            out += f"; the KNN by one channel alone: {alone}"
         out += "."
     return f"{out} {library.note}".strip()

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from shared.raster import RasterPlan
+
 Image = npt.NDArray[np.complexfloating]
 Labels = npt.NDArray[np.int32]
 
@@ -56,6 +58,12 @@ class ReportContext:
         Scan id, times, versions; key to text.
     notes
         Sentences shown at the top, such as what never ran on hardware.
+    plan
+        Where the positions of the scan were; with `quality`'s `masked_columns` it makes the map of what was masked.
+    rx_gains
+        Board to its RX: gain_db and phase_deg against the first, which were divided out.
+    rig_file
+        The whole rig file as text.
     """
 
     title: str
@@ -78,3 +86,6 @@ class ReportContext:
     config: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    plan: RasterPlan | None = None
+    rx_gains: dict[str, list[dict[str, float]]] = field(default_factory=dict)
+    rig_file: str = ""

@@ -21,6 +21,7 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
 from host.report.context import ReportContext
+from host.report.coverage import coverage_figure, masked_positions
 
 PALETTE = (
     "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",
@@ -325,6 +326,9 @@ def figures(ctx: ReportContext) -> dict[str, bytes]:
         found = permittivity_figure(ctx)
         if found is not None:
             out["permittivity"] = found
+    masks = masked_positions(ctx)
+    if any(m.any() for m in masks.values()):
+        out["coverage"] = png(coverage_figure(ctx, masks))
     if ctx.truth:
         out["truth"] = map_figure(ctx, draw_truth, "Truth")
     return out

@@ -22,7 +22,7 @@ def imaging_table(imaging: Any) -> dict[str, Any] | None:
     if not boards:
         return None
     rows = [
-        {"cells": [text, *(_number(board.get(key)) for board in boards.values())], "share": None}
+        {"cells": [text, *(_number(board.get(key), _between(key)) for board in boards.values())], "share": None}
         for key, text in _ROWS
         if any(key in board for board in boards.values())
     ]
@@ -32,9 +32,13 @@ def imaging_table(imaging: Any) -> dict[str, Any] | None:
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
 
 
-def _number(value: Any) -> str:
+def _between(key: str) -> str:
+    return " × " if key.endswith("_mm") else ", "
+
+
+def _number(value: Any, between: str = " × ") -> str:
     if value is None:
         return "–"
     if isinstance(value, list | tuple):
-        return " × ".join(_number(v) for v in value)
+        return between.join(_number(v) for v in value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)

@@ -10,6 +10,7 @@ from host.report.context import ReportContext
 from host.report.imaging import imaging_table
 
 Table = dict[str, Any]
+_NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
 
 
 def text(value: Any) -> str:
@@ -93,7 +94,8 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
     out = [part for part in parts if part]
     rest = [(k, v) for k, v in quality.items() if k not in known]
     if rest:
-        rows = [_cells(pretty(k), text(v)) for k, v in rest]
+        flat = _flatten(dict(rest), nested=False)
+        rows = [_cells(pretty(k), text(v)) for k, v in flat.items()]
         out.append({"caption": "Rows, masked data and other figures.", "head": [], "rows": rows})
     return out
 
@@ -110,10 +112,25 @@ def _boards(boards: Any) -> Table | None:
     """A line for each figure and a column for each board: it stays narrow enough for a phone."""
     if not isinstance(boards, dict) or not boards:
         return None
-    keys = [k for k in dict.fromkeys(k for b in boards.values() for k in b) if k != "synchronisation"]
-    rows = [_cells(pretty(k), *(text(b.get(k)) for b in boards.values())) for k in keys]
+    flat = {name: _numbers_of(board) for name, board in boards.items()}
+    keys = dict.fromkeys(k for board in flat.values() for k in board)
+    rows = [_cells(pretty(k), *(text(board.get(k)) for board in flat.values())) for k in keys]
     caption = "Frames by board. What is missing is masked, never invented."
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
+
+
+def _numbers_of(board: dict[str, Any]) -> dict[str, Any]:
+    """A board's figures, those in tables one by one: `direct_path_hz` {median} becomes `direct_path_median_hz`."""
+    out: dict[str, Any] = {}
+    for key, value in board.items():
+        if key in _NOT_LISTED:
+            continue
+        stem, _, unit = key.rpartition("_")
+        for part, number in value.items() if isinstance(value, dict) else ():
+            out[f"{stem}_{part}_{unit}" if unit in UNITS else f"{key}_{part}"] = number
+        if not isinstance(value, dict):
+            out[key] = value
+    return out
 
 
 def _residuals_of(boards: Any) -> dict[str, Any]:
@@ -142,11 +159,13 @@ def _residuals(residuals: Any) -> Table | None:
     return {"caption": caption, "head": head, "rows": rows}
 
 
-def _flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten(value: dict[str, Any], prefix: str = "", nested: bool = True) -> dict[str, Any]:
+    """Paths to values; one level deep only unless `nested`."""
     out: dict[str, Any] = {}
     for k, v in value.items():
         name = f"{prefix} {k}".strip()
-        out.update(_flatten(v, name) if isinstance(v, dict) else {name: v})
+        deeper = isinstance(v, dict) and v and (nested or not prefix)
+        out.update(_flatten(v, name, nested) if deeper else {name: v})
     return out
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from host.report.context import ReportContext
+from host.report.coverage import coverage_sentence, masked_positions
 from host.report.figures import FIGURES, UNKNOWN_COLOUR, colours_of, figures
 from host.report.products import write_atomically
 from host.report.quality import key_numbers, quality_tables, text
@@ -43,7 +44,13 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
     )
     rows = [_row(r, colours_of(ctx)) for r in ctx.materials]
     seen = {r["truth"] for r in rows}
-    alt = {**FIGURES, "materials": "Material map", "truth": "True plates", "permittivity": "Permittivity plot"}
+    alt = {
+        **FIGURES,
+        "materials": "Material map",
+        "truth": "True plates",
+        "permittivity": "Permittivity plot",
+        "coverage": "Masked positions",
+    }
     centre = [f"{(float(a[0]) + float(a[-1])) * 500:.1f}" for a in (ctx.x_m, ctx.y_m)]
     return environment.get_template("report.html").render(
         ctx=ctx,
@@ -55,6 +62,7 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         rows=rows,
         missed=[str(t["name"]) for t in ctx.truth or [] if str(t["name"]) not in seen] if rows else [],
         quality=quality_tables(ctx.quality),
+        coverage=coverage_sentence(masked_positions(ctx)),
         config=[(k, text(v)) for k, v in ctx.config.items()],
         provenance=[(k, text(v)) for k, v in ctx.provenance.items()],
     )
@@ -88,6 +96,8 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
         "votes": DASH if r.get("confidence") is None else f"{100 * r['confidence']:.0f} %",
         "real": "metal-like" if r.get("metal_like") else DASH,
         "loss": DASH,
+        "real_error": "",
+        "loss_error": "",
         "real_range": "",
         "loss_range": "",
         "true_real": ("metal" if truth["metal"] else DASH) if truth else DASH,
@@ -101,6 +111,9 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
     if e:
         (r0, r1), (i0, i1) = e["real_p30_p70"], e["imag_p30_p70"]
         out["real"], out["loss"] = f"{e['real']:.2f}", f"{-e['imag']:.2f}"
+        real_std, loss_std = e.get("real_std"), e.get("imag_std")
+        out["real_error"] = "" if real_std is None else f"± {real_std:.2f}"
+        out["loss_error"] = "" if loss_std is None else f"± {loss_std:.2f}"
         out["real_range"], out["loss_range"] = f"({r0:.2f} … {r1:.2f})", f"({-i1:.2f} … {-i0:.2f})"
     if true_eps:
         out["true_real"], out["true_loss"] = f"{true_eps['real']:.2f}", f"{-true_eps['imag']:.2f}"

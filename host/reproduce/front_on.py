@@ -52,7 +52,7 @@ def fig4(run: Run) -> Item:
         near = front_on(run.config, Path(temporary))
         views = {"front-on": _seen("front-on", near, grid=FRONT_ON_GRID, object_gain=10.0)}
     views["steep"] = _seen("steep", run.config)
-    fig = new_figure(15.5, 8.6)
+    fig = new_figure(11.5, 6.8)
     for line, (name, view) in zip(fig.subplots(2, 3), views.items(), strict=True):
         draw_row(fig, line, view, ("amplitude_h", "amplitude_v", "amplitude_p"), name)
     theta = {name: float(np.mean(view.result.theta_rad)) for name, view in views.items()}

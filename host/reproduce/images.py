@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.patheffects import withStroke
+from scipy.ndimage import gaussian_filter
 
 from host.materials import MaterialsResult, table2
 from host.polarimetry import ratio_from_permittivity
@@ -28,6 +30,8 @@ SETS: dict[str, tuple[int, ...]] = {
 FIG13 = (13, 12, 18, 3, 14, 6)
 FIG13_DISTANCE_MM = 598.0
 """Object plane at which the rig file's boards see 50 degrees."""
+PHASE_DEG = 30.0
+"""Range of the phase that Fig. 14 shows, to either side."""
 
 
 @dataclass(frozen=True)
@@ -53,20 +57,33 @@ def seen(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0)
     return Seen(found.result, context)
 
 
-def _label_plates(ax: Any, ctx: ReportContext, size: float = 6.5) -> None:
+def _label_plates(ax: Any, ctx: ReportContext, size: float = 7.5) -> None:
     for t in ctx.truth or []:
-        x0, _, x1, y1 = t["box_mm"]
+        x0, y0, x1, y1 = t["box_mm"]
         name = str(t["name"]).split(" (")[0]
-        ax.text((x0 + x1) / 2, y1 + 1.5, name, ha="center", va="bottom", fontsize=size, color="white")
+        ax.text(
+            (x0 + x1) / 2, (y0 + y1) / 2, name.replace(" ", "\n"), ha="center", va="center", fontsize=size,
+            color="white", path_effects=[withStroke(linewidth=2.0, foreground=INK)],
+        )  # fmt: skip
     left, right, bottom, top = extent_mm(ctx)
     ax.set_xlim(max(left, -110), min(right, 110))
     ax.set_ylim(max(bottom, -110), min(top, 110))
+
+
+def _reflects(ctx: ReportContext) -> npt.NDArray[np.float64]:
+    """Opacity of P: it is noise where nothing reflects, 20 dB below metal or less."""
+    power = (np.abs(ctx.h).astype(np.float64) ** 2 + np.abs(ctx.v).astype(np.float64) ** 2) / 2
+    power = np.nan_to_num(power)
+    level = 10 * np.log10(np.maximum(np.minimum(power, gaussian_filter(power, 1.5)), 1e-12))
+    return np.clip((level + 20) / 6, 0.0, 1.0)
 
 
 def draw_row(fig: Any, axes: Any, view: Seen, keys: tuple[str, ...], name: str) -> None:
     """Images of a scan side by side, with colour bars and the plates' names."""
     for ax, key in zip(axes, keys, strict=True):
         shown, unit = draw_channel(ax, view.context, key)
+        if key.endswith("_p"):
+            shown.set_alpha(_reflects(view.context))
         kind, _, channel = key.partition("_")
         dress(ax, f"{name}: {kind} {channel.upper()}", "x (mm)", "y (mm)" if ax is axes[0] else "")
         ax.set_aspect("equal")
@@ -74,7 +91,7 @@ def draw_row(fig: Any, axes: Any, view: Seen, keys: tuple[str, ...], name: str) 
         ax.set_facecolor("#3a404a")
         bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.02)
         bar.set_label(unit, fontsize=8)
-        bar.ax.tick_params(labelsize=7)
+        bar.ax.tick_params(labelsize=7.5)
         if bar.solids is not None:
             bar.solids.set_alpha(1)
         _label_plates(ax, view.context)
@@ -112,7 +129,7 @@ def ratio_data(views: dict[str, Seen]) -> dict[str, Any]:
 def fig13(run: Run) -> Item:
     """Seven materials at 50 degrees."""
     view = seen("seven materials at 50 degrees", FIG13, run, FIG13_DISTANCE_MM)
-    fig = new_figure(14.0, 4.4)
+    fig = new_figure(11.5, 3.7)
     draw_row(fig, fig.subplots(1, 3), view, ("amplitude_h", "amplitude_v", "amplitude_p"), "50°")
     views = {"50°": view}
     return Item(
@@ -131,7 +148,7 @@ def fig13(run: Run) -> Item:
 def fig19(run: Run) -> Item:
     """Solids, liquids and powders at 55 degrees: H, V and P."""
     views = {name: seen(name, rows, run) for name, rows in SETS.items()}
-    fig = new_figure(15.5, 12.6)
+    fig = new_figure(11.5, 10.2)
     for line, (name, view) in zip(fig.subplots(3, 3), views.items(), strict=True):
         draw_row(fig, line, view, ("amplitude_h", "amplitude_v", "amplitude_p"), name)
     return Item(
@@ -157,31 +174,30 @@ def fig14(run: Run) -> Item:
     """Phase of H, V and P inside water, oil and metal."""
     view = seen("liquids", SETS["liquids"], run)
     shown = ("Water (with glass)", "Corn Oil (with glass)", "copper")
-    fig = new_figure(14.0, 4.4)
+    fig = new_figure(11.5, 3.4)
     channels = {"H": view.result.calibrated.h, "V": view.result.calibrated.v, "P": view.result.calibrated.p}
     patches = {p.truth.name: p for p in view.result.patches if p.truth is not None and p.truth.name in shown}
     rows, data = [], {}
+    inside = np.any([p.patch.interior for p in patches.values()], axis=0)
     for ax, (channel, values) in zip(fig.subplots(1, 3), channels.items(), strict=True):
-        inside = np.zeros(values.shape, bool)
-        for p in patches.values():
-            inside |= p.patch.interior
         metal = np.mean(values[patches["copper"].patch.interior])
         angle = np.angle(values / metal, deg=True)
         phase = np.ma.masked_array(angle, ~inside)
         picture = ax.imshow(
-            phase, extent=extent_mm(view.context), origin="lower", cmap="twilight", vmin=-180, vmax=180,
+            phase, extent=extent_mm(view.context), origin="lower", cmap="PuOr", vmin=-PHASE_DEG, vmax=PHASE_DEG,
             interpolation="nearest",
         )  # fmt: skip
         dress(ax, f"phase of {channel}", "x (mm)", "y (mm)")
         ax.grid(visible=False)
-        ax.set_facecolor("#d9dde3")
-        ax.set_xlim(-110, 110)
-        ax.set_ylim(-110, 110)
-        bar = fig.colorbar(picture, ax=ax, fraction=0.046, pad=0.02, ticks=[-180, -90, 0, 90, 180])
+        ax.set_facecolor("#b9c0ca")
+        ax.set_xlim(-95, 95)
+        ax.set_ylim(-30, 115)
+        ticks = [-PHASE_DEG, -PHASE_DEG / 2, 0, PHASE_DEG / 2, PHASE_DEG]
+        bar = fig.colorbar(picture, ax=ax, fraction=0.046, pad=0.02, ticks=ticks, extend="both")
         bar.set_label("degrees", fontsize=8)
         for p in patches.values():
             x0, _, x1, y1 = p.patch.box_mm
-            text = f"{p.truth.name if p.truth else ''}\n{np.median(angle[p.patch.interior]) + 0.0:.1f}°"
+            text = f"{p.truth.name.split(' (')[0] if p.truth else ''}\n{np.median(angle[p.patch.interior]) + 0.0:.1f}°"
             ax.text((x0 + x1) / 2, y1 + 4, text, ha="center", fontsize=8, color=INK)
     for name, p in patches.items():
         spreads = {c: _spread_deg(v[p.patch.interior]) for c, v in channels.items()}
@@ -206,7 +222,8 @@ def fig14(run: Run) -> Item:
         {
             "phase": Picture(
                 fig,
-                "Phase of each channel less that of metal, in a cyclic map; the number is the median over the plate.",
+                f"Phase of each channel less that of metal, from {-PHASE_DEG:g} to {PHASE_DEG:g} degrees; the number is"
+                " the median over the plate.",
             )
         },
         data,

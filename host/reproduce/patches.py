@@ -21,12 +21,13 @@ import numpy.typing as npt
 from scipy import optimize
 
 from host.materials import Entry, Library, Published, table2
-from host.materials.models import Samples, feature_matrix, score
+from host.materials.judge import score
+from host.materials.models import PAPER
+from host.materials.samples import Samples, feature_matrix
 from host.polarimetry import fresnel
 from host.reproduce.published import published
 
 Complex = npt.NDArray[np.complex128]
-PAPER_KNN = "weighted KNN (paper)"
 SCANS, PIXELS = 8, 12
 """Placements of Fig. 17; with 12 pixels each a material has 96, the paper's "about 80 to 120"."""
 
@@ -129,7 +130,7 @@ def draw(
 def h_accuracy(group: Group, errors: Errors, seeds: tuple[int, ...]) -> float:
     """Share of pixels the paper's KNN names right from |H| alone, split by pixel, mean over draws."""
     drawn = (draw(group.materials, group.angle_deg, errors, seed).samples() for seed in seeds)
-    return float(np.mean([score(s, PAPER_KNN, "H", by_pixel=True).pixels for s in drawn]))
+    return float(np.mean([score(s, PAPER, "H", by_pixel=True).pixels for s in drawn]))
 
 
 @cache

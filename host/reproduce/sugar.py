@@ -8,6 +8,7 @@ import numpy as np
 
 from host.materials import table2
 from host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
+from host.polarimetry import permittivity_from_ratio
 from host.report.figures import INK, PALETTE
 from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
 from host.reproduce.patches import calibrated_errors, draw, groups
@@ -29,8 +30,17 @@ def fig21(run: Run) -> Item:
     y = np.array([value[e.name] for e in library.entries])
     error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
 
-    fig = new_figure(11.0, 4.3)
-    left, right = fig.subplots(1, 2)
+    fig = new_figure(11.5, 4.2)
+    left, centre, right = fig.subplots(1, 3)
+    eps = np.array([
+        np.median(permittivity_from_ratio(e.p.astype(np.complex128), np.radians(e.incidence_deg)).real)
+        for e in library.entries
+    ])  # fmt: skip
+    centre.plot(y, eps, "o", ms=4, color=PALETTE[0], label="patches, simulated")
+    told_eps = [(value[m.name], m.permittivity.real) for m in materials]
+    centre.plot(*zip(*sorted(told_eps), strict=True), "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
+    dress(centre, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
+    centre.legend(fontsize=8, frameon=False)
     left.plot(x, y, "o", ms=4, color=PALETTE[0], label="patches")
     at = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
     low, high = result.line.interval(np.radians(at))
@@ -42,7 +52,7 @@ def fig21(run: Run) -> Item:
     right.axvline(told, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {told:g} %")
     right.axvline(result.median_error, color=INK, ls=":", lw=1.2, label=f"simulated median {result.median_error:.3f} %")
     dress(right, "Error, each concentration left out", "error (% by weight)", "share of patches")
-    right.legend(fontsize=8, frameon=False)
+    right.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
 
     rows = []
     for name in sorted(value, key=lambda n: value[n]):
@@ -69,7 +79,12 @@ def fig21(run: Run) -> Item:
                 tuple(rows),
             ),
         ),
-        {"sugar": Picture(fig, "The calibration line with its interval, and the distribution of errors.")},
+        {
+            "sugar": Picture(
+                fig,
+                "The calibration line with its interval, the permittivity by Eq. 3, and the distribution of errors.",
+            )
+        },
         {
             "published_median_error_percent": told,
             "median_error_percent": result.median_error,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from host.capture.decode import decode_row, row_words
 from host.imaging import ImageBuilder
@@ -97,7 +97,7 @@ def sync_scan(run: Run) -> SyncScan:
 def fig12(run: Run) -> Item:
     """Range profiles of a row and the image of H, before and after."""
     scan = sync_scan(run)
-    fig = new_figure(13.0, 9.4)
+    fig = new_figure(11.5, 8.4)
     contrast = []
     for line, image, profile, when in zip(
         fig.subplots(2, 2), scan.images, scan.profiles, ("hardware trigger alone", "all stages"), strict=True
@@ -144,7 +144,7 @@ def fig15(run: Run) -> Item:
     told = published()
     limits = {"frequency_hz": told["frequency_std_hz"], "phase_rad": told["phase_std_rad"]}
     summary: dict[str, Any] = {name: r.summary() for name, r in sync_scan(run).reports.items()}
-    fig = new_figure(13.0, 4.4)
+    fig = new_figure(11.5, 4.4)
     rows = []
     chirps = " and ".join(f"{c['chirps']} chirps of {b}" for b, c in summary.items())
     for ax, quantity, unit in zip(fig.subplots(1, 3), QUANTITIES, UNITS, strict=True):
@@ -168,7 +168,13 @@ def fig15(run: Run) -> Item:
                 label=f"published, all stages: {limits[quantity]:g}",
             )
         ax.set_yscale("log")
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        if quantity in limits:
+            ax.yaxis.set_minor_formatter(NullFormatter())
+        else:
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+            ax.yaxis.set_minor_formatter("{x:g}")
+            ax.tick_params(axis="y", which="minor", labelsize=7)
         ax.margins(y=0.25)
         dress(ax, unit, "", f"standard deviation of {unit}")
         ax.set_xticks(range(len(STAGES)), list(STAGES), fontsize=8)

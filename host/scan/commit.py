@@ -9,7 +9,6 @@ from host.scan.take import Take
 from host.store.appending import sync_folder
 from host.store.manifest import Fact, ManifestWriter
 from host.store.scanfolder import PART, ScanFolder, utc_now
-from shared.config import Instrument
 from shared.errors import DeviceError, ScanError
 from shared.faults import explain
 
@@ -106,12 +105,12 @@ def _counts(take: Take, name: str) -> Fact:
     return {**{kind: getattr(c, kind) for kind in _KINDS}, "located": c.located, "received_bytes": c.bytes}
 
 
-def gave_up(take: Take, faults: list[str], instrument: Instrument, takes: int) -> ScanError:
+def gave_up(take: Take, faults: list[str], scan: ScanFolder, takes: int) -> ScanError:
     """The error for a row whose retakes are used up, with the likeliest cause."""
     what = f"row {take.row.index} is not complete after {takes} takes: {'; '.join(faults)}"
-    resume = "then `polysight resume`; --keep-incomplete keeps such rows, masked"
+    resume = f"then `polysight resume {scan.path}`; with --keep-incomplete it keeps such rows, masked"
     if take.silent_boards:
-        silent = [silent_radar(instrument.by_name(name), take.captures[name]) for name in take.silent_boards]
+        silent = [silent_radar(scan.instrument.by_name(name), take.captures[name]) for name in take.silent_boards]
         asked = [f"{n}'s radar was {take.radars[n].detail}" for n in take.silent_boards if n in take.radars]
         return ScanError(
             what, "; ".join([f"{e.what}: {e.why}" for e in silent] + asked), f"{silent[0].remedy}; {resume}"

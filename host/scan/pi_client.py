@@ -28,6 +28,8 @@ from shared.messages import (
     Hello,
     HelloReply,
     Home,
+    Pulse,
+    Pulsed,
     Refused,
     Replay,
     ReplayReply,
@@ -145,6 +147,16 @@ class PiClient:
             if any(_is_of(e, row_index, take) for e in self._pending):
                 return
         raise self._silent("RunRow")
+
+    def pulse(self, pulses: int, period_us: float, width_us: float) -> Pulsed:
+        """One burst on SYNC_IN at rest. Sent once: a second one would be more frames than asked for.
+
+        Raises RefusedError, DeviceError.
+        """
+        reply = self._once(Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
+        if not isinstance(reply, Pulsed):
+            raise self._silent("Pulse")
+        return reply
 
     def abort(self, reason: str) -> None:
         """Stop the row now; aborting twice does no harm. Raises RefusedError, DeviceError."""

@@ -61,5 +61,5 @@ def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
             f"{folder}: {free / 1e9:.2f} GB free, {need / 1e9:.2f} GB needed for {rows} rows and"
             f" {reserve / 1e9:.2f} GB kept free",
             "the disk is too full for this scan",
-            "free space, or lower limits.free_disk_bytes; `polysight resume` goes on from the last committed row",
+            f"free space, or lower limits.free_disk_bytes; `polysight resume {folder}` goes on behind its last row",
         )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import zmq
 
+from host.calibration.in_force import keep_in_scan
 from host.radar.backends import radar_control
 from host.radar.interface import RadarControl
 from host.scan.capture_rig import CaptureRig
@@ -69,13 +70,17 @@ def run_scan(
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
     with ExitStack() as stack:
         pi, rig, hello = _connect(stack, instrument, progress)
+        simulated = hello.backend != HARDWARE_BACKEND
         scan = ScanFolder.create(
             folder,
             instrument,
             plan,
-            simulated=hello.backend != HARDWARE_BACKEND,
+            simulated=simulated,
             scan_id=new_scan_id(),
-            extra={"pi": {"release": hello.pi_release, "firmware": hello.firmware, "backend": hello.backend}},
+            extra={
+                "pi": {"release": hello.pi_release, "firmware": hello.firmware, "backend": hello.backend},
+                "calibration": keep_in_scan(instrument, folder, simulated),
+            },
         )
         writer = stack.enter_context(scan.writer())
         radars = stack.enter_context(radars or radar_control(instrument))

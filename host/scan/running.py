@@ -51,6 +51,7 @@ class RunningScan:
         self._current = (-1, 0, 0)
         self._state = ""
         self._told_stop = False
+        self._remedy: Fact = {}  # of the error that ended the scan
         self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
 
     def run(self) -> ScanResult:
@@ -76,6 +77,8 @@ class RunningScan:
             aborted = isinstance(e, KeyboardInterrupt)
             self.result.exit_status = "abort" if aborted else "fail"
             self.result.reason = e.what if isinstance(e, PolysightError) else f"{type(e).__name__}: {e}"
+            if isinstance(e, PolysightError):
+                self._remedy = {"why": e.why, "remedy": e.remedy}
             with suppress(PolysightError):  # what failed first is what is told
                 self._end(begun)
             raise
@@ -160,14 +163,16 @@ class RunningScan:
                 raise
             faults = take.faults(self._instrument.burst.pulses)
             if number == last_take:
-                raise gave_up(take, faults, self._instrument, number - first_take + 1)
+                raise gave_up(take, faults, self._scan, number - first_take + 1)
             self.result.retakes += 1
             self._say("retake", f"row {row.index} is taken again: {'; '.join(faults)}")
 
     def _take(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
         """Wait until the row may begin, and take it; None when asked to stop before it began."""
         check_disk(self._scan.path, self._instrument, 1)
-        if not self._wait_for_processing() or not make_ready(self._pi, self._stop, self._say):
+        if not self._wait_while_paused() or not self._wait_for_processing():
+            return None
+        if not make_ready(self._pi, self._stop, self._say):
             return None
         self._current = (row.index, number, row.points)
         self._say("row", f"row {row.index}" + (f", take {number}" if number > 1 else ""))
@@ -180,6 +185,21 @@ class RunningScan:
         """Write what the radars told since the last time, if they tell anything."""
         if told := self._radars.report():
             self._writer.append({"fact": "radars", **of, **told})
+
+    def _wait_while_paused(self) -> bool:
+        """Until nobody wants a pause any more; the manifest says from when to when. False when asked to stop."""
+        if not self._stop.paused:
+            return not self._stop.now
+        self._writer.append({"fact": "scan_paused", "paused_utc": utc_now()})
+        self._say("wait", "paused on request; the next row begins when the scan is told to go on")
+        while self._stop.paused:
+            if self._stop.after_row:
+                return False
+            time.sleep(_LOOK_S)
+            self._pi.events()
+        self._writer.append({"fact": "scan_continued", "continued_utc": utc_now()})
+        self._say("wait", "going on")
+        return not self._stop.after_row
 
     def _wait_for_processing(self) -> bool:
         """Until processing has caught up; nothing is lost by waiting. False when asked to stop meanwhile."""
@@ -219,6 +239,7 @@ class RunningScan:
                 "fact": "scan_ended",
                 "exit_status": status,
                 "reason": reason,
+                **self._remedy,
                 "rows_committed": len(self._committed),
                 "events_refetched": self._pi.gaps_filled,
                 "ended_utc": utc_now(),

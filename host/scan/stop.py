@@ -1,4 +1,4 @@
-"""Asking a scan to stop: once, after this row; twice, now."""
+"""Asking a scan to stop: once, after this row; twice, now. Or to wait before its next row."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ class StopRequest:
 
     def __init__(self) -> None:
         self._count = 0
+        self.paused = False  # whether the next row is not to begin yet
 
     def request(self) -> None:
         """Ask once more."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import secrets
-import zlib
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -18,6 +17,7 @@ import shared
 from host.capture.segment import read_index
 from host.store import manifest
 from host.store.appending import sync_folder
+from host.store.crc import crc32
 from host.store.manifest import Fact, Manifest, ManifestWriter
 from host.store.source import RowData
 from shared.config import Instrument, to_builtins
@@ -76,6 +76,7 @@ class ScanFolder:
     def __init__(self, path: Path, content: Manifest) -> None:
         self.path = path
         self.content = content
+        self._rows: tuple[Manifest, int, dict[int, CommittedRow]] | None = None
         started = next((f for f in content.facts if f["fact"] == "scan_started"), None)
         if started is None:
             raise DataError(
@@ -154,6 +155,15 @@ class ScanFolder:
 
     def committed(self) -> dict[int, CommittedRow]:
         """Committed rows by index; the last valid take wins, unless it was withdrawn."""
+        return dict(self._committed())
+
+    def _committed(self) -> dict[int, CommittedRow]:
+        """The same, made once for the facts at hand: reading a scan asks for every row."""
+        if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
+            self._rows = (self.content, len(self.content.facts), self._count_rows())
+        return self._rows[2]
+
+    def _count_rows(self) -> dict[int, CommittedRow]:
         rows: dict[int, CommittedRow] = {}
         for fact in self.content.facts:
             if fact["fact"] == "row_withdrawn":
@@ -187,7 +197,7 @@ class ScanFolder:
         DataError
             when the row is not committed, or its files are absent or damaged.
         """
-        found = self.committed().get(row)
+        found = self._committed().get(row)
         board = None if found is None else found.boards.get(board_name)
         if board is None:
             raise DataError(
@@ -200,7 +210,7 @@ class ScanFolder:
             payload = np.fromfile(path, dtype=np.uint8)
         except OSError as e:
             raise DataError(f"{path}: cannot be read: {e.strerror}", "the file was removed", self._remedy()) from None
-        if payload.size != board.bytes or f"{zlib.crc32(payload.data):08x}" != board.crc32:
+        if payload.size != board.bytes or f"{crc32(payload.data):08x}" != board.crc32:
             raise DataError(
                 f"{path}: not the bytes that were committed ({payload.size} bytes, {board.bytes} expected)",
                 "the file was changed, truncated or damaged after the scan",
@@ -213,7 +223,7 @@ class ScanFolder:
             return []
         facts, _ = read_index(path)
         missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
-        damaged = board.index_crc32 and f"{zlib.crc32(path.read_bytes()):08x}" != board.index_crc32
+        damaged = board.index_crc32 and f"{crc32(path.read_bytes()):08x}" != board.index_crc32
         if damaged or sum(b - a for a, b in missing) != board.missing_bytes:
             raise DataError(f"{path}: not the index that was committed", "the file was changed", self._remedy())
         return missing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,11 @@ class RowData:
     frames_expected: int
     crc32: str = ""
 
+    @classmethod
+    def none(cls, positions: int) -> RowData:
+        """What stands for a row that was synchronised elsewhere: a frame for each position, and no bytes."""
+        return cls(np.zeros(0, np.uint8), [], positions)
+
     @property
     def missing_bytes(self) -> int:
         """Number of bytes that never arrived."""
@@ -50,8 +55,8 @@ class RowData:
         return mask
 
 
-class ScanSource(Protocol):
-    """A recorded scan: a scan folder, or another layout read as one."""
+class Scan(Protocol):
+    """What every scan tells, however it was recorded."""
 
     @property
     def instrument(self) -> Instrument:
@@ -77,6 +82,22 @@ class ScanSource(Protocol):
         """Indices of the rows that hold data, ascending."""
         ...
 
+
+class ScanSource(Scan, Protocol):
+    """A recorded scan: a scan folder, or another layout read as one."""
+
     def read_row(self, board_name: str, row: int) -> RowData:
         """One board's recording of one row. Raises DataError when it is absent or damaged."""
+        ...
+
+
+class SyncedSource(Scan, Protocol):
+    """A scan that another program has synchronised."""
+
+    def read_synced(self, board_name: str, row: int) -> NDArray[np.complex64]:
+        """One board's row, complex64 [rx, column, sample], column 0 the smallest x. Raises DataError."""
+        ...
+
+    def recording(self) -> dict[str, Any]:
+        """What quality.json says of how it was recorded."""
         ...

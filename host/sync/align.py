@@ -12,20 +12,17 @@ quarter of the samples. Only the average is taken at the full rate.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
-import scipy.ndimage
 from numpy.typing import NDArray
 
 from host.sync import hpf
-from host.sync.passes import FOLD, Passes, passes
-from host.sync.tone import Real, Tone, block_edges, block_times, cis, refine, search_size, strongest
+from host.sync.passes import FOLD, Passes, passes_for
+from host.sync.tone import Real, Tone, cis
 
 _REFERENCES = 4  # reference chirps to try before a position is given up
 _GOOD = 0.5  # a good chirp has at least this part of the coherence of the position's median chirp
-_BAND_BINS = 9  # IF bins over which the signal's centre is sought: direct path and object lie within
 
 
 class AlignedRow(NamedTuple):
@@ -77,7 +74,7 @@ def align_row(
     linear: tuple[int, int],
     equaliser: hpf.Equaliser | None = None,
     full_scale: int = 32767,
-    by: Passes = passes,
+    by: Passes | None = None,
 ) -> AlignedRow:
     """Align and average the burst of every position.
 
@@ -94,12 +91,16 @@ def align_row(
     full_scale
         A chirp with a sample at it was clipped, and is left out: its IF holds tones that are not there.
     by
-        The passes over raw samples, compiled or plain.
+        The passes over raw samples, compiled or plain; None takes the fastest.
     """
+    by = by or passes_for(words.shape[-1])
+    words = np.ascontiguousarray(words)
     pieces = [
         _align(words[i : i + by.CHUNK], valid[i : i + by.CHUNK], linear, equaliser, full_scale, by)
         for i in range(0, valid.shape[0], by.CHUNK)
     ]
+    if len(pieces) == 1:
+        return pieces[0]
     columns = zip(AlignedRow._fields, zip(*pieces, strict=True), strict=True)
     return AlignedRow(*(np.concatenate(column, axis=1 if name == "error" else 0) for name, column in columns))
 
@@ -114,26 +115,23 @@ def _align(
 ) -> AlignedRow:
     """The same for a few positions."""
     linear = whole_blocks(linear)
-    frames = by.load(words)
-    first, centre, coherence, usable, peak = _against_one(frames, valid, linear, words.shape[-1], full_scale, by)
+    first, centre, coherence, usable, peak = _against_one(words, valid, linear, full_scale, by)
     good = _coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
     taps = _taps(equaliser, frequency)
     start = np.angle(first.amplitude * taps.sum(axis=-1))
 
-    # Second pass: each chirp against the sum of the others, which is the sum less the chirp's own energy.
-    edges = block_edges((linear[1] - linear[0]) // FOLD)
+    # Second pass: each chirp against the sum of the others.
     turned = taps * cis(-start)[..., None]
-    sums, own, level = by.against_others(frames, frequency, _c64(turned), good, linear, edges)
-    times, n = block_times(edges) * FOLD, good.sum(axis=1)
-    second = refine(sums[0] + sums[1] - np.where(good[..., None], own, 0), times, steps=2)
+    off, product, own, level, apart = by.against_others(words, frequency, _c64(turned), good, linear)
+    n = good.sum(axis=1)
     level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     others = n[:, None] - good
-    amplitude = np.abs(second.amplitude) / np.maximum(others, 1) / level
+    amplitude = np.abs(product) / np.maximum(others, 1) / level
     # What a chirp differs by from the mean of the others, it differs by less from the mean of all.
     part = others / np.maximum(n, 1)[:, None]
-    correction, shift = part * second.frequency, part * np.angle(second.amplitude)
-    coherence = amplitude * np.sqrt(level / np.maximum(own.sum(axis=2), 1e-30))
+    correction, shift = part * off, part * np.angle(product)
+    coherence = amplitude * np.sqrt(level / np.maximum(own, 1e-30))
     good = _coherent(coherence, usable)
 
     # What is filtered and then turned by the correction is what is turned and then filtered by turned taps.
@@ -141,11 +139,7 @@ def _align(
     turned *= cis(2 * np.pi * FOLD * lag * correction[..., None] - shift[..., None])
     weights = turned * (good / np.maximum(good.sum(axis=1), 1)[:, None])[..., None]
     second_half = np.cumsum(good, axis=1) % 2 == 0
-    mean, halves = by.average(frames, frequency + correction, _c64(weights), second_half, linear)
-
-    at_rest = cis(-2 * np.pi * second.frequency[..., None] * times - np.angle(second.amplitude)[..., None])
-    split = refine(sums * at_rest, times, steps=1)
-    disagreement = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
+    mean, halves = by.average(words, frequency + correction, _c64(weights), second_half, linear)
     return AlignedRow(
         mean,
         halves,
@@ -155,7 +149,7 @@ def _align(
         np.angle(cis(start + shift)),
         amplitude,
         np.abs(taps.sum(axis=-1)),
-        _centred(np.stack(disagreement) / 2, good),
+        _centred(apart / 2, good),
         coherence,
         peak,
     )
@@ -168,12 +162,7 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
 
 
 def _against_one(
-    frames: NDArray[Any],
-    valid: NDArray[np.bool_],
-    linear: tuple[int, int],
-    rx: int,
-    full_scale: int,
-    by: Passes,
+    words: NDArray[np.int16], valid: NDArray[np.bool_], linear: tuple[int, int], full_scale: int, by: Passes
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]:
     """Offsets from one chirp of each position; another one is taken where the first matches few of the others.
 
@@ -181,28 +170,24 @@ def _against_one(
     from, usable chirps (received whole, not clipped, not silent), and the largest count.
     """
     positions, chirps = valid.shape
-    n = linear[1] - linear[0]
-    noise = 4.0 / np.sqrt(rx * n)  # coherence of two records of noise: four times the rms of a sum of random phases
+    # Coherence of two records of noise: four times the rms of a sum of random phases.
+    noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
     order = np.argsort(~valid, axis=1, kind="stable")  # the valid ones, first to last
     reference, todo = order[:, 0], np.arange(positions)
     frequency, amplitude, centre = np.zeros(valid.shape), np.zeros(valid.shape, complex), np.zeros(positions)
     coherence, usable, peak = np.zeros(valid.shape), valid, np.zeros(valid.shape, np.int32)
     for attempt in range(min(_REFERENCES, chirps)):
         tried = order[todo, attempt]
-        z, chosen, energy, highest = by.products(
-            frames if attempt == 0 else frames[todo], tried, linear, search_size(n)
-        )
+        offset, product, middle, energy, highest = by.match(words if attempt == 0 else words[todo], tried, linear)
         if attempt == 0:
             usable, peak = valid & (highest < full_scale) & (energy > 0), highest
-        tone = strongest(z, n)
         at = np.arange(todo.size), tried
-        c = np.abs(tone.amplitude) / np.sqrt(np.maximum(energy * energy[at][:, None], 1e-30)) * usable[todo]
+        c = np.abs(product) / np.sqrt(np.maximum(energy * energy[at][:, None], 1e-30)) * usable[todo]
         c[at] = 0  # a chirp always matches itself
         better = c.sum(axis=1) >= coherence[todo].sum(axis=1)
         won = todo[better]
         reference[won], coherence[won] = tried[better], c[better]
-        frequency[won], amplitude[won] = tone.frequency[better], tone.amplitude[better]
-        centre[won] = _band_centre(chosen, n)[better]
+        frequency[won], amplitude[won], centre[won] = offset[better], product[better], middle[better]
         matching = (c > noise).sum(axis=1)
         todo = todo[2 * matching < usable[todo].sum(axis=1) - 1]
         if todo.size == 0:
@@ -211,19 +196,6 @@ def _against_one(
     every = np.arange(positions)
     coherence[every, reference] = np.where(usable[every, reference], best, 0)  # as good as its best match
     return Tone(frequency, amplitude), centre, coherence, usable, peak
-
-
-def _band_centre(chosen: NDArray[np.complex64], samples: int) -> NDArray[np.float64]:
-    """Middle of the band that holds the signal, cycles a sample, [position]: where the smoothed spectrum is highest.
-
-    `chosen` is complex64 [position, rx, size], zero beyond `samples`; overwritten.
-    """
-    size = chosen.shape[-1]
-    spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(chosen, axis=-1, overwrite_x=True))
-    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
-    for _ in range(3):  # three boxes make a bell: two tones within it give one peak, between them
-        power = scipy.ndimage.uniform_filter1d(power, _BAND_BINS * size // samples // 2, axis=-1, mode="wrap")
-    return np.argmax(power, axis=-1) / size
 
 
 def _taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
@@ -247,13 +219,3 @@ def _centred(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np
     """Values [..., position, chirp] less the mean over the good chirps of their position; zero where not good."""
     mean = (values * good).sum(axis=-1) / np.maximum(good.sum(axis=-1), 1)
     return (values - mean[..., None]) * good
-
-
-def _spread(pair: tuple[NDArray[np.float64], NDArray[np.float64]], good: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Std over the good chirps of two quantities, [position, 2]; 0 where fewer than two are good."""
-    n = np.maximum(good.sum(axis=1), 1)
-    out = np.zeros((len(good), 2))
-    for i, x in enumerate(pair):
-        mean = np.where(good, x, 0).sum(axis=1) / n
-        out[:, i] = np.sqrt(np.where(good, (x - mean[:, None]) ** 2, 0).sum(axis=1) / n)
-    return out

@@ -60,6 +60,9 @@ class SyncedRow:
     noise
         float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), nan
         where fewer than two were good; None: not known.
+    turn
+        float64 [position]: radians by which direct path and echoes together, weighed by power, turn from one position
+        to the next; burst alignment undoes it within a burst (`imaging.motion`). None: nothing was aligned.
     errors
         Error samples of the row after each stage (`residuals.errors`), {stage: float64 [3, n]}.
     """
@@ -73,6 +76,7 @@ class SyncedRow:
     phase_residual_rad: NDArray[np.float64]
     errors: residuals.Errors = field(default_factory=dict)
     noise: NDArray[np.float64] | None = None
+    turn: NDArray[np.float64] | None = None
 
     @property
     def stages(self) -> dict[str, tuple[float, float, float]]:
@@ -129,4 +133,13 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
         residual[1],
         residuals.errors(aligned, done, setup.path, rate),
         residuals.noise_power(aligned),
+        turn_along(done),
     )
+
+
+def turn_along(done: direct_path.Referenced) -> NDArray[np.float64]:
+    """See `SyncedRow.turn`: by the two neighbours of each position, or the one that is valid; else 0."""
+    signal = done.halves.sum(axis=1) * done.found[:, None, None]
+    flat = signal.reshape(len(signal), -1)
+    step = np.einsum("pi,pi->p", flat[:-1].conj(), flat[1:])  # from each to the next
+    return np.angle(np.pad(step, (1, 0)) + np.pad(step, (0, 1)))

@@ -117,8 +117,8 @@ def filtered(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDAr
 
 
 def high_pass(chirp: Chirp) -> HighPass:
-    """The filter that a chirp profile programs."""
-    return HighPass((chirp.hpf1_khz * 1e3, chirp.hpf2_khz * 1e3))
+    """The filter that a chirp profile programs; a corner of 0 is no section (simulated rigs only)."""
+    return HighPass(tuple(khz * 1e3 for khz in (chirp.hpf1_khz, chirp.hpf2_khz) if khz))
 
 
 def fit_high_pass(

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from host.sync import plain
+
 try:
     from host.sync import compiled as fastest
 except ImportError:
-    from host.sync import plain as fastest
+    fastest = plain
 
 from host.sync.plain import FOLD as FOLD
+
+_Real, _Complex, _Chosen = NDArray[np.float64], NDArray[np.complex128], NDArray[np.bool_]
 
 
 class Passes(Protocol):
@@ -20,38 +24,35 @@ class Passes(Protocol):
 
     CHUNK: int
 
-    def load(self, words: NDArray[np.int16]) -> NDArray[Any]:
-        """Frames as the other passes take them."""
-        ...
-
-    def products(
-        self, frames: NDArray[Any], reference: NDArray[np.intp], linear: tuple[int, int], size: int
-    ) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.float32], NDArray[np.int32]]:
-        """Conjugate products with a reference chirp."""
+    def match(
+        self, words: NDArray[np.int16], reference: NDArray[np.intp], linear: tuple[int, int]
+    ) -> tuple[_Real, _Complex, _Real, NDArray[np.float32], NDArray[np.int32]]:
+        """Tones between each chirp and a reference chirp."""
         ...
 
     def against_others(
         self,
-        frames: NDArray[Any],
-        frequency: NDArray[np.float64],
+        words: NDArray[np.int16],
+        frequency: _Real,
         taps: NDArray[np.complex64],
-        good: NDArray[np.bool_],
+        good: _Chosen,
         linear: tuple[int, int],
-        edges: NDArray[np.intp],
-    ) -> tuple[NDArray[np.complex64], NDArray[np.float32], NDArray[np.float32]]:
-        """Products of each chirp, filtered, with the sum of the good ones."""
+    ) -> tuple[_Real, _Complex, NDArray[np.float32], NDArray[np.float32], _Real]:
+        """Tones between each chirp, filtered, and the sum of the good others."""
         ...
 
     def average(
         self,
-        frames: NDArray[Any],
-        frequency: NDArray[np.float64],
+        words: NDArray[np.int16],
+        frequency: _Real,
         weights: NDArray[np.complex64],
-        second_half: NDArray[np.bool_],
+        second_half: _Chosen,
         linear: tuple[int, int],
     ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """The average, and what two halves of the chirps add to it."""
         ...
 
 
-passes = cast(Passes, fastest)
+def passes_for(rx: int) -> Passes:
+    """The fastest passes for a number of RX: compiled ones are for the four of an AWR2243."""
+    return cast(Passes, fastest if rx == 4 else plain)

@@ -1,17 +1,18 @@
 """The three passes over a burst's raw samples, in NumPy: what `host.sync.compiled` does, plainly and more slowly.
 
-Frames are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q; a pass takes what :func:`load`
-makes of them. Mixing is by `exp(-j 2 pi f (n - centre))`, with f in cycles a sample and `centre` the middle of the
-linear samples.
+Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing is by `exp(-j 2 pi f (n -
+centre))`, with f in cycles a sample and `centre` the middle of the linear samples.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import scipy.fft
+import scipy.ndimage
 from numpy.typing import NDArray
 
 from host.sync import hpf
-from host.sync.tone import phasor
+from host.sync.tone import block_edges, block_times, cis, phasor, refine, search_size, strongest
 
 CHUNK = 8
 """Positions at a time: the working set stays in the second-level cache."""
@@ -19,112 +20,119 @@ CHUNK = 8
 FOLD = 4
 """Samples that are averaged before the second estimate: tones 2.7 IF bins off the middle lose 0.8 % of their power."""
 
-Frames = NDArray[np.complex64]
+BAND_BINS = 9
+"""IF bins over which the signal's centre is sought: direct path and object lie within."""
 
 
-def load(words: NDArray[np.int16]) -> Frames:
-    """Complex64 [position, chirp, rx, sample] of raw frames."""
-    positions, chirps, samples, _, rx = words.shape
-    out = np.empty((positions, chirps, rx, samples), np.complex64)
-    out.real = words[..., 0, :].swapaxes(2, 3)
-    out.imag = words[..., 1, :].swapaxes(2, 3)
-    return out
-
-
-def products(
-    frames: Frames, reference: NDArray[np.intp], linear: tuple[int, int], size: int
-) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.float32], NDArray[np.int32]]:
-    """Conjugate products with a reference chirp, summed over the RX.
+def match(
+    words: NDArray[np.int16], reference: NDArray[np.intp], linear: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]:
+    """The tone between each chirp and a reference chirp: the strongest of their conjugate product, summed over the RX.
 
     Parameters
     ----------
-    frames
-        From :func:`load`.
+    words
+        int16 [position, chirp, sample, 2, rx].
     reference
         int [position]: the reference chirp of each.
     linear
         Linear samples `[a, b)`.
-    size
-        Length that is padded to with zeros.
 
     Returns
     -------
-    products
-        complex64 [position, chirp, size].
-    chosen
-        complex64 [position, rx, size]: the reference chirps' linear samples.
+    frequency
+        float64 [position, chirp], cycles a sample, within some hundredths of a bin.
+    amplitude
+        complex128 [position, chirp]: the tone's sum over RX and linear samples, at their middle.
+    centre
+        float64 [position]: middle of the band that holds the reference chirp's signal, cycles a sample 0..1: where the
+        spectrum of all RX, smoothed over half `BAND_BINS` three times, is highest.
     energy
         float32 [position, chirp], over RX and linear samples.
     peak
         int32 [position, chirp]: largest |I| or |Q| of the whole chirp.
     """
-    a, b = linear
-    positions, chirps, rx, _ = frames.shape
-    inside = frames[..., a:b]
+    frames = _complex(words)
+    n, (positions, chirps, rx, _) = linear[1] - linear[0], frames.shape
+    size = search_size(n)
+    inside = frames[..., slice(*linear)]
     chosen = np.zeros((positions, rx, size), np.complex64)
-    chosen[..., : b - a] = inside[np.arange(positions), reference]
-    out = np.zeros((positions, chirps, size), np.complex64)
-    out[..., : b - a] = (inside * chosen[:, None, :, : b - a].conj()).sum(axis=2)
+    chosen[..., :n] = inside[np.arange(positions), reference]
+    products = np.zeros((positions, chirps, size), np.complex64)
+    products[..., :n] = (inside * chosen[:, None, :, :n].conj()).sum(axis=2)
+    tone = strongest(products, n)
+
+    spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(chosen, axis=-1))
+    power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
+    for _ in range(3):  # three boxes make a bell: two tones within it give one peak, between them
+        power = scipy.ndimage.uniform_filter1d(power, BAND_BINS * size // n // 2, axis=-1, mode="wrap")
     energy = (inside.real**2 + inside.imag**2).sum(axis=(2, 3))
     parts = frames.view(np.float32)
-    peak = np.maximum(parts.max(axis=(2, 3)), -parts.min(axis=(2, 3)))
-    return out, chosen, energy, peak.astype(np.int32)
+    peak = np.maximum(parts.max(axis=(2, 3)), -parts.min(axis=(2, 3))).astype(np.int32)
+    return tone.frequency, tone.amplitude.astype(complex), np.argmax(power, axis=-1) / size, energy, peak
 
 
 def against_others(
-    frames: Frames,
+    words: NDArray[np.int16],
     frequency: NDArray[np.float64],
     taps: NDArray[np.complex64],
     good: NDArray[np.bool_],
     linear: tuple[int, int],
-    edges: NDArray[np.intp],
-) -> tuple[NDArray[np.complex64], NDArray[np.float32], NDArray[np.float32]]:
-    """Mix down, average every `FOLD` samples, filter, and multiply each chirp with the sum of the good ones.
+) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+    """Mix down, average every `FOLD` samples, filter, and find the tone between each chirp and the sum of all others.
 
     Parameters
     ----------
-    frames
-        From :func:`load`.
+    words
+        int16 [position, chirp, sample, 2, rx].
     frequency
         float64 [position, chirp].
     taps
         complex64 [position, chirp, tap]: one or three, one averaged sample apart (`hpf.Equaliser`).
     good
-        bool [position, chirp].
+        bool [position, chirp]: chirps of the sum.
     linear
         Linear samples `[a, b)`, a multiple of `FOLD` many.
-    edges
-        Where the averaged samples are cut into parts.
 
     Returns
     -------
-    sums
-        complex64 [2, position, chirp, part]: products over even and over odd RX.
-    own
-        float32 [position, chirp, part]: the chirp's own share of them, energy over all RX.
+    frequency, amplitude
+        float64 and complex128 [position, chirp]: the tone, as of `tone.refine`, by two Newton steps from zero.
+    energy
+        float32 [position, chirp]: the chirp's own, over RX and averaged samples.
     level
         float32 [position]: energy of the good chirps' sum.
+    apart
+        float64 [2, position, chirp]: what the tones seen by even and by odd RX differ by, with the chirp itself left
+        in: cycles a sample, and radians.
     """
     a, b = linear
     turn = phasor(-frequency, np.zeros(frequency.shape), b - a, (b - a - 1) / 2)
-    mixed = frames[..., a:b] * turn[:, :, None]
-    folded = hpf.filtered(_fold(mixed), taps)
+    folded = hpf.filtered(_fold(_complex(words)[..., a:b] * turn[:, :, None]), taps)
     positions, chirps, rx, blocks = folded.shape
     total = (good[:, None].astype(np.complex64) @ folded.reshape(positions, chirps, rx * blocks)).reshape(
         positions, 1, rx, blocks
     )
+    edges = block_edges(blocks)
+    times, starts = block_times(edges) * FOLD, edges[:-1]
     product = folded * total.conj()
     halves = np.stack([product[:, :, 0::2].sum(axis=2), product[:, :, 1::2].sum(axis=2)])
-    own = (folded.real**2 + folded.imag**2).sum(axis=2)
+    sums = np.add.reduceat(halves, starts, axis=-1).astype(complex)
+    own = np.add.reduceat((folded.real**2 + folded.imag**2).sum(axis=2), starts, axis=-1)
+    tone = refine(sums[0] + sums[1] - np.where(good[..., None], own, 0), times, steps=2)
+    split = refine(sums * cis(-2 * np.pi * tone.frequency[..., None] * times), times, steps=1)
+    apart = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
     return (
-        np.add.reduceat(halves, edges[:-1], axis=-1),
-        np.add.reduceat(own, edges[:-1], axis=-1),
+        tone.frequency,
+        tone.amplitude.astype(complex),
+        own.sum(axis=-1),
         (total.real**2 + total.imag**2).sum(axis=(1, 2, 3)),
+        np.stack(apart),
     )
 
 
 def average(
-    frames: Frames,
+    words: NDArray[np.int16],
     frequency: NDArray[np.float64],
     weights: NDArray[np.complex64],
     second_half: NDArray[np.bool_],
@@ -134,8 +142,8 @@ def average(
 
     Parameters
     ----------
-    frames
-        From :func:`load`.
+    words
+        int16 [position, chirp, sample, 2, rx].
     frequency
         float64 [position, chirp].
     weights
@@ -154,6 +162,7 @@ def average(
         averaged.
     """
     a, b = linear
+    frames = _complex(words)
     positions, chirps, rx, samples = frames.shape
     turn = phasor(-frequency, np.zeros(frequency.shape), samples, (a + b - 1) / 2)
     mixed = (frames * turn[:, :, None]).reshape(positions, chirps, rx * samples)
@@ -162,6 +171,15 @@ def average(
     terms = (split.reshape(positions, 2 * taps, chirps) @ mixed).reshape(positions * 2, taps, rx, samples)
     parts = hpf.shifted(terms, FOLD).sum(axis=1).reshape(positions, 2, rx, samples)
     return parts.sum(axis=1), _fold(parts[..., a:b])
+
+
+def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
+    """Complex64 [position, chirp, rx, sample] of raw words."""
+    positions, chirps, samples, _, rx = words.shape
+    out = np.empty((positions, chirps, rx, samples), np.complex64)
+    out.real = words[..., 0, :].swapaxes(2, 3)
+    out.imag = words[..., 1, :].swapaxes(2, 3)
+    return out
 
 
 def _fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:

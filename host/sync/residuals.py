@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from host.sync.align import AlignedRow
 from host.sync.direct_path import DirectPath, Referenced
 from host.sync.passes import FOLD
-from host.sync.tone import Complex, Real, block_edges, block_times, phasor, refine
+from host.sync.tone import Complex, Real, block_edges, block_times, cis, phasor, refine
 
 STAGES = {
     "received": "one chirp as the hardware trigger left it",
@@ -40,7 +40,7 @@ def errors(aligned: AlignedRow, done: Referenced, path: DirectPath, sample_rate_
             np.abs(done.amplitude)[found, None] * aligned.amplitude[found] / aligned.gain[found],
         ]
     )[:, good]
-    turns = np.exp(1j * received[1])
+    turns = cis(received[1])
     received[0] -= received[0].mean()
     received[1] = np.angle(turns * np.conj(turns.mean()))
     received[2] = received[2] / received[2].mean() - 1
@@ -50,12 +50,12 @@ def errors(aligned: AlignedRow, done: Referenced, path: DirectPath, sample_rate_
 
     two = found & (aligned.good.sum(axis=1) > 1)
     n = aligned.good[two].sum(axis=1)
-    halves = done.halves[two] * (n[:, None] / np.stack([(n + 1) // 2, n // 2], axis=1))[..., None, None]
+    whole = (n[:, None] / np.stack([(n + 1) // 2, n // 2], axis=1)).astype(np.float32)
     out = {
         "received": received,
         "aligned": one,
         "averaged": _direct_path(done.halves[found].sum(axis=1), path),
-        "referenced": _object(halves.astype(np.complex64), path),
+        "referenced": _object(done.halves[two] * whole[..., None, None], path) if two.any() else np.zeros((3, 0)),
     }
     for values in out.values():
         values[0] *= sample_rate_hz
@@ -66,9 +66,16 @@ def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
     """Noise power of a sample of one channel of one chirp, [position], from what two averages differ by; else nan."""
     n = aligned.good.sum(axis=1)
     parts = np.stack([(n + 1) // 2, n // 2], axis=1)
-    each = aligned.halves * (n[:, None] / np.maximum(parts, 1))[..., None, None]
-    power = (np.abs(each[:, 0] - each[:, 1]) ** 2).mean(axis=(1, 2))
+    whole = (n[:, None] / np.maximum(parts, 1)).astype(np.float32)[..., None, None]
+    apart = aligned.halves[:, 0] * whole[:, 0] - aligned.halves[:, 1] * whole[:, 1]
+    power = _energy(apart) / (apart.shape[1] * apart.shape[2])
     return np.where(n > 1, power * FOLD / (1 / np.maximum(parts, 1)).sum(axis=1), np.nan)
+
+
+def _energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Sum of squared magnitudes over RX and blocks, of signals [position, rx, block]."""
+    parts = np.ascontiguousarray(signal).view(np.float32)
+    return np.einsum("prn,prn->p", parts, parts)
 
 
 def _direct_path(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
@@ -94,13 +101,15 @@ def _object(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float
     # Each half referenced to its own direct path, which is then taken away: what is left is the object.
     amplitude, w = _estimate(halves, path.estimator)
     back = phasor(-w * FOLD / (2 * np.pi), -np.angle(amplitude), n, (n - 1) / 2)
-    echo = halves * back[:, :, None] - np.abs(amplitude)[..., None, None]
+    echo = halves * back[:, :, None]
+    echo -= np.abs(amplitude).astype(np.float32)[..., None, None]
     product = (echo[:, 0] * echo[:, 1].conj()).sum(axis=1)
     edges = block_edges(n)
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
-    size = np.abs((echo * echo.mean(axis=1, keepdims=True).conj()).sum(axis=(2, 3)))
+    # Amplitudes along the mean of both: the products of each with it are sums of these.
+    energy, common = np.stack([_energy(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
+    size = np.abs(energy + np.stack([common, common.conj()], axis=1))
     contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
-    energy = (echo.real**2 + echo.imag**2).sum(axis=(2, 3))
     # Two records of noise are this coherent by chance; an echo that is no more so is none.
     echoing = np.abs(tone.amplitude) > 4 / np.sqrt(rx * n) * np.sqrt(energy.prod(axis=1))
     return np.stack([tone.frequency / 2, np.angle(tone.amplitude) / 2, contrast])[:, echoing]

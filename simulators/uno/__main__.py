@@ -6,25 +6,24 @@ times per heartbeat allows 2, and a machine that cannot keep up slows the simula
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 from pathlib import Path
 
 from shared.config import load_instrument
 from shared.errors import PolysightError
-from simulators._process import die_with_parent
+from simulators._process import command_line, die_with_parent
 from simulators.stage_logic import homing_zero
 from simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run until SIGTERM or SIGINT."""
-    p = argparse.ArgumentParser(prog="python -m simulators.uno", description=__doc__)
+    p = command_line("simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
     p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
     p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires: gets trigger and motion")
     p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")
-    p.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="times real time; see below")
+    p.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="times real time; see above")
     p.add_argument("--boot-ms", type=int, default=200, metavar="N", help="after opening, in the board's own time")
     args = p.parse_args(argv)
     if not args.time_scale > 0:

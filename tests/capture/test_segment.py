@@ -33,3 +33,15 @@ def test_damaged_index_is_refused(tmp_path):
         (tmp_path / "a.idx").write_bytes(raw)
         with pytest.raises(DataError):
             read_index(tmp_path / "a.idx")
+
+
+def test_messages_name_the_scan_folder(tmp_path):
+    index = tmp_path / "scan/raw/RH/0003.idx"
+    index.parent.mkdir(parents=True)
+    index.write_bytes(b"[]\n")
+    with pytest.raises(DataError) as damaged:
+        read_index(index)
+    assert f"polysight validate {tmp_path / 'scan'}`" in damaged.value.remedy
+    with pytest.raises(DeviceError) as full:
+        Segment(index.with_suffix(".part"), 1 << 60)
+    assert f"polysight resume {tmp_path / 'scan'}`" in full.value.remedy

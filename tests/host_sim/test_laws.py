@@ -8,7 +8,7 @@ import pytest
 
 from host.materials import Classifier, Library, pixel_accuracy
 from host.materials.segment import axis_mm, box_mask
-from host.pipeline import LIBRARY
+from host.options import LIBRARY
 from host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
 
 pytestmark = pytest.mark.xdist_group("host_sim")

@@ -15,14 +15,15 @@ from host.materials import (
     Weights,
     analyse,
     estimate_permittivity,
-    fit_weights,
+    fit_library,
     make_library,
     median_ratio,
     pixel_accuracy,
     read_truth,
     table2,
 )
-from host.materials.classify import ratio_distance, vote
+from host.materials.decision import majority
+from host.materials.knn import ratio_distance
 from host.materials.library import FORMAT
 from host.polarimetry import fresnel
 from shared.errors import DataError
@@ -104,9 +105,9 @@ def test_at_least_eight_of_nine_named_right(synthetic, library):
 
 def test_polarimetry_beats_one_channel(library):
     """The law behind the instrument: P separates what |H| cannot, and all three together are no worse than P."""
-    channel = library.fit["by_channel"]
-    assert channel["p"] > channel["h"] + 0.1
-    assert library.fit["pixel_accuracy"] >= channel["p"]
+    fit = library.fit["angles"]["55"]
+    assert fit["by_channel"]["p"] > fit["by_channel"]["h"] + 0.1
+    assert fit["pixel_accuracy"] >= fit["by_channel"]["p"]
 
 
 def test_far_material_is_unknown(synthetic, library):
@@ -118,14 +119,16 @@ def test_far_material_is_unknown(synthetic, library):
     assert names["copper"] == "copper"
 
 
-def test_weights_need_two_scans_and_splits_are_by_scan(library):
-    with pytest.raises(DataError, match="at least 2"):
-        fit_weights(library.select(library.scans[:1]))
+def test_one_scan_is_not_enough_and_splits_are_by_scan(library):
+    with pytest.raises(DataError, match="1 scan"):
+        fit_library(library.select(library.scans[:1]))
     # With names shuffled among patches only the patch's own pixels could tell: a split that leaks would succeed.
     some = library.select(library.scans[:4])
     names = np.random.default_rng(0).permutation([e.name for e in some.entries])
     shuffled = Library(tuple(replace(e, name=str(n)) for e, n in zip(some.entries, names, strict=True)))
-    assert fit_weights(shuffled, pixels_per_patch=6).pixel_accuracy < 0.4
+    fit = fit_library(shuffled).fit["angles"]["55"]
+    assert all(judged["pixels"] < 0.4 for judged in fit["judged"].values())
+    assert fit["judged"][fit["model"]]["pixels_split_by_pixel"] > 2 * fit["pixel_accuracy"]  # the patch knows itself
 
 
 def test_unusable_libraries_are_refused(library):
@@ -158,10 +161,13 @@ def test_pixels_that_are_not_finite_are_unknown(library):
     assert c.patch([], [], []).name == UNKNOWN
 
 
-def test_vote_is_a_majority():
-    v = vote(np.array(["a", "b", "a", "unknown"]), np.array([0.1, 0.2, 0.3, 9.0]))
-    assert (v.name, v.confidence, v.pixels) == ("a", 0.5, 4)
-    assert list(v.votes) == ["a", "b", "unknown"]
+def test_a_majority_names_the_patch():
+    names, distance = np.array(["a", "b", "a", "c"]), np.array([0.1, 0.2, 0.3, 9.0])
+    found = majority(names, distance, np.array([7, 7, 7, 9]))
+    assert found.patches.tolist() == [7, 9]
+    assert found.names.tolist() == ["a", "c"]
+    assert found.confidence == pytest.approx([2 / 3, 1.0])
+    assert found.distance.tolist() == [0.2, 9.0]
 
 
 @pytest.mark.parametrize("row", [m for m in table2() if m.number not in (1, 23)], ids=lambda m: m.name)

@@ -38,6 +38,45 @@ def test_nine_plates_and_no_more(synthetic, seed):
         assert (found.labels[patch.mask] == patch.label).all()
 
 
+WEAK_AND_STRONG = {
+    "copper": None,
+    "water": 9.37 - 18.0j,
+    "rubber": 5.06 - 1.11j,
+    "wood": 2.61 - 0.01j,
+    "fabric": 2.21 - 0.13j,
+    "foam": 1.3 - 0.0j,  # |r_s| = 0.16
+}
+
+
+def found_right(synthetic, seeds, **scene_facts):
+    """Plates whose box is found within 6 mm, of all, and patches that are none."""
+    right = extra = plates = 0
+    for seed in seeds:
+        scene = synthetic(seed, **scene_facts)
+        found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+        matched = match(found.patches, scene.plates)
+        plates += len(scene.plates)
+        extra += len(found.patches) - len(matched)
+        for patch in found.patches:
+            truth = matched.get(patch.label)
+            right += truth is not None and bool(np.allclose(patch.box_mm, truth.box_mm, rtol=0, atol=6.0))
+    return right, plates, extra
+
+
+def test_speckle_does_not_hide_the_plates(synthetic):
+    """Noise of a fifth of metal's amplitude in each channel: two fifths of a dielectric's in H, more than all in V."""
+    right, plates, extra = found_right(synthetic, range(4), noise=0.2)
+    assert right >= 0.85 * plates
+    assert extra <= 2
+
+
+def test_weak_plates_are_found_beside_strong_ones(synthetic):
+    """From metal to foam, 16 dB below it and 8 dB above the noise."""
+    right, plates, extra = found_right(synthetic, range(4), materials=WEAK_AND_STRONG, noise=0.06)
+    assert right >= plates - 1
+    assert extra <= 1
+
+
 @pytest.mark.parametrize("count", [1, 4, 7])
 def test_their_number_is_not_told(synthetic, nine, count):
     few = dict(list(nine.items())[:count])
@@ -87,18 +126,35 @@ def test_metal_is_found_by_itself_whatever_the_gains(synthetic):
     for seed in range(4):
         scene = synthetic(seed, gain_v=0.05j)
         found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        metal = find_metal(scene.h, scene.v, found)
+        metal = find_metal(scene.h, scene.v, found, scene.theta)
         assert match(found.patches, scene.plates)[metal.label].name == "copper"
         assert metal.certain
         assert "brightest in both channels" in metal.how
 
 
-def test_scene_without_metal_is_called_uncertain(synthetic, nine):
-    scene = synthetic(0, {n: e for n, e in nine.items() if e is not None})
+WITHOUT_METAL = {
+    "eight dielectrics": ("rubber", "cardboard (rough)", "silicone rubber", "PET 0.5 mm", "ceramic", "wood (thin)"),
+    "far ahead of the rest": ("ceramic", "silicone rubber", "wood (thin)"),  # |H||V| 2.3 times the next
+    "alone": ("rubber",),
+    "two": ("ceramic", "wood (thin)"),  # 8 times the next
+}
+
+
+@pytest.mark.parametrize("names", WITHOUT_METAL.values(), ids=WITHOUT_METAL.keys())
+def test_scene_without_metal_is_called_uncertain(synthetic, nine, names):
+    for seed in range(3):
+        scene = synthetic(seed, {n: nine[n] for n in names})
+        found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+        metal = find_metal(scene.h, scene.v, found, scene.theta)
+        assert not metal.certain
+        assert "--reference" in metal.how
+
+
+def test_leakage_is_taken_into_account_when_metal_is_judged(synthetic):
+    scene = synthetic(1, leak=(0.05, 0.05))
     found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    metal = find_metal(scene.h, scene.v, found)
-    assert not metal.certain
-    assert "--metal" in metal.how
+    assert find_metal(scene.h, scene.v, found, scene.theta, (0.05, 0.05)).certain
+    assert not find_metal(scene.h, scene.v, found, scene.theta).certain
 
 
 def test_metal_by_box_and_label(synthetic):

@@ -85,6 +85,7 @@ def test_installing_twice_keeps_the_rig_file(tmp_path):
     for name in ("etc/systemd/system/polysight-pi.service", "etc/udev/rules.d/60-polysight.rules"):
         assert (root / name).read_text() == (PI / Path(name).name).read_text()
     asked = log.read_text()
+    assert "--groups gpio,dialout" in asked, "by hand, `polysight-pi check` as this user has no group from the unit"
     for words in ("useradd --system", f"venv {root}/opt/polysight/venv", f"{ROOT}/pi_controller", "systemctl enable"):
         assert words in asked
     assert PROGRAM in done.stdout

@@ -67,3 +67,10 @@ def test_a_board_is_checked_and_gets_firmware(rig_file, words, board, clock, mon
 def test_an_unknown_board_is_named(rig_file, monkeypatch, capsys):
     assert run(monkeypatch, "check", rig_file(), "XX") == 2
     assert "no board 'XX'" in capsys.readouterr().err
+
+
+def test_a_rig_without_native_boards_is_told_what_to_set(rig, rig_file, monkeypatch, capsys):
+    path = rig_file(msgspec.structs.replace(rig, radar=type(rig.radar)()))
+    for what in (("plan", path), ("check", path, "RH")):
+        assert run(monkeypatch, *what) == 2
+        assert "usb_serial" in capsys.readouterr().err

@@ -8,7 +8,9 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 
+from host.quality import masked_runs
 from host.report import (
     ReportContext,
     banner_png,
@@ -19,9 +21,12 @@ from host.report import (
     write_json,
     write_report,
 )
-from host.report.figures import colours_of
+from host.report.coverage import coverage_figure, masked_positions
+from host.report.figures import colours_of, png
 from host.report.quality import pretty, text
+from host.report.report import render
 from shared.errors import DataError
+from shared.raster import RasterPlan
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -280,3 +285,60 @@ def test_numbers_read_well():
     assert text({"a": 1, "b": [2, 3]}) == "a: 1, b: 2, 3"
     assert pretty("RH if_hz") == "RH IF (Hz)"
     assert pretty("rows_retaken") == "rows retaken"
+
+
+def scanned(ctx, boards):
+    return replace(ctx, plan=RasterPlan(6, 4, 10.0, 5.0), quality={**ctx.quality, "boards": boards})
+
+
+def test_masked_positions_come_out_of_runs_and_of_rows_that_are_absent(ctx):
+    boards = {"RH": {"masked_columns": {"2": [[0, 2], [5, 6]]}, "rows_recorded": [0, 1, 2]}}
+    mask = masked_positions(scanned(ctx, boards))["RH"]
+    assert np.argwhere(mask).tolist() == [[2, 0], [2, 1], [2, 5], *([3, c] for c in range(6))]
+
+
+def test_runs_and_their_mask_are_the_same(ctx):
+    rng = np.random.default_rng(5)
+    for share in (0.0, 0.3, 1.0):
+        rows = rng.uniform(size=(4, 6)) < share
+        runs = {str(i): masked_runs(row) for i, row in enumerate(rows) if row.any()}
+        found = masked_positions(scanned(ctx, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}}))
+        assert (found["RH"] == rows).all()
+
+
+def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(ctx):
+    boards = {"RH": {"masked_columns": {"2": [[0, 3]]}, "rows_recorded": [0, 1, 2, 3], "raw_crc32": {"0": "deadbeef"}}}
+    told = replace(
+        scanned(ctx, boards),
+        rx_gains={"RH": [{"gain_db": 0.0, "phase_deg": 0.0}, {"gain_db": 1.25, "phase_deg": -8.1}]},
+        rig_file='name = "a <rig>"',
+    )
+    picture = png(coverage_figure(told, masked_positions(told)))
+    page = Page(render(told, {"coverage": picture}))
+    assert base64.b64encode(picture).decode() in page.sources[0]
+    assert "RH 3 of 24 (12.50%)" in page.words
+    assert "+1.25 dB" in page.words
+    assert "-8.1°" in page.words
+    assert 'name = "a <rig>"' in page.words
+    assert "deadbeef" not in page.words
+
+
+def test_without_anything_masked_that_is_said(ctx):
+    boards = {"RH": {"masked_columns": {}, "rows_recorded": [0, 1, 2, 3]}}
+    assert "Every position of every board has data." in Page(render(scanned(ctx, boards), {})).words
+
+
+def test_the_maps_of_amplitude_keep_their_order_in_grey_and_the_phase_map_is_cyclic():
+    """Amplitudes are told apart by lightness alone, as by any eye; -180 and 180 degrees have one colour."""
+    grey = np.array([0.2126, 0.7152, 0.0722])
+    assert (np.diff(colormaps["cividis"](np.linspace(0, 1, 64))[:, :3] @ grey) > 0).all()
+    ends = colormaps["twilight"](np.array([0.0, 1.0]))
+    assert np.abs(ends[0] - ends[1]).max() < 0.02
+
+
+def test_a_board_s_figures_stand_one_by_one_and_keep_their_units(ctx):
+    board = {"frames_expected": 7, "direct_path_hz": {"median": 123.0, "min": 9}, "stage_backlash_mm": None}
+    words = Page(render(replace(ctx, quality={"boards": {"RH": board}}), {})).words
+    assert "direct path median (Hz) 123" in words
+    assert "direct path min (Hz) 9" in words
+    assert "stage backlash (mm) –" in words

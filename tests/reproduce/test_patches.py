@@ -5,10 +5,12 @@ import inspect
 import numpy as np
 import pytest
 
-from host.materials.models import score
+from host.materials.judge import score
+from host.materials.models import DISCRIMINANT, PAPER
 from host.polarimetry import fresnel, permittivity_from_ratio
 from host.reproduce import patches
-from host.reproduce.patches import PAPER_KNN, Errors, calibrated_errors, draw, groups, h_accuracy
+from host.reproduce.bound import pixel_bound
+from host.reproduce.patches import Errors, calibrated_errors, draw, groups, h_accuracy
 from host.reproduce.published import published
 
 QUIET = Errors(0.0, 0.0)
@@ -63,13 +65,13 @@ def test_the_phase_error_is_the_published_residual_and_nothing_but_h_was_looked_
     monkeypatch.setattr(patches, "score", spy)
     errors = inspect.unwrap(calibrated_errors)("powders", 1)
     assert errors.phase_rad == 0.022
-    assert set(seen) == {(PAPER_KNN, "H", True)}
+    assert set(seen) == {(PAPER, "H", True)}
 
 
 def test_v_and_p_add_to_what_h_tells():
     group = groups()["powders"]
     seen = draw(group.materials, group.angle_deg, calibrated_errors("powders", 1), seed=3).samples()
-    h, all_three = (score(seen, PAPER_KNN, c).pixels for c in ("H", "H+V+P"))
+    h, all_three = (score(seen, PAPER, c).pixels for c in ("H", "H+V+P"))
     assert all_three > h + 0.2
 
 
@@ -77,3 +79,39 @@ def test_more_noise_is_never_better():
     group = groups()["powders"]
     shares = [h_accuracy(group, Errors(a, 0.022), (1, 2)) for a in (0.003, 0.03, 0.3)]
     assert shares[0] > shares[1] > shares[2] > 0.15
+
+
+def test_no_classifier_passes_the_bound_and_the_better_one_comes_near():
+    group, errors = groups()["powders"], Errors(0.03, 0.06)
+    found = [score(draw(group.materials, 60.0, errors, seed).samples(), DISCRIMINANT) for seed in range(12)]
+    alone = pixel_bound(group.materials, (60.0,), errors, True, 1)
+    known = pixel_bound(group.materials, (60.0,), errors, False, 1)
+    patch = pixel_bound(group.materials, (60.0,), errors, False, 12)
+    assert alone < known < patch
+    for share, bound in (("pixels", alone), ("in_scan", known), ("by_patch", patch)):
+        mean = np.mean([getattr(s, share) for s in found])
+        assert bound - 0.08 < mean < bound + 0.03, share  # chance of twelve draws
+
+
+def test_the_bound_is_one_without_errors_and_falls_to_chance():
+    materials = groups()["powders"].materials
+    bounds = [pixel_bound(materials, (60.0,), Errors(a, a), True, 1) for a in (1e-6, 0.03, 0.1, 30.0)]
+    assert bounds[0] == 1.0
+    assert sorted(bounds, reverse=True) == bounds
+    assert bounds[-1] == pytest.approx(0.25, abs=0.05)
+    one, two = (pixel_bound(materials, angles, Errors(0.05, 0.05), True, 1) for angles in ((60.0,), (60.0, 55.0)))
+    assert two > one
+
+
+def test_confusions_stand_in_the_order_of_table_2():
+    from host.reproduce.confusion import confusion_figure
+
+    group = groups()["powders"]
+    found = score(draw(group.materials, 60.0, Errors(0.03, 0.06), 0).samples(), DISCRIMINANT)
+    figure = confusion_figure(group.materials, [(found, found.confusion, "title")])
+    labels = [t.get_text() for t in figure.axes[0].get_xticklabels()]
+    assert labels == [str(m.number) for m in group.materials]
+    shown = figure.axes[0].images[0].get_array()
+    salt = [m.name for m in group.materials].index("Salt (with plastic)")
+    at = found.names.index("Salt (with plastic)")
+    assert shown[salt, salt] == pytest.approx(100 * found.confusion[at, at])

@@ -67,6 +67,7 @@ commands = st.one_of(
     st.builds(m.Resume, **v),
     st.builds(m.Abort, reason=text, **v),
     st.builds(m.Status, **v),
+    st.builds(m.Pulse, pulses=st.integers(1, m.MOST_PULSES), period_us=x, width_us=x, **v),
     st.builds(m.Replay, scan_id=text, from_seq=small, limit=st.integers(1, 10000), **v),
 )
 replies = st.one_of(
@@ -89,6 +90,7 @@ replies = st.one_of(
         reason=text,
         **v,
     ),
+    st.builds(m.Pulsed, pulses=n, width_max_ns=n, jitter_ns=n, fault=n, **v),
     st.builds(m.ReplayReply, events=st.lists(events, max_size=3), last_seq=n, **v),
 )
 

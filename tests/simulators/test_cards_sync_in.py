@@ -75,7 +75,7 @@ def test_motion_lines_are_kept_long_enough_and_not_for_ever() -> None:
 def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
     moving, frozen = StageTrack(RIG), StageTrack(RIG, burst_motion=False)
     trigger = 1_000_000_000
-    times = [trigger + k * 1_500_000 for k in range(16)]
+    times = [trigger + 200_000 + k * 1_500_000 for k in range(16)]  # as the Pi sends them
     for track in (moving, frozen):
         track.add(WireMotion(0, 400_000, 250_000, 20_000))
         track.trigger(trigger)

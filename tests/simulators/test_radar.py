@@ -327,8 +327,8 @@ def test_the_transmitting_board_sends_its_leakage_and_noise() -> None:
 
 def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
     moving, still = radar(burst_motion=True), radar()
-    assert np.allclose(moving.burst_mm(1), 20.0 * np.arange(16) * 1.5e-3)
-    assert np.allclose(still.burst_mm(-1), -0.225)
+    assert np.allclose(moving.burst_mm(1), 20.0 * (0.2e-3 + np.arange(16) * 1.5e-3))
+    assert np.allclose(still.burst_mm(-1), -0.229)
     for direction in (1, -1):
         assert np.isclose(moving.burst_mm(direction).mean(), still.burst_mm(direction).mean())
 

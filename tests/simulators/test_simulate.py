@@ -12,7 +12,7 @@ import pytest
 from shared.config import load_instrument
 from shared.errors import ConfigError, DataError
 from shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
-from shared.raster import plan_raster
+from shared.raster import FIRST_PULSE_DELAY_S, plan_raster
 from simulators.__main__ import main
 from simulators.radar import SimulatedRig
 from simulators.scene import decode_scene
@@ -38,7 +38,8 @@ def test_rows_hold_the_radars_bytes_at_true_positions(tmp_path: Path) -> None:
     radar = SimulatedRig(RIG, SCENE)
     row = plan_raster(radar.rig.grid).row(1)
     x, y = row_offsets_mm(radar, row)
-    assert x[0] == 20.0  # odd rows start at the largest x and move on during each burst
+    # Odd rows start at the largest x, and move on until the first pulse and during each burst.
+    assert np.isclose(x[0], 20.0 - RIG.stage.speed_mm_s * FIRST_PULSE_DELAY_S)
     assert np.allclose(np.diff(x.reshape(5, 16), axis=1), -0.03)
     assert np.allclose(np.diff(x.reshape(5, 16)[:, 0]), -10.0)
     expected = radar.chirps("RV", x, y, first_pulse=len(x))

@@ -128,6 +128,60 @@ def test_settings_make_the_rig(write, base):
         assert rx_positions_m(rig, new)[0][0] == pytest.approx(rx_positions_m(base, old)[0][0] + wider / 2)
 
 
+ANGLES = {
+    "txboard_angle_y": 44.0,
+    "rxboard_v_angle_y": -20.0,
+    "rxboard_angle_y": -55.0,
+    "rxboard_angle_z": 22.5,
+    "rxboard_tilt_offset": [38.3, 33.0, 30.0],
+}
+
+
+def test_the_published_angles_are_the_rig_files(write, base):
+    folder, _ = write(**ANGLES)
+    assert open_scan(folder, base).instrument.boards == base.boards
+    assert open_scan(folder, base).notices == ()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "moved"),
+    [
+        ("txboard_angle_y", 40.0, {"LS"}),
+        ("rxboard_v_angle_y", -10.0, {"RV"}),
+        ("rxboard_angle_y", -60.0, {"RH", "RV"}),
+        ("rxboard_angle_z", 20.0, {"RH", "RV"}),
+        ("rxboard_tilt_offset", [30.0, 33.0, 31.0], {"RH", "RV"}),
+    ],
+)
+def test_each_mount_angle_of_the_scan_turns_its_boards(write, base, key, value, moved):
+    folder, _ = write(**ANGLES | {key: value})
+    rig = open_scan(folder, base).instrument
+    assert {b.name for b, old in zip(rig.boards, base.boards, strict=True) if b.mount != old.mount} == moved
+    for name in moved:  # by hand: undo what comes after the turn, and turn by the difference
+        old, new = base.by_name(name), rig.by_name(name)
+        if key == "rxboard_tilt_offset":
+            turn = np.radians(-55.0)
+            shift = np.array([np.cos(turn) * -8.3 + np.sin(turn) * 1.0, 0, -np.sin(turn) * -8.3 + np.cos(turn) * 1.0])
+            for a, b in zip(rx_positions_m(base, old), rx_positions_m(rig, new), strict=True):
+                np.testing.assert_allclose(np.subtract(b, a) * 1e3, shift, atol=1e-9)
+        if key in ("txboard_angle_y", "rxboard_angle_y"):
+            by = np.radians(value - ANGLES[key])
+            place = tx_position_m if name == "LS" else lambda r, board=new: rx_positions_m(r, r.by_name(board.name))[0]
+            a, b = np.array(place(base)), np.array(place(rig))
+            origin = np.array([-0.75875 if name == "LS" else 0.75875, 0, 0])
+            x, y, z = a - origin
+            turned = [np.cos(by) * x + np.sin(by) * z, y, -np.sin(by) * x + np.cos(by) * z]
+            np.testing.assert_allclose(b - origin, turned, atol=1e-9)
+
+
+def test_a_board_never_looks_away_from_the_object(write, base):
+    folder, _ = write(**ANGLES | {"rxboard_angle_y": 55.0, "txboard_angle_y": -44.0})
+    scan = open_scan(folder, base)
+    assert scan.instrument.boards == base.boards
+    assert len(scan.notices) == 3
+    assert "away from the object" in scan.recording()["notices"][0]
+
+
 def test_units_of_tis_tools_are_understood_too(write, base):
     chirp = {"f0": 76.01, "slope": 38.816929, "ramp_time": 128.5, "adc_start_time": 7, "num_adc": SAMPLES, "Fs": 2150}
     folder, _ = write(chirp_configs=[chirp])
@@ -187,11 +241,11 @@ def test_contradictions_are_refused(write, base):
         open_scan(folder, base)
 
 
-def test_columns_first_scans_and_other_folders_are_refused(write, base, tmp_path):
+def test_other_orders_and_other_folders_are_refused(write, base, tmp_path):
     with pytest.raises(DataError, match="not a scan"):
         open_scan(tmp_path, base)
-    folder, _ = write(moving_direction="col")
-    with pytest.raises(DataError, match="moving_direction 'col'"):
+    folder, _ = write(moving_direction="spiral")
+    with pytest.raises(DataError, match="moving_direction 'spiral'"):
         open_scan(folder, base)
     with pytest.raises(DataError, match="geometry"):
         open_scan(folder)

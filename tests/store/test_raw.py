@@ -13,7 +13,7 @@ import pytest
 
 from host.dropping import drop_raw, processed_digests
 from host.live import resume
-from host.pipeline import Options
+from host.options import Options
 from host.store.appending import AppendFile
 from host.store.raw import drop, droppable, dropped_files, require_raw
 from host.store.scanfolder import MANIFEST, ScanFolder

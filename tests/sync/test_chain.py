@@ -1,3 +1,5 @@
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
@@ -123,6 +125,17 @@ def test_clipped_and_missing_chirps_are_left_out(row, setup):
     assert not done.samples[:, 7].any()
     kept = done.valid
     assert np.abs(done.samples[:, kept] / 800 - ideal[:, kept])[..., :192].mean() < 0.2
+
+
+def test_bursts_of_one_chirp(row, setup):
+    """Nothing to align with: the direct path alone synchronises, and what needs two chirps is not told."""
+    frames, valid, ideal = row(snr_db=20)
+    one = dataclasses.replace(setup, pulses=1)
+    done = synchronise_row(frames[:, ::PULSES], valid[::PULSES], one)
+    assert done.valid.all()
+    assert (done.chirps == 1).all()
+    assert "referenced" not in done.stages
+    assert _relative_error(done, ideal) < 1.3 * 10 ** (-20 / 20)
 
 
 def test_a_row_of_nothing_is_all_invalid(setup):

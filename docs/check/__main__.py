@@ -1,0 +1,80 @@
+"""`python -m docs.check [--run] [PAGE ...]`: look at README and docs; with --run, run what they show."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from docs.check.commands import is_ours
+from docs.check.looking import page_faults
+from docs.check.pages import SHELLS, Page, all_pages, read_page
+from docs.check.running import PageRun, run_page, scratch_copy
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _table(pages: Sequence[Page], runs: dict[Path, PageRun]) -> None:
+    """Every shell block: run, or only checked and why."""
+    _say("\nshell blocks of the pages:")
+    count = {True: 0, False: 0}
+    for page in pages:
+        for block in page.blocks:
+            commands = block.commands() if block.language in SHELLS or block.is_run else []
+            if block.language == "python":
+                commands = commands[:1]  # a program counts as one
+            if block.language == "":
+                commands = [(n, text) for n, text in enumerate(block.text.splitlines(), block.line) if is_ours(text)]
+            if not commands:
+                continue
+            run = runs.get(page.path)
+            why = block.kept_back or ("" if run else "--run not given")
+            if run and run.failed_line and not why:
+                first, last = commands[0][0], block.line + block.text.count("\n")
+                why = "not reached" if run.failed_line < first else "FAILED" if run.failed_line <= last else ""
+            count[not why] += len(commands)
+            _say(
+                f"  {'run    ' if not why else 'checked'}  {page.name}:{block.line:<4} {commands[0][1][:70]:70}  {why}"
+            )
+    _say(f"{count[True]} commands run, {count[False]} only checked")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Check the pages; 0 only when nothing is wrong."""
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.check",
+        description="Check links and commands of README and docs.",
+        epilog="example:\n  python -m docs.check --run docs/how-to/scan.md",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("pages", nargs="*", type=Path, metavar="PAGE", help="default: README and all of docs")
+    parser.add_argument("--run", action="store_true", help="run the commands too, in a scratch copy")
+    args = parser.parse_args(argv)
+    pages = [read_page(path.resolve()) for path in args.pages or all_pages()]
+    faults = [fault for page in pages for fault in page_faults(page)]
+    runs: dict[Path, PageRun] = {}
+    if args.run:
+        with tempfile.TemporaryDirectory(prefix="docs-") as folder:
+            copy = scratch_copy(Path(folder))
+            for page in pages:
+                if any(block.is_run for block in page.blocks):
+                    run = runs[page.path] = run_page(page, copy)
+                    _say(f"{'FAILED' if run.failed_line else 'ran   '}  {page.name}  {run.seconds:.0f} s")
+                    if run.failed_line:
+                        faults.append(f"{page.name}:{run.failed_line}: this command failed; the end of what it said:\n")
+                        faults[-1] += run.output
+    _table(pages, runs)
+    for fault in faults:
+        _say(fault)
+    links = sum(len(page.links) for page in pages)
+    _say(f"{len(pages)} pages, {links} links, {len(faults)} faults")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""The commands of a page, run in a scratch copy of the repository as a newcomer would, in the order of the page."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from docs.check.pages import ROOT, Page
+
+LIMIT_S = 900.0
+"""A page that takes longer has failed."""
+RIG_SCENE, RIG_TIME_SCALE = "examples/nine-materials.toml", 40
+_LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "out", "build", "__pycache__", ".*_cache", "*.egg-info", "scans")
+
+
+@dataclass(frozen=True)
+class PageRun:
+    """How a page's commands ended: at which line it failed (0: it did not), the time, and the output's end."""
+
+    failed_line: int
+    seconds: float
+    output: str
+
+
+def scratch_copy(folder: Path, root: Path = ROOT) -> Path:
+    """A copy of the working tree with the same .venv; nothing that a page does reaches the tree itself."""
+    copy = folder / "polysight"
+    shutil.copytree(root, copy, ignore=_LEFT_OUT)
+    (copy / ".venv").symlink_to(root / ".venv")
+    for file in copy.rglob("pyproject.toml"):
+        os.utime(file, (0, 0))  # older than .venv/installed: `make` shall not install the copy
+    return copy
+
+
+def script_of(page: Page) -> str:
+    """A shell script whose line numbers are the page's: all but the commands to be run is left blank."""
+    lines = [""] * len(page.path.read_text(encoding="utf-8").splitlines())
+    for block in page.blocks:
+        for number, text in block.shell_lines() if block.is_run else ():
+            lines[number - 1] = text
+        if block.is_run and block.language == "python":  # where the page has its fences
+            lines[block.line - 2], lines[block.line - 1 + block.text.count("\n")] = "python - <<'PYTHON'", "PYTHON"
+    # On the first line, which is a heading: stop at the first failure, and say before each command where we are.
+    lines[0] = f"set -euo pipefail; trap 'echo $LINENO >\"$AT_LINE\"' DEBUG; {lines[0]}"
+    return "\n".join(lines) + "\n"
+
+
+def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
+    """Run a page's commands in `copy`, beside a simulated rig where a block asks for one."""
+    began = time.monotonic()
+    work = copy.parent / "work"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    script, at = work / "page.sh", work / "at"
+    script.write_text(script_of(page), encoding="utf-8")
+    at.write_text("0")
+    environment = {
+        **os.environ, "PATH": f"{copy / '.venv/bin'}:{os.environ['PATH']}", "AT_LINE": str(at), "LC_ALL": "C.UTF-8",
+        "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(copy),
+    }  # fmt: skip
+    rig = None
+    with (work / "output").open("w+") as output:
+        try:
+            if any("rig" in block.info[1:] for block in page.blocks):
+                rig = _start_rig(copy, work, environment)
+            shell = subprocess.Popen(
+                ["bash", str(script)], cwd=copy, env=environment, stdout=output, stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL, start_new_session=True,
+            )  # fmt: skip
+            try:
+                status = shell.wait(limit_s)
+            except subprocess.TimeoutExpired:
+                status = 124
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(shell.pid, signal.SIGKILL)  # it, or what it left running
+            shell.wait()
+        finally:
+            if rig is not None:
+                _end(rig)
+                shutil.copy(ROOT / "instrument.toml", copy)
+        output.seek(0)
+        said = output.read()
+    return PageRun(max(1, int(at.read_text())) if status else 0, time.monotonic() - began, said[-3000:])
+
+
+def _start_rig(copy: Path, work: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
+    """A simulated rig; `instrument.toml` of the copy becomes the one that reaches it."""
+    command = [sys.executable, "-m", "simulators.rig", "--config", "instrument.toml", "--scene", RIG_SCENE]
+    command += ["--dir", str(work / "rig"), "--time-scale", str(RIG_TIME_SCALE), "--with-pi", "--native"]
+    rig = subprocess.Popen(
+        command, cwd=copy, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    said = rig.stdout.readline() if rig.stdout else ""
+    if not said.startswith("ready "):
+        _end(rig)
+        raise RuntimeError(f"the simulated rig did not start; its logs are in {work / 'rig/logs'}")
+    shutil.copy(work / "rig/instrument.toml", copy)
+    return rig
+
+
+def _end(rig: subprocess.Popen[str]) -> None:
+    rig.terminate()
+    try:
+        rig.communicate(timeout=20)
+    except subprocess.TimeoutExpired:
+        rig.kill()
+        rig.communicate()

@@ -1,0 +1,40 @@
+# %% [markdown]
+# # Your own material
+#
+# What a material of known permittivity should look like, what the scan of it gave (run `own_scene.py` first), and a
+# library that knows it: `polysight process NEXT --library out/own-library.npz` then names it in the next scan. A
+# library wants two scans at least, because a classifier is judged by leaving whole scans out.
+
+# %%
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+
+from host.export import material_columns, read_products
+from host.materials import Library
+from host.offline import train
+from host.polarimetry import fresnel
+from shared.config import load_instrument
+from shared.geometry import incidence_deg
+from simulators.scene import load_scene
+from simulators.simulate import simulate
+
+ROOT = Path(__file__).parents[2]
+
+# %%
+rig = load_instrument(ROOT / "instrument.toml")
+r_s, r_p = fresnel(6.0 - 0.3j, np.radians(incidence_deg(rig, rig.receivers[0])))
+expected = r_s / r_p
+print(f"expected: |P| {abs(expected):.2f}, phase of P {np.degrees(np.angle(expected)):.1f} degrees")
+
+# %%
+table = material_columns(read_products(Path("out/own-products")))
+for name in ("true_name", "p_abs_db", "p_phase_deg", "permittivity_real", "permittivity_real_standard_error"):
+    print(name, table[name])
+
+# %%
+scene = load_scene(ROOT / "examples" / "own-scene.toml")
+again = simulate(rig, replace(scene, name="own scene again", seed=5), Path("out/own-scene-again"))
+train(None, [Path("out/own-scene"), again], ROOT / "instrument.toml", Path("out/own-library.npz"))
+print(Library.load(Path("out/own-library.npz")).names)

@@ -1,0 +1,30 @@
+# %% [markdown]
+# # Your own scene
+#
+# Describes what lies on the plane (`examples/own-scene.toml`: copy and change it), simulates a scan of it with every
+# disturbance of a real rig, and processes it to a report beside the truth.
+
+# %%
+from pathlib import Path
+
+from host.materials import read_truth
+from host.options import Options
+from host.pipeline import Pipeline
+from host.store.scanfolder import ScanFolder
+from shared.config import load_instrument
+from simulators.scene import load_scene
+from simulators.simulate import simulate
+
+ROOT = Path(__file__).parents[2]
+
+# %%
+rig = load_instrument(ROOT / "instrument.toml")
+scene = load_scene(ROOT / "examples" / "own-scene.toml")
+folder = simulate(rig, scene, Path("out/own-scene"))
+
+# %%
+pipeline = Pipeline(ScanFolder.load(folder))
+for row in pipeline.source.rows():
+    pipeline.add_row(row)
+products = pipeline.finish(Path("out/own-products"), Options(), read_truth(folder / "truth.json"))
+print(products.summary())

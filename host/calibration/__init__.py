@@ -1,0 +1,1 @@
+"""`polysight calibrate`: what the rig is, measured with the rig: places, filters, metal, start frequencies."""

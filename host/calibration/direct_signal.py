@@ -1,0 +1,148 @@
+"""The direct path in a short capture: its IF chirp by chirp, and what that says of start frequency, trigger, crystal.
+
+IF of the direct path, with tau its delay, dt how much later the board started than the transmitter, and p what its
+crystal is faster by:
+
+    f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
+
+A crystal shows by itself: it makes the IF drift by 2 p K within the chirp. What remains beside the geometry is dt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from host.radar.validator import direct_if_hz
+from host.sync import BoardSetup
+from host.sync.align import AlignedRow, align_row, whole_blocks
+from host.sync.direct_path import reference
+from host.sync.passes import FOLD
+from host.sync.residuals import noise_power
+from host.sync.tone import cis
+from shared.config import Board, Instrument
+
+FULL_SCALE = 32767
+PASSBAND = 0.9  # of the sample rate
+
+
+@dataclass(frozen=True)
+class DirectSignal:
+    """The direct path of one board.
+
+    Attributes
+    ----------
+    if_hz
+        float64 [chirp]: its IF, of the chirps in which it was found; in the receiver's band, so it may be aliased.
+    power, noise_power
+        float64 [chirp]: square of its amplitude as recorded, before any filter is undone, and of the noise in that
+        estimate; ADC counts squared. The first holds the second.
+    expected_hz
+        IF by the rig file: geometry and start offsets.
+    drift_hz_per_s
+        Change of the IF within a chirp.
+    chirps
+        Chirps that were received whole.
+    """
+
+    if_hz: NDArray[np.float64]
+    power: NDArray[np.float64]
+    noise_power: NDArray[np.float64]
+    expected_hz: float
+    drift_hz_per_s: float
+    chirps: int
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a direct path at all: in most chirps."""
+        return 2 * self.if_hz.size > self.chirps > 0
+
+    def crystal_ppm(self, rig: Instrument) -> float:
+        """How much faster the board's crystal is than the transmitter's, parts per million, by the drift."""
+        return self.drift_hz_per_s / (2e-6 * rig.chirp.slope_hz_per_s)
+
+    def later_s(self, rig: Instrument) -> tuple[float, float]:
+        """How much later the board starts its chirps than the transmitter, and the mean's standard error; seconds."""
+        chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
+        middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (a + b - 1) / 2
+        expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
+        later = (expected - self.if_hz) / chirp.slope_hz_per_s
+        return float(later.mean()), float(later.std(ddof=1) / np.sqrt(later.size)) if later.size > 1 else np.inf
+
+
+def band_hz(rig: Instrument) -> tuple[float, float]:
+    """IF that the receiver keeps: 0..0.9 sample rates (complex 1x) or +-0.45 (complex 2x)."""
+    width = PASSBAND * rig.chirp.sample_rate_hz
+    return (0.0, width) if rig.chirp.if_mode == "complex1x" else (-width / 2, width / 2)
+
+
+def jitter_hz(rig: Instrument) -> float:
+    """IF that 5 ns of trigger uncertainty make."""
+    return rig.chirp.slope_hz_per_s * 5e-9
+
+
+def find_direct(
+    rig: Instrument, board: Board, words: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup | None = None
+) -> DirectSignal:
+    """Look for the direct path in bursts.
+
+    Parameters
+    ----------
+    rig, board
+        The rig file, and one of its receiving boards.
+    words
+        int16 [frame, sample, 2, rx], whole bursts.
+    valid
+        bool [frame].
+    setup
+        The board's, where it is there already.
+    """
+    setup, chirp = setup or BoardSetup.of(rig, board), rig.chirp
+    shape = (len(words) // setup.pulses, setup.pulses)
+    aligned = align_row(
+        words.reshape(*shape, *words.shape[1:]), valid.reshape(shape), chirp.linear_samples, setup.equaliser, FULL_SCALE
+    )
+    # The estimate of the drift is linear in it: what two ppm make is found to a tenth, and what that leaves, exactly.
+    drift, time = reference(aligned, setup.path, chirp).drift, np.arange(aligned.halves.shape[-1]) * float(FOLD)
+    time -= time.mean()
+    flat = aligned._replace(halves=aligned.halves * cis(-0.5 * drift * time**2))
+    done = reference(flat, setup.path, chirp)
+    good = aligned.good & done.found[:, None]
+    cycles = (done.frequency[:, None] + aligned.frequency)[good]
+    power = _power(words[good.ravel()], cycles, setup, drift + done.drift)
+    noise = _recorded_noise(aligned) * (np.abs(setup.path.estimator[0]) ** 2).sum() / FOLD
+    cycles = cycles % 1.0 if chirp.if_mode == "complex1x" else (cycles + 0.5) % 1.0 - 0.5
+    rate = chirp.sample_rate_hz
+    return DirectSignal(
+        cycles * rate,
+        power,
+        np.full(power.size, noise),
+        direct_if_hz(rig, board),
+        (drift + done.drift) * rate**2 / (2 * np.pi),  # its phase is `drift t^2 / 2`, t in samples
+        int(valid.sum()),
+    )
+
+
+def _recorded_noise(aligned: AlignedRow) -> float:
+    """Noise power of a recorded sample; compensation has raised it by its gain. The same in all positions."""
+    raised = (aligned.gain**2 * aligned.good).sum(axis=1) / np.maximum(aligned.good.sum(axis=1), 1)
+    recorded = noise_power(aligned) / np.maximum(raised, 1e-12)
+    return float(np.nanmedian(recorded)) if np.isfinite(recorded).any() else 0.0
+
+
+def _power(
+    words: NDArray[np.int16], cycles: NDArray[np.float64], setup: BoardSetup, drift: float
+) -> NDArray[np.float64]:
+    """Power of the direct path in each chirp [chirp], by the estimator that does not hear the object."""
+    if not len(words):
+        return np.zeros(0)
+    a, b = whole_blocks(setup.chirp.linear_samples)
+    n, path = b - a, setup.path
+    time = np.arange(n) - (n - 1) / 2
+    raw = words[:, a:b, 0] + 1j * words[:, a:b, 1].astype(np.float32)  # [chirp, sample, rx]
+    still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
+    folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
+    return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2

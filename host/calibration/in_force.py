@@ -1,0 +1,183 @@
+"""The calibration in force: read from the files a rig file names, copied into each scan, applied by processing.
+
+A scan keeps copies of what it was taken with, in `<scan>/calibration`, named with their digests in its manifest; its
+processing uses these, whatever the rig file says later.
+"""
+
+from __future__ import annotations
+
+import shutil
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
+from host.store import manifest
+from host.store.scanfolder import MANIFEST, ScanFolder
+from shared.config import Board, Instrument, MountStep, to_builtins
+from shared.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from host.polarimetry import PlaneReference
+    from host.sync.hpf import HighPass
+
+FOLDER = "calibration"
+FACT = "calibration"
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What is known better than the rig file says; None where nothing is. `paths` are where it was read."""
+
+    places: PlacesFile | None = None
+    filters: FilterFile | None = None
+    metal: MetalFile | None = None
+    paths: dict[str, Path] | None = None
+
+    def rig(self, rig: Instrument) -> Instrument:
+        """The rig with boards and object plane where they were found to be.
+
+        Raises
+        ------
+        ConfigError
+            when the rig file's own places are not those that the calibration counts from.
+        """
+        if self.places is None:
+            return rig
+        if places_crc32(rig) != self.places.rig_crc32:
+            raise ConfigError(
+                f"{self._path('direct_path')}: made for other mounts, antennas or another object distance",
+                "the rig file was changed after the calibration",
+                "calibrate again with this rig file, or empty calibration.direct_path",
+            )
+        boards = tuple(self._shifted(b, self.places) for b in rig.boards)
+        geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=self.places.object_distance_mm)
+        return msgspec.structs.replace(rig, boards=boards, geometry=geometry)
+
+    @staticmethod
+    def _shifted(board: Board, places: PlacesFile) -> Board:
+        found = places.boards.get(board.name)
+        if found is None:
+            return board
+        return msgspec.structs.replace(board, mount=(*board.mount, MountStep(shift_mm=found.shift_mm)))
+
+    def high_pass(self, board: str) -> HighPass | None:
+        """A board's filter as measured; None: as programmed."""
+        from host.sync.hpf import HighPass
+
+        found = None if self.filters is None else self.filters.boards.get(board)
+        return None if found is None else HighPass(tuple(1e3 * corner for corner in found.corners_khz))
+
+    def reference(self) -> PlaneReference | None:
+        """Metal over the plane, pixel by pixel. Raises DataError when its images are not what the file names."""
+        if self.metal is None:
+            return None
+        from host.polarimetry import PlaneReference
+
+        path = self._path("metal").parent / self.metal.images
+        if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != self.metal.images_crc32:
+            raise DataError(
+                f"{path}: absent, or not the images that {self._path('metal').name} names",
+                "the two files were parted",
+                "copy both, or calibrate again",
+            )
+        with np.load(path, allow_pickle=False) as f:
+            images = (f["h"], f["v"], f["valid"], f["x_m"], f["y_m"])
+        return PlaneReference(*images, self.metal.spread, self.metal.how)
+
+    def facts(self) -> dict[str, Any]:
+        """For quality.json: which files were in force."""
+        kinds = {"direct_path": self.places, "hpf": self.filters, "metal": self.metal}
+        return {
+            kind: {"file": str(self._path(kind)), "made_utc": file.made_utc, "simulated": file.simulated}
+            for kind, file in kinds.items()
+            if file is not None
+        }
+
+    def _path(self, kind: str) -> Path:
+        return (self.paths or {}).get(kind, Path(kind))
+
+
+def load_calibration(paths: dict[str, Path]) -> Calibration:
+    """Read the files, by kind. Raises ConfigError naming the one that is not what it should be."""
+    kinds = {"direct_path": PlacesFile, "hpf": FilterFile, "metal": MetalFile}
+    found = {kind: read(path, kinds[kind], kind) for kind, path in paths.items()}
+    return Calibration(found.get("direct_path"), found.get("hpf"), found.get("metal"), dict(paths))
+
+
+def of_rig(rig: Instrument) -> Calibration:
+    """What a rig file names. Raises ConfigError."""
+    return load_calibration({kind: Path(name) for kind, name in to_builtins(rig.calibration).items() if name})
+
+
+def of_scan(scan: Any) -> Calibration:
+    """What a scan was taken with: its own copies, or where it has none, what its rig file names.
+
+    Raises
+    ------
+    ConfigError, DataError
+        when a file is not what it should be, or a copy was changed.
+    """
+    facts = scan.facts("scan_started") if isinstance(scan, ScanFolder) else []
+    recorded = facts[0].get(FACT) if facts else None
+    if recorded is None or not isinstance(scan, ScanFolder):
+        return of_rig(scan.instrument)
+    paths = {}
+    for kind, fact in recorded.items():
+        path = paths[kind] = scan.path / fact["file"]
+        if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != fact["crc32"]:
+            raise DataError(
+                f"{path}: absent, or not the calibration that the scan was taken with",
+                "the file was removed or changed",
+                f"restore it from a copy, or from {fact['copied_from']}",
+            )
+    return load_calibration(paths)
+
+
+def checked(rig: Instrument, simulated: bool) -> Calibration:
+    """What a rig file names, ready to be used by a scan that is simulated or not.
+
+    Raises
+    ------
+    ConfigError, DataError
+        when a file is not what it should be, or comes from simulated data and the scan does not.
+    """
+    calibration = of_rig(rig)
+    calibration.rig(rig)
+    calibration.reference()
+    for kind, fact in calibration.facts().items():
+        if fact["simulated"] and not simulated:
+            raise ConfigError(
+                f"{fact['file']}: made from simulated data",
+                "it says nothing about a real rig",
+                f"calibrate with the rig, or empty calibration.{kind}",
+            )
+    return calibration
+
+
+def keep_in_scan(rig: Instrument, folder: Path, simulated: bool) -> dict[str, Any]:
+    """Copy what is in force into a new scan's folder; returns the fact for its manifest, by kind.
+
+    A folder that holds a scan already is left alone: making the scan will refuse it. Raises as :func:`checked`, before
+    anything is copied.
+    """
+    calibration = checked(rig, simulated)
+    taken = (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length > 0
+    facts = {}
+    for kind, path in (calibration.paths or {}).items():
+        copy = folder / FOLDER / path.name
+        if not taken:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
+            if kind == "metal" and calibration.metal is not None:
+                shutil.copyfile(path.parent / calibration.metal.images, copy.parent / calibration.metal.images)
+        facts[kind] = {
+            "file": f"{FOLDER}/{path.name}",
+            "crc32": f"{zlib.crc32(path.read_bytes()):08x}",
+            "copied_from": str(path),
+        }
+    return facts

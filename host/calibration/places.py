@@ -1,0 +1,298 @@
+"""Where the receivers and the object plane are, from a scan of points at known places on the plane.
+
+Samples are referenced to the direct path, so an echo of a point at v, seen from stage offset u, has the phase
+2 pi f d / c with the excess path
+
+    d = |v - u - tx| + |v - u - rx| - |tx - rx|
+
+The transmitter is taken to be where the rig file says, which fixes the frame; unknown are the shift of each receiving
+board (3), the plane's distance (1), where the target was laid (2) and how it was turned (1). Each point's amplitude is
+a complex number a board, so phases count only as they change over the aperture and with frequency; amplitudes drop out
+by projection (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973). Least squares over positions, RX and frequencies,
+noise made white. A ruler's accuracy is a prior for each unknown: what the scan cannot tell stays near the rig file, and
+its standard error says so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import NDArray
+
+from host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, head, places_crc32
+from host.calibration.rows import board_rows
+from host.imaging.grid import Antennas, image_grid, row_offsets_m
+from host.imaging.reduce import reduction, scene_gate_m
+from host.store.source import ScanSource
+from host.sync import BoardSetup, synchronise_row
+from host.sync.hpf import HighPass
+from shared.config import Instrument, decode, read_toml
+from shared.errors import DataError
+from shared.geometry import specular_midpoint_m
+from shared.raster import plan_raster
+from shared.units import SPEED_OF_LIGHT_M_S
+
+Real = NDArray[np.float64]
+DEPTH_M = 0.02  # how far the plane may lie from where the rig file has it
+POSITIONS = 400  # that are looked at; more would only take longer
+_SEARCHED = 100  # positions that the search for the target looks at
+_REACH_MM, _STEP_MM = 12.0, 1.5  # where the target may lie, and the search's step: under half a resolution cell
+_KEPT = 1e-3  # directions of the reduced samples with less noise than this part of the most hold nothing
+_EXPLAINED = 0.3  # part of the power that the points must explain
+
+
+class TargetPoint(msgspec.Struct, frozen=True):
+    """A scatterer of the target, millimetres along x and y from its middle."""
+
+    position_mm: tuple[float, float]
+    name: str = ""
+
+
+class Target(msgspec.Struct, frozen=True):
+    """A target file: `[[points]]`. Other keys are let be, so that a scene file is one too."""
+
+    points: tuple[TargetPoint, ...] = ()
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How well the unknowns are known beforehand: one standard deviation."""
+
+    board_mm: float = 5.0
+    plane_mm: float = 5.0
+    target_mm: float = 10.0
+    turn_deg: float = 2.0
+
+    def scale(self, boards: int) -> Real:
+        """One for each unknown."""
+        return np.array([self.board_mm] * 3 * boards + [self.plane_mm, *2 * [self.target_mm], self.turn_deg])
+
+
+@dataclass
+class Seen:
+    """What one board saw: whitened samples [rx, position, k], how an echo comes out, and where it was seen from.
+
+    Made by :func:`look`.
+    """
+
+    antennas: Antennas
+    samples: NDArray[np.complex128]
+    echo: NDArray[np.complex128]
+    offsets_m: Real
+    frequencies_hz: Real
+
+
+@dataclass
+class PlacesFit:
+    """The unknowns (millimetres, degrees), their covariance, and the part of the power that is explained."""
+
+    values: Real
+    covariance: Real
+    explained: float
+    boards: list[str] = field(default_factory=list)
+
+    @property
+    def errors(self) -> Real:
+        """Standard errors."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def read_target(path: Path) -> list[TargetPoint]:
+    """Points of a target file. Raises ConfigError, and DataError for fewer than three."""
+    points = list(decode(read_toml(path), Target, str(path)).points)
+    if len(points) < 3:
+        raise DataError(
+            f"{path}: {len(points)} points",
+            "two points do not tell a turn from a shift",
+            "give three or more [[points]] with position_mm = [x, y]",
+        )
+    return points
+
+
+def look(source: ScanSource, rig: Instrument, filters: dict[str, HighPass | None] | None = None) -> dict[str, Seen]:
+    """What each receiving board saw in a scan, by name; `filters` are measured ones. Raises DataError."""
+    return {b.name: _look(source, rig, b.name, (filters or {}).get(b.name)) for b in rig.receivers}
+
+
+def fit_places(seen: dict[str, Seen], rig: Instrument, points: list[TargetPoint], prior: Prior = Prior()) -> PlacesFit:
+    """Fit boards, plane and target to what was seen.
+
+    Parameters
+    ----------
+    seen
+        From :func:`look`.
+    rig
+        Where everything is thought to be.
+    points
+        The target's points.
+    prior
+        How well that is known.
+    """
+    mm = np.array([p.position_mm for p in points])
+    centre = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    scale = prior.scale(len(seen))
+    boards = list(seen.values())
+
+    def misfit(unknown: Real, sigma: float) -> Real:
+        parts = [
+            _left_over(b, unknown[3 * i : 3 * i + 3], _places_m(centre, mm, unknown)) for i, b in enumerate(boards)
+        ]
+        flat = np.concatenate([p.ravel() for p in parts]) / sigma
+        return np.concatenate([flat.real, flat.imag, unknown / scale])
+
+    start = np.zeros(scale.size)
+    start[-3:-1] = _find_target(boards, centre, mm)
+    size = sum(b.samples.size for b in boards)
+    sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
+    found: Any = None
+    for tolerance in (1e-3, 1e-6, 1e-8):  # the noise is known once it fits
+        found = scipy.optimize.least_squares(
+            misfit, start, args=(sigma,), method="lm", x_scale=scale / 10, ftol=tolerance, xtol=tolerance
+        )
+        start = found.x
+        sigma *= float(np.sqrt(np.mean(found.fun[: 2 * size] ** 2)))
+    power = sum(float((np.abs(b.samples) ** 2).sum()) for b in boards)
+    explained = 1 - 2 * size * sigma**2 / power
+    covariance = np.linalg.inv(found.jac.T @ found.jac)
+    return PlacesFit(found.x, covariance, explained, list(seen))
+
+
+def _look(source: ScanSource, rig: Instrument, name: str, model: HighPass | None) -> Seen:
+    """A board's scan, synchronised, reduced to the gate, its RX alike, its noise white."""
+    board, plan = rig.by_name(name), plan_raster(rig.grid)
+    setup = BoardSetup.of(rig, board, model=model)
+    every = tuple(Antennas.of(rig, b) for b in rig.receivers)
+    gate = scene_gate_m(every, plan, image_grid(rig), DEPTH_M)
+    maps = reduction(rig.chirp, gate)
+    reduced, direct, offsets = [], [], []
+    stride = max(1, int(np.ceil(np.sqrt(plan.positions / POSITIONS))))
+    for row, words, valid in board_rows(source, name):
+        if row % stride:
+            continue
+        synced = synchronise_row(words, valid, setup)
+        keep = np.flatnonzero(synced.valid)[::stride]
+        reduced.append(synced.samples[:, keep] @ maps.matrix.T)
+        direct.append(synced.samples[:, keep] @ maps.direct)
+        offsets.append(row_offsets_m(rig, plan.row(row))[keep])
+    samples, gains = np.concatenate(reduced, axis=1), np.concatenate(direct, axis=1).mean(axis=1)
+    if not samples.size or np.any(gains == 0):
+        raise DataError(f"{source.scan_id}: no direct path of {name}", "see `polysight sync-report`", "scan again")
+    # Noise is white in the raw samples, so its covariance in the reduced ones is that of their map.
+    power, directions = scipy.linalg.eigh(maps.matrix @ maps.matrix.conj().T)
+    kept = power > _KEPT * power[-1]
+    white = directions[:, kept].conj().T / np.sqrt(power[kept])[:, None]
+    samples = (samples / gains[:, None, None]) @ white.T
+    flat = np.concatenate(offsets)
+    places = np.column_stack([flat, np.zeros(len(flat))])
+    return Seen(Antennas.of(rig, board), samples, white @ maps.model, places, maps.frequencies_hz)
+
+
+def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
+    """Where the target's points are, metres [point, 3], rig frame."""
+    depth, x, y, turn = unknown[-4:]
+    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    flat = mm @ np.array([[c, s], [-s, c]]) + [x, y]
+    return centre + np.column_stack([flat, np.full(len(mm), depth)]) / 1e3
+
+
+def _design(board: Seen, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+    """What each point of amplitude one answers, complex [rx * position * k, point]."""
+    tx, rx = board.antennas.tx_m, board.antennas.rx_m + np.asarray(shift_mm) / 1e3
+    away = places_m[None] - board.offsets_m[:, None]  # [position, point, 3]
+    out = np.linalg.norm(away - tx, axis=-1)
+    back = np.linalg.norm(away[None] - rx[:, None, None], axis=-1)
+    path = out + back - np.linalg.norm(rx - tx, axis=-1)[:, None, None]
+    f = board.frequencies_hz / SPEED_OF_LIGHT_M_S
+    step = _turns(path * (f[-1] - f[0]) / (f.size - 1))
+    tones = np.empty((*path.shape, f.size), np.complex128)
+    tones[..., 0] = _turns(path * f[0]) / (out * back)
+    for k in range(1, f.size):  # evenly spaced
+        np.multiply(tones[..., k - 1], step, out=tones[..., k])
+    echoes = tones.reshape(-1, f.size) @ board.echo.T
+    return echoes.reshape(*path.shape, -1).transpose(0, 1, 3, 2).reshape(-1, len(places_m))
+
+
+def _turns(cycles: Real) -> NDArray[np.complex128]:
+    return np.exp(2j * np.pi * (cycles - np.round(cycles)))
+
+
+def _left_over(board: Seen, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+    """The samples less the best sum of the points' answers."""
+    design, samples = _design(board, shift_mm, places_m), board.samples.reshape(-1)
+    amplitude = np.linalg.lstsq(design.conj().T @ design, design.conj().T @ samples, rcond=1e-9)[0]
+    return samples - design @ amplitude
+
+
+def _find_target(boards: list[Seen], centre: Real, mm: Real) -> tuple[float, float]:
+    """Where the target lies, millimetres, on a coarse grid: the most power at all points together."""
+    best, found = -1.0, (0.0, 0.0)
+    few = [_fewer(b) for b in boards]
+    steps = np.arange(-_REACH_MM, _REACH_MM + _STEP_MM / 2, _STEP_MM)
+    for x in steps:
+        for y in steps:
+            places = _places_m(centre, mm, np.array([0.0, x, y, 0.0]))
+            total = 0.0
+            for board in few:
+                design = _design(board, np.zeros(3), places)
+                answer = design.conj().T @ board.samples.reshape(-1)
+                total += float((np.abs(answer) ** 2 / (np.abs(design) ** 2).sum(axis=0)).sum())
+            if total > best:
+                best, found = total, (float(x), float(y))
+    return found
+
+
+def _fewer(b: Seen) -> Seen:
+    """One RX at some of the positions."""
+    at = slice(None, None, -(-len(b.offsets_m) // _SEARCHED))
+    antennas = Antennas(b.antennas.tx_m, b.antennas.rx_m[:1])
+    return Seen(antennas, b.samples[:1, at], b.echo, b.offsets_m[at], b.frequencies_hz)
+
+
+def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[SourceScan]) -> PlacesFile:
+    """What a fit found, as a file. Raises DataError when the points explain too little of the data."""
+    if fit.explained < _EXPLAINED:
+        raise DataError(
+            f"the points explain {100 * fit.explained:.0f} % of the echoes",
+            "the target was another one, lay more than a centimetre from the middle, or other things reflect too",
+            "check the target file; cover what reflects beside it",
+        )
+    errors, boards = fit.errors, {}
+    for i, name in enumerate(fit.boards):
+        own = slice(3 * i, 3 * i + 3)
+        antennas = Antennas.of(rig, rig.by_name(name))
+        before = antennas.rx_m[0] - antennas.tx_m
+        after = before + fit.values[own] / 1e3
+        along = after / np.linalg.norm(after)
+        boards[name] = BoardPlace(
+            _vector(fit.values[own]),
+            _vector(errors[own]),
+            float(np.linalg.norm(after) * 1e3),
+            float(np.linalg.norm(before) * 1e3),
+            float(np.sqrt(along @ fit.covariance[own, own] @ along)),
+        )
+    depth, x, y, turn = (float(v) for v in fit.values[-4:])
+    return PlacesFile(
+        **head("direct_path", sources),
+        rig_crc32=places_crc32(rig),
+        boards=boards,
+        object_distance_mm=rig.geometry.object_distance_mm + depth,
+        object_distance_was_mm=rig.geometry.object_distance_mm,
+        object_distance_standard_error_mm=float(errors[-4]),
+        target_mm=(x, y),
+        target_standard_error_mm=(float(errors[-3]), float(errors[-2])),
+        target_turn_deg=turn,
+        target_turn_standard_error_deg=float(errors[-1]),
+        explained=fit.explained,
+        points=points,
+    )
+
+
+def _vector(values: Real) -> Vector:
+    x, y, z = (float(v) for v in values)
+    return x, y, z

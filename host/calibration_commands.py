@@ -1,0 +1,153 @@
+"""`polysight calibrate`: each command looks at recorded scans, writes one dated file, and says what that changes.
+
+Nothing else is written: neither the scans nor the rig file.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from host.calibration.files import CalibrationFile, FilterFile, StartFile, head, write
+from host.calibration.rows import facts_of, open_raw
+from shared.config import Instrument, load_instrument, to_builtins
+from shared.errors import ConfigError, DataError
+
+
+def _tell(path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool) -> int:
+    """Say what was found and what to set; 0."""
+    if as_json:
+        sys.stdout.write(
+            json.dumps({"file": str(path), "simulated": file.simulated, **to_builtins(file)}, indent=1) + "\n"
+        )
+        return 0
+    head_line = "SIMULATED data: of no use for a real rig" if file.simulated else "measured"
+    scans = ", ".join(f"{s.scan_id} ({s.rows} rows)" for s in file.sources)
+    sys.stdout.write(f"{head_line}: {scans}\n" + "".join(f"  {line}\n" for line in lines))
+    sys.stdout.write(f"written: {path}\nnothing else was changed; to use it, in the rig file:\n")
+    sys.stdout.write("".join(f"  {line}\n" for line in what_to_set))
+    return 0
+
+
+def with_places_of(scanned: Instrument, other: Instrument) -> Instrument:
+    """A scan's rig with another rig file's antennas, mounts and object plane. Raises ConfigError."""
+    mounts = {b.name: b.mount for b in other.boards}
+    if set(mounts) != {b.name for b in scanned.boards}:
+        raise ConfigError(f"the rig file has the boards {sorted(mounts)}", "it is of another rig", "give the scan's")
+    boards = tuple(msgspec.structs.replace(b, mount=mounts[b.name]) for b in scanned.boards)
+    return msgspec.structs.replace(scanned, boards=boards, antennas=other.antennas, geometry=other.geometry)
+
+
+def _key(kind: str, path: Path) -> list[str]:
+    return ["[calibration]", f'{kind} = "{path.resolve()}"']
+
+
+def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
+    """Places of boards and plane from a scan of known points. Raises PolysightError."""
+    from host.calibration.in_force import of_scan
+    from host.calibration.places import Prior, fit_places, look, places_file, read_target
+
+    points = read_target(target)
+    given = None if config is None else load_instrument(config)
+    source = open_raw(scan, given)
+    rig = source.instrument if given is None else with_places_of(source.instrument, given)
+    in_force = of_scan(source)
+    filters = {b.name: in_force.high_pass(b.name) for b in rig.receivers}
+    fit = fit_places(look(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
+    file = places_file(rig, fit, len(points), [facts_of(source, scan)])
+    path = write(file, out)
+    lines = []
+    for name, b in file.boards.items():
+        shift = ", ".join(f"{v:+.2f} +- {e:.2f}" for v, e in zip(b.shift_mm, b.standard_error_mm, strict=True))
+        lines += [
+            f"{name}: shifted by ({shift}) mm in x, y, z",
+            f"{name}: direct path to RX1 {b.direct_path_was_mm:.2f} -> {b.direct_path_mm:.2f}"
+            f" +- {b.direct_path_standard_error_mm:.2f} mm",
+        ]
+        lines += [
+            f"{name}: the scan does not tell its shift along {axis}: a wider aperture does"
+            for axis, e in zip("xyz", b.standard_error_mm, strict=True)
+            if e > prior_mm / 2
+        ]
+    lines += [
+        f"object plane: {file.object_distance_was_mm:.2f} -> {file.object_distance_mm:.2f}"
+        f" +- {file.object_distance_standard_error_mm:.2f} mm",
+        f"the target lay at ({file.target_mm[0]:+.2f}, {file.target_mm[1]:+.2f}) mm, turned by"
+        f" {file.target_turn_deg:+.2f} degrees; its points explain {100 * file.explained:.1f} % of the echoes",
+    ]
+    return _tell(path, file, lines, _key("direct_path", path), as_json)
+
+
+def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
+    """The receivers' filters from scans at several start frequencies. Raises PolysightError."""
+    from host.calibration.filters import fit_filter
+
+    rig = None if config is None else load_instrument(config)
+    sources = [open_raw(folder, rig) for folder in scans]
+    chirps = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
+    if len(chirps) > 1:
+        raise DataError(
+            f"the scans have different filters: {sorted(chirps)} kHz", "they are of several sweeps", "give one"
+        )
+    names = [b.name for b in sources[0].instrument.receivers]
+    boards = {name: fit_filter(sources, name) for name in names}
+    found = [facts_of(source, folder) for source, folder in zip(sources, scans, strict=True)]
+    file = FilterFile(**head("hpf", found), boards=boards)
+    path = write(file, out)
+    lines = [
+        f"{name}: corners "
+        + ", ".join(
+            f"{was:.0f} -> {c:.1f} +- {e:.1f} kHz"
+            for was, c, e in zip(b.programmed_khz, b.corners_khz, b.standard_error_khz, strict=True)
+        )
+        + f"; IF {b.if_from_khz:.0f}..{b.if_to_khz:.0f} kHz, {b.chirps} chirps, the fit leaves {b.residual_db:.2f} dB"
+        for name, b in boards.items()
+    ]
+    return _tell(path, file, lines, _key("hpf", path), as_json)
+
+
+def metal(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
+    """Gains at every pixel from a scan of a metal plate over the plane. Raises PolysightError."""
+    from host.calibration.files import MetalFile, read
+    from host.calibration.metal import write_metal
+    from host.metal_scans import load_reference
+
+    source = open_raw(scan, None if config is None else load_instrument(config))
+    path = write_metal(load_reference(scan, config), [facts_of(source, scan)], out)
+    file = read(path, MetalFile, "metal")
+    lines = [
+        f"metal on {100 * file.share_of_plane:.0f} % of the image; elsewhere pixels are masked",
+        f"gains vary over it by {file.h_variation_db:.2f} dB (H), {file.v_variation_db:.2f} dB (V),"
+        f" {file.ratio_variation_db:.2f} dB and {file.ratio_variation_deg:.1f} degrees (H / V)",
+        f"scatter of its own pixels: {file.spread:.4f}",
+        f"images: {file.images}, beside the file",
+    ]
+    return _tell(path, file, lines, _key("metal", path), as_json)
+
+
+def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
+    """Start offsets that put the direct paths in the middle of the band. Raises PolysightError."""
+    from host.calibration.start_frequency import fit_start
+
+    source = open_raw(scan, None if config is None else load_instrument(config))
+    boards = {b.name: fit_start(source, b.name) for b in source.instrument.receivers}
+    file = StartFile(**head("start_frequency", [facts_of(source, scan)]), boards=boards)
+    path = write(file, out)
+    lines, what_to_set = [], []
+    rate_khz = source.instrument.chirp.sample_rate_hz / 1e3
+    for name, b in boards.items():
+        told = f"{name}: direct path at {b.direct_if_hz / 1e3:.1f} +- {b.direct_if_standard_error_hz / 1e3:.1f} kHz"
+        told += f" ({b.expected_if_hz / 1e3:.0f} kHz by the rig file)"
+        told += f", an alias of {b.direct_if_hz / 1e3 + b.alias * rate_khz:.0f} kHz" if b.alias else ""
+        lines += [
+            told,
+            f"{name}: start_offset_hz {b.start_offset_was_hz:.0f} -> {b.start_offset_hz:.0f} puts it at"
+            f" {b.middle_hz / 1e3:.0f} kHz; where mmWave Studio programs the board:"
+            f" {b.start_offset_hz - b.start_offset_was_hz:+.0f} Hz to its start frequency",
+        ]
+        what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
+    return _tell(path, file, lines, what_to_set, as_json)

@@ -1,0 +1,138 @@
+"""`polysight classify`: name the patches of processed scans, of several angles too, or judge models on a library."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from host.materials import Classifier, Library, Verdict
+from host.materials.authors import read_materials
+from host.materials.patches import PATCHES, MatchedPatch, match_patches, read_patches
+from host.options import LIBRARY
+from host.report.assemble import classifier_sentence
+from shared.errors import ConfigError, DataError
+
+
+def classify(data: Sequence[Path], library: Path | None, model: str | None, as_json: bool) -> int:
+    """Name the patches of processed scans together, or judge the models on one library; returns the exit status.
+
+    Parameters
+    ----------
+    data
+        Folders that `polysight process` wrote, one for each incidence angle; or a library (.npz), or a folder of the
+        published material files.
+    library, model
+        Of the naming; without: the simulated library, and the model that was chosen for it.
+    as_json
+        Print JSON.
+
+    Raises
+    ------
+    ConfigError
+        when the data are of both kinds.
+    DataError
+        when something in them cannot be used.
+    """
+    scans = [(d / PATCHES).exists() for d in data]
+    if all(scans):
+        return _name(data, library or LIBRARY, model, as_json)
+    if len(data) > 1:
+        other = data[scans.index(False)]
+        raise ConfigError(
+            f"{other}: not a folder of products", "several scans are named together from what polysight process wrote",
+            f"polysight process SCAN --out {other}",
+        )  # fmt: skip
+    return _judge(data[0], as_json)
+
+
+def _judge(data: Path, as_json: bool) -> int:
+    from host.materials.judge import score
+    from host.materials.models import MODELS
+    from host.materials.samples import Samples
+
+    library = read_materials(data) if data.is_dir() else Library.load(data)
+    if len(library.angles_deg) > 1:
+        sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
+        library = library.at(library.angles_deg[-1])
+    samples = Samples.of(library)
+    scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
+    source = "simulated" if library.simulated else "measured"
+    if as_json:
+        rows = [{k: v for k, v in asdict(s).items() if "confusion" not in k and k != "names"} for s in scores]
+        best = max(scores[::2], key=lambda s: s.pixels + s.patches)
+        content = {"source": source, "names": best.names, "scores": rows}
+        content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
+        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        return 0
+    sys.stdout.write(
+        f"{source}: {len(library.names)} materials, {len(library.scans)} scans, {samples.names.size} pixels\n"
+        f"{'':44s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
+        f"{'model':44s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
+    )
+    for held, mixed in zip(scores[::2], scores[1::2], strict=True):
+        sys.stdout.write(
+            f"{held.model:44s}{held.pixels:11.1%}{held.patches:11.1%}{mixed.pixels:12.1%}{mixed.patches:12.1%}\n"
+        )
+    return 0
+
+
+def _name(folders: Sequence[Path], library_path: Path, model: str | None, as_json: bool) -> int:
+    library = Library.load(library_path)
+    scans = [read_patches(folder / PATCHES) for folder in folders]
+    classifier = Classifier(library, model=model, angles_deg=[s.angle_deg for s in scans])
+    matched = match_patches(scans)
+    if not matched:
+        raise DataError(
+            f"{folders[-1]}: none of its patches lies where one of {folders[0]} does",
+            "the object was moved between the scans, or these are scans of other objects",
+            "scan the same patches in the same places",
+        )
+    named = classifier.scan([m.features for m in matched])
+    rows = [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)]
+    simulated = any(s.simulated for s in scans)
+    once = sum(len(s.patches) for s in scans) - len(scans) * len(matched)
+    if as_json:
+        content = {
+            "source": "simulated" if simulated else "measured",
+            "incidence_deg": [s.angle_deg for s in scans],
+            "model": classifier.model,
+            "library": classifier_sentence(classifier),
+            "patches": rows,
+            "patches_not_in_every_scan": once,
+        }
+        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        return 0
+    angles = " and ".join(f"{s.angle_deg:.1f}" for s in scans)
+    sys.stdout.write(f"{'simulated: ' if simulated else ''}{len(rows)} patches at {angles} degrees\n")
+    for row in rows:
+        votes = ", ".join(f"{name} {share:.0%}" for name, share in list(row["votes"].items())[:2])
+        truth = f"   truly {row['truth']}" if row["truth"] else ""
+        sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {row['confidence']:6.1%}   pixels: {votes}{truth}\n")
+    known = [r for r in rows if r["truth"]]
+    if known:
+        right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
+        sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
+    if once:
+        sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
+    sys.stdout.write(classifier_sentence(classifier) + "\n")
+    return 0
+
+
+def _row(matched: MatchedPatch, verdict: Verdict, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
+    return {
+        "label": matched.label,
+        "name": verdict.name,
+        "confidence": verdict.confidence,
+        "votes": verdict.votes,
+        "distance": verdict.distance if np.isfinite(verdict.distance) else None,
+        "pixels": verdict.pixels,
+        "truth": matched.truth,
+        "pixels_right": float((pixels == matched.truth).mean()) if matched.truth else None,
+    }

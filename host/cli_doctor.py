@@ -1,0 +1,47 @@
+"""The options of `polysight doctor`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from host.cli_materials import Add
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from host.doctor.bench import Wanted
+    from host.doctor.command import doctor
+
+    return doctor(Wanted(args.config, args.out, args.move, args.pulse, args.bursts), args.json)
+
+
+def _bursts(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= 16:
+        raise argparse.ArgumentTypeError(f"{text} is not a number from 1 to 16")
+    return value
+
+
+def add_doctor_command(add: Add, rig: Path) -> None:
+    """`polysight doctor`."""
+    sub = add(
+        "doctor",
+        _doctor,
+        "try every hop of the rig in order, and say what is wrong and what to do; nothing moves without --move",
+        "polysight doctor --config instrument.toml --out scans",
+    )
+    sub.add_argument("--config", type=Path, default=rig, metavar="FILE", help="rig file (default: instrument.toml)")
+    sub.add_argument(
+        "--out", type=Path, default=Path(), metavar="DIR", help="where scans will go: its disk is tried (default: here)"
+    )
+    sub.add_argument(
+        "--move", action="store_true", help="THE STAGE MOVES: home it and run a short row, to try the trigger line"
+    )
+    sub.add_argument(
+        "--no-pulse",
+        dest="pulse",
+        action="store_false",
+        help="send no SYNC_IN pulses (default: a few bursts at rest; radars that are armed transmit meanwhile)",
+    )
+    sub.add_argument("--bursts", type=_bursts, default=4, metavar="N", help="how many bursts to capture (default: 4)")
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")

@@ -1,0 +1,66 @@
+"""Options that several commands of `polysight` share."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from host.cli_materials import add_model_option
+
+if TYPE_CHECKING:
+    from host.options import Options
+
+RIG = Path("instrument.toml")
+
+
+def options_of(args: argparse.Namespace) -> Options:
+    """What the options of :func:`add_material_options` ask for."""
+    from host.options import Options
+
+    return Options(metal_box_mm=args.metal, library=args.library, model=args.model)
+
+
+def rig_file(args: argparse.Namespace) -> Path | None:
+    """The rig file that was given, or the one that lies with the data, or here."""
+    return args.config or next((rig for rig in (args.data / RIG, RIG) if rig.exists()), None)
+
+
+def box(text: str) -> tuple[float, float, float, float]:
+    """`x,y,width,height` in millimetres as corners (x0, y0, x1, y1)."""
+    try:
+        x, y, w, h = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not of the form x,y,width,height in mm, e.g. 0,0,40,40"
+        ) from None
+    if w <= 0 or h <= 0:
+        raise argparse.ArgumentTypeError(f"width and height of {text!r} must be positive")
+    return x - w / 2, y - h / 2, x + w / 2, y + h / 2
+
+
+def positive(text: str) -> float:
+    """A number above zero."""
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
+    return value
+
+
+def add_config_option(sub: argparse.ArgumentParser) -> None:
+    """The rig file."""
+    sub.add_argument("--config", type=Path, default=RIG, metavar="FILE", help="rig file (default: instrument.toml)")
+
+
+def add_material_options(sub: argparse.ArgumentParser) -> None:
+    """Library, metal and model: how patches are named."""
+    sub.add_argument(
+        "--library", type=Path, default=None, metavar="FILE", help="reference library (default: the simulated one)"
+    )
+    sub.add_argument(
+        "--metal",
+        type=box,
+        metavar="X,Y,W,H",
+        help="metal reference: place and size, mm from the image centre, e.g. --metal=-60,0,40,40 (default: found)",
+    )
+    add_model_option(sub, none=True)

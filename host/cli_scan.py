@@ -1,0 +1,86 @@
+"""The commands that make and keep a scan: scan, resume, validate, drop-raw."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from host.cli_materials import Add
+from host.cli_options import add_config_option, add_material_options, options_of
+
+
+def _scan(args: argparse.Namespace) -> int:
+    from host.live import scan
+
+    return scan(args.config, args.out, args.truth, options_of(args), args.keep_incomplete, not args.no_process)
+
+
+def _resume(args: argparse.Namespace) -> int:
+    from host.live import resume
+
+    return resume(args.folder, options_of(args), args.keep_incomplete, not args.no_process)
+
+
+def _validate(args: argparse.Namespace) -> int:
+    from host.checks import validate_folder
+
+    return validate_folder(args.folder, args.json)
+
+
+def _drop_raw(args: argparse.Namespace) -> int:
+    from host.dropping import drop_raw
+
+    return drop_raw(args.folder, args.products, args.yes)
+
+
+def add_scan_commands(add: Add) -> None:
+    """Register them."""
+    sub = add(
+        "scan",
+        _scan,
+        "scan with the rig, and process while it scans; Ctrl-C ends it after the row, twice at once",
+        "polysight scan --config instrument.toml --out scans/one",
+    )
+    add_config_option(sub)
+    add_material_options(sub)
+    sub.add_argument("--out", type=Path, required=True, metavar="SCAN", help="scan folder to make; never overwritten")
+    sub.add_argument(
+        "--truth", type=Path, default=None, metavar="FILE", help="truth.json of a simulated scene, for the report"
+    )
+    sub.add_argument(
+        "--keep-incomplete",
+        action="store_true",
+        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
+    )
+    sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
+
+    sub = add(
+        "resume",
+        _resume,
+        "go on with a scan that was stopped or killed, at its first missing row",
+        "polysight resume scans/one",
+    )
+    add_material_options(sub)
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; the rig file is in it")
+    sub.add_argument(
+        "--keep-incomplete",
+        action="store_true",
+        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
+    )
+    sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
+
+    sub = add(
+        "validate", _validate, "check every file of a scan folder, and name every fault", "polysight validate scans/one"
+    )
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+    sub = add(
+        "drop-raw",
+        _drop_raw,
+        "remove the raw rows of a finished scan that saved products were made from; their digests stay",
+        "polysight drop-raw scans/one",
+    )
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument("--products", type=Path, metavar="DIR", help="products made from it (default: SCAN/products)")
+    sub.add_argument("--yes", action="store_true", help="do not ask; the default is to have the word drop typed")

@@ -1,0 +1,129 @@
+"""The order of the checks, and what each of them needs: a hop behind one that is wrong is not tried."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+from host.doctor.bench import Bench
+from host.doctor.check_cards import check_buffer, check_card
+from host.doctor.check_clock import check_host_clock, check_pi_clock
+from host.doctor.check_config import check_config
+from host.doctor.check_disk import check_disk, check_time
+from host.doctor.check_network import check_network
+from host.doctor.check_pi import check_free, check_keys, check_pi
+from host.doctor.check_stage import check_stage
+from host.doctor.check_stream import check_pulses, check_radar
+from host.doctor.check_trigger import check_trigger
+from host.doctor.finding import Finding, not_checked, of_error
+from shared.config import Board
+from shared.errors import DeviceError, PolysightError
+
+
+def _calibration(bench: Bench) -> Finding:
+    from host.doctor.check_calibration import check_calibration
+
+    return check_calibration(bench)
+
+
+def _level(bench: Bench, board: Board) -> Finding:
+    from host.doctor.check_level import check_level
+
+    return check_level(bench, board)
+
+
+def _direct_path(bench: Bench, board: Board) -> Finding:
+    from host.doctor.check_direct_path import check_direct_path
+
+    return check_direct_path(bench, board)
+
+
+def _skew(bench: Bench) -> Finding:
+    from host.doctor.check_skew import check_skew
+
+    return check_skew(bench)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One hop. `needs` must not have failed, nor been left out because of a failure; `unless` must not be wrong."""
+
+    name: str
+    run: Callable[..., Finding]
+    needs: tuple[str, ...] = ()
+    unless: tuple[str, ...] = ()
+    each_board: bool = False
+
+
+CHECKS = (
+    Check("config", check_config),
+    Check("host clock", check_host_clock),
+    Check("keys", check_keys, ("config",)),
+    Check("pi", check_pi, ("keys",)),
+    Check("pi clock", check_pi_clock, ("pi",)),
+    Check("rig is free", check_free, ("pi",)),
+    Check("calibration", _calibration, ("config",)),
+    Check("stage", check_stage, ("pi",)),
+    Check("card", check_card, ("config",), ("rig is free",), each_board=True),
+    Check("network", check_network, ("config",), each_board=True),
+    Check("buffer", check_buffer, ("card",), each_board=True),
+    Check("disk", check_disk, ("config",)),
+    Check("scan time", check_time, ("config",)),
+    Check("trigger line", check_trigger, ("rig is free", "stage")),
+    Check("pulses", check_pulses, ("pi", "rig is free")),
+    Check("radar", check_radar, ("buffer", "pulses"), each_board=True),
+    Check("level", _level, ("radar",), each_board=True),
+    Check("direct path", _direct_path, ("level",), each_board=True),
+    Check("trigger skew", _skew, ("direct path",)),
+)
+
+
+def walk(bench: Bench) -> Iterator[Finding]:
+    """Every check in order. A finding is told as soon as it is there."""
+    causes: dict[str, str] = {}  # titles that cannot be relied on, and the first check that was wrong
+
+    def told(title: str, finding: Finding, cause: str) -> Finding:
+        if cause:
+            causes[title] = cause
+        return replace(finding, check=title)
+
+    for check in CHECKS:
+        boards = bench.boards if check.each_board and bench.given is not None else (None,)
+        for board in boards:
+            title = check.name if board is None else f"{check.name} {board.name}"
+            cause = _cause(check, board, causes)
+            if cause:
+                yield told(title, not_checked(f"{cause} failed"), cause)
+                continue
+            finding = _try(check, bench, board)
+            yield told(title, finding, title if finding.verdict == "error" else "")
+
+
+def _cause(check: Check, board: Board | None, causes: dict[str, str]) -> str:
+    """What keeps a check from being tried; "" for nothing. A need is this board's, or of every board."""
+
+    def titles(need: str) -> list[str]:
+        if board is not None and f"{need} {board.name}" in causes:
+            return [f"{need} {board.name}"]
+        own = [need] if need in causes else []
+        return own if board is not None else own + [t for t in causes if t.startswith(f"{need} ") and t not in _NAMES]
+
+    for need in check.needs:
+        for title in titles(need):
+            return causes[title]
+    return next((causes[title] for title in check.unless if causes.get(title) == title), "")
+
+
+_NAMES = frozenset(check.name for check in CHECKS)
+
+
+def _try(check: Check, bench: Bench, board: Board | None) -> Finding:
+    try:
+        return check.run(bench) if board is None else check.run(bench, board)
+    except PolysightError as e:
+        return of_error(e)
+    except OSError as e:
+        where = f"{e.filename}: " if e.filename else ""
+        return of_error(
+            DeviceError(f"{where}{e.strerror or e}", "a path, a permission or a device", "see what it says")
+        )

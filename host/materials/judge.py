@@ -1,0 +1,173 @@
+"""Classifiers judged side by side on data they have not seen.
+
+Whole groups are left out (scans, or physical samples): pixels of one patch share their speckle, their placement and
+their metal reference, so that a split by pixel measures how well a patch knows itself. That figure is given too,
+because the paper seems to use it; it is optimistic and called so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.materials.decision import majority
+from host.materials.models import MODELS, SLOW
+from host.materials.samples import Real, Samples
+from shared.errors import DataError
+
+FOLDS = 8
+OPTIMISTIC = "by pixel (optimistic)"
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a model did.
+
+    Attributes
+    ----------
+    model, channels, split
+        Its name, what it saw, and how training and test were kept apart.
+    pixels
+        Share of pixels named right, each by nothing but itself: mean over materials.
+    in_scan
+        The same when the pixels of a scan are named together.
+    by_patch
+        Share of pixels whose patch was named right, the patches of a scan named together: mean over materials.
+    patches
+        Share of patches named right.
+    unknown
+        Share of the patches, all of them of known materials, that were called unknown.
+    confusion
+        float64 [material, material] of pixels on their own, rows the truth, each adding to 1, in the order of `names`.
+    patch_confusion
+        The same of pixels by their patch.
+    names
+        Materials, sorted.
+    """
+
+    model: str
+    channels: str
+    split: str
+    pixels: float
+    in_scan: float
+    by_patch: float
+    patches: float
+    unknown: float
+    confusion: Real
+    patch_confusion: Real
+    names: tuple[str, ...]
+
+
+def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
+    """Training and test pixels of each fold: whole groups apart, or single pixels.
+
+    Raises
+    ------
+    DataError
+        when there are fewer than two groups to keep apart.
+    """
+    from sklearn.model_selection import GroupKFold, StratifiedKFold
+
+    groups = np.unique(samples.groups)
+    if by_pixel:
+        smallest = int(np.unique(samples.names, return_counts=True)[1].min())
+        kept = StratifiedKFold(max(2, min(folds, smallest)), shuffle=True, random_state=0)
+        yield from kept.split(samples.x, samples.names)
+        return
+    if groups.size < 2:
+        raise DataError(
+            f"{groups.size} scan to judge a classifier on",
+            "whole scans are left out, and none would remain to learn from",
+            "process more scans",
+        )
+    yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, samples.groups)
+
+
+def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool = False, folds: int = FOLDS) -> Score:
+    """Judge a model by cross-validation.
+
+    Parameters
+    ----------
+    samples
+        Pixels.
+    model, channels
+        A key of `MODELS`, one of `CHANNELS`.
+    by_pixel
+        Split by pixel instead of by group: optimistic, see the module's text.
+    folds
+        At most so many folds.
+
+    Raises
+    ------
+    DataError
+        when there are fewer than two groups.
+    """
+    alone, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
+    unknown = np.zeros(samples.names.size, bool)
+    for train, test in splits(samples, by_pixel, folds):
+        fitted = MODELS[model](channels)
+        fitted.fit(samples.take(train))
+        alone[test], far = fitted.by_pixel(samples.x[test])
+        whole = [test]
+        if fitted.knows_scans:
+            whole = [test[samples.groups[test] == group] for group in np.unique(samples.groups[test])]
+        for at in whole:
+            if fitted.knows_scans:
+                found = fitted.by_scan(samples.x[at], samples.patches[at])
+            else:
+                found = majority(alone[at], far, samples.patches[at])
+            row = np.searchsorted(found.patches, samples.patches[at])
+            in_scan[at], of_patch[at], unknown[at] = found.pixel_names, found.names[row], (found.distance > 1)[row]
+    names = np.unique(samples.names)
+    tables = [_confusion(samples.names, found, names) for found in (alone, in_scan, of_patch)]
+    first = np.unique(samples.patches, return_index=True)[1]
+    return Score(
+        model,
+        channels,
+        OPTIMISTIC if by_pixel else f"whole scans left out, {np.unique(samples.groups).size} scans",
+        *(float(np.mean(np.diag(t))) for t in tables),
+        patches=float(np.mean((of_patch == samples.names)[first])),
+        unknown=float(np.mean(unknown[first])),
+        confusion=tables[0],
+        patch_confusion=tables[2],
+        names=tuple(str(n) for n in names),
+    )
+
+
+def _confusion(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Real:
+    table = np.zeros((names.size, names.size))
+    np.add.at(table, (np.searchsorted(names, true), np.searchsorted(names, found)), 1)
+    return table / table.sum(axis=1, keepdims=True)
+
+
+def best_model(samples: Samples) -> tuple[str, tuple[Score, ...]]:
+    """Name of the model that does best with whole groups left out, and the scores of all but the slowest.
+
+    Best is the mean of the pixels' and of the patches' share.
+    """
+    scores = tuple(score(samples, model) for model in MODELS if model != SLOW)
+    return max(scores, key=lambda s: s.pixels + s.patches).model, scores
+
+
+def strangers(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str, float]:
+    """Share of each material's patches that are called unknown when no patch of that material was ever learnt.
+
+    The other materials are learnt from other scans than the one that is judged, as always.
+    """
+    out = {}
+    for name in np.unique(samples.names):
+        missed = []
+        for train, test in splits(samples):
+            others = train[samples.names[train] != name]
+            fitted = MODELS[model](channels)
+            fitted.fit(samples.take(others))
+            for group in np.unique(samples.groups[test]):
+                at = test[samples.groups[test] == group]
+                found = fitted.by_scan(samples.x[at], samples.patches[at])
+                mine = np.unique(samples.patches[at][samples.names[at] == name])
+                missed += list(found.distance[np.searchsorted(found.patches, mine)] > 1)
+        out[str(name)] = float(np.mean(missed))
+    return out

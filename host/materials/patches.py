@@ -1,0 +1,144 @@
+"""`patches.npz`: the features of every patch's pixels as a scan left them, and the same patches in several scans."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import KDTree
+
+from host.materials.analyse import MaterialsResult
+from host.materials.classify import features_of
+from host.materials.samples import Real
+from host.materials.segment import axis_mm
+from shared.errors import DataError
+
+PATCHES = "patches.npz"
+FORMAT = "polysight-patches-1"
+APART_MM = 20.0
+"""Middles of one patch in two scans lie no farther apart."""
+NEAR_MM = 4.0
+"""Two pixels of two scans that lie no farther apart show the same spot: about the resolution."""
+
+
+@dataclass(frozen=True)
+class SeenPatch:
+    """A patch in one scan: its middle (mm from the image centre), the places of its pixels and their features.
+
+    `places_mm` float64 [n, 2], `features` float64 [n, 4] of its interior, after the Gaussian filter.
+    """
+
+    label: int
+    centre_mm: tuple[float, float]
+    truth: str | None
+    places_mm: Real
+    features: Real
+
+
+@dataclass(frozen=True)
+class SeenPatches:
+    """The patches of one scan."""
+
+    angle_deg: float
+    simulated: bool
+    patches: tuple[SeenPatch, ...]
+
+
+@dataclass(frozen=True)
+class MatchedPatch:
+    """A patch that several scans have in common; `features` [n, 4 * scans] of the spots that all of them show."""
+
+    label: int
+    truth: str | None
+    features: Real
+
+
+def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
+    """Content of `patches.npz`."""
+    x, y = axis_mm(x_m), axis_mm(y_m)
+    rows, places, features = [], [np.zeros((0, 2))], [np.zeros((0, 4))]
+    for r in found.patches:
+        at = r.patch.interior
+        iy, ix = np.nonzero(at)
+        places.append(np.stack([x[ix], y[iy]], axis=1))
+        features.append(features_of(found.h[at], found.v[at], found.p[at]))
+        truth = r.truth.name if r.truth else None
+        rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
+    angle = float(np.degrees(np.mean(found.theta_rad)))
+    meta = {"format": FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows}
+    out = io.BytesIO()
+    np.savez_compressed(
+        out,
+        meta=np.frombuffer(json.dumps(meta).encode("utf-8"), np.uint8),
+        places_mm=np.concatenate(places).astype(np.float32),
+        features=np.concatenate(features).astype(np.float32),
+    )
+    return out.getvalue()
+
+
+def read_patches(path: Path) -> SeenPatches:
+    """Read `patches.npz` (no pickle). Raises DataError."""
+    try:
+        with path.open("rb") as f, np.load(f, allow_pickle=False) as z:
+            meta = json.loads(z["meta"].tobytes().decode("utf-8"))
+            places, features = z["places_mm"].astype(np.float64), z["features"].astype(np.float64)
+        if meta["format"] != FORMAT:
+            raise ValueError(f"its format is {meta['format']!r}, this program reads {FORMAT!r}")
+        ends = np.cumsum([0, *(int(r["pixels"]) for r in meta["patches"])])
+        if features.shape != (ends[-1], 4) or places.shape != (ends[-1], 2):
+            raise ValueError(f"arrays {places.shape}, {features.shape} for {ends[-1]} pixels")
+        patches = tuple(
+            _seen(r, places[a:b], features[a:b]) for r, a, b in zip(meta["patches"], ends, ends[1:], strict=False)
+        )
+        return SeenPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches)
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
+        raise DataError(
+            f"{path}: the patches cannot be read: {type(e).__name__}: {e}",
+            "written by polysight process", "process the scan again",
+        ) from None  # fmt: skip
+
+
+def _seen(row: Mapping[str, object], places: Real, features: Real) -> SeenPatch:
+    x, y = row["centre_mm"]  # type: ignore[misc]
+    return SeenPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)  # type: ignore[arg-type]
+
+
+def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
+    """Patches that every scan shows in the same place, pixel by pixel.
+
+    A patch belongs to the one whose middle is nearest, when each is the other's nearest. Pixels are compared by their
+    place in the patch, so that the scans' image centres may differ by less than half a patch.
+    """
+    out = []
+    for patch in scans[0].patches:
+        partners = [_partner(patch, scans[0], other) for other in scans[1:]]
+        if any(p is None for p in partners):
+            continue
+        places = patch.places_mm - patch.centre_mm
+        columns, kept = [patch.features], np.ones(len(places), bool)
+        for partner in partners:
+            assert partner is not None  # noqa: S101
+            theirs = partner.places_mm - partner.centre_mm
+            far, at = KDTree(theirs).query(places) if len(theirs) else (np.full(len(places), np.inf), 0)
+            kept &= far <= NEAR_MM
+            columns.append(partner.features[np.minimum(at, len(theirs) - 1)] if len(theirs) else columns[0])
+        out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[kept]))
+    return out
+
+
+def _partner(patch: SeenPatch, here: SeenPatches, there: SeenPatches) -> SeenPatch | None:
+    def nearest(to: SeenPatch, among: SeenPatches) -> SeenPatch | None:
+        def apart(p: SeenPatch) -> float:
+            return float(np.hypot(p.centre_mm[0] - to.centre_mm[0], p.centre_mm[1] - to.centre_mm[1]))
+
+        best = min(among.patches, key=apart, default=None)
+        return best if best is not None and apart(best) <= APART_MM else None
+
+    found = nearest(patch, there)
+    return found if found is not None and nearest(found, here) is patch else None

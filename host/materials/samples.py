@@ -1,0 +1,110 @@
+"""Labelled pixels as classifiers see them: features, material, scan and patch of each pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from host.materials.library import Library
+from shared.errors import DataError
+
+Real = npt.NDArray[np.float64]
+WIDTH = 4
+"""Columns of one angle: |H|, |V|, real and imaginary part of 1/P = V/H."""
+CHANNELS = ("H", "V", "P", "H+V+P")
+"""What a classifier may look at (Fig. 20 of the paper)."""
+
+
+def feature_matrix(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
+    """Features [n, 4] of metal-referenced pixels: |H|, |V|, real and imaginary part of V / H = 1 / P.
+
+    The ratio stands upside down because V / H stays bounded where V vanishes (Brewster angle).
+    """
+    inverse = 1 / np.asarray(p, np.complex128)
+    return np.stack([np.abs(h), np.abs(v), inverse.real, inverse.imag], axis=-1)
+
+
+def usable(x: Real) -> npt.NDArray[np.bool_]:
+    """Pixels whose features are all finite, bool [n]."""
+    return np.asarray(np.isfinite(x).all(axis=1), np.bool_)
+
+
+def by_angle(x: Real) -> tuple[Real, Real, npt.NDArray[np.complex128]]:
+    """|H|, |V| and V / H of features [n, 4 * angles], each [n, angles]."""
+    h, v, real, imag = np.moveaxis(x.reshape(len(x), -1, WIDTH), -1, 0)
+    return h, v, real + 1j * imag
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Labelled pixels.
+
+    Attributes
+    ----------
+    x
+        float64 [n, 4 * angles].
+    names, groups, patches
+        Material, group that is left out as a whole (a scan, or a sample), and patch number of each pixel, [n].
+    """
+
+    x: Real
+    names: npt.NDArray
+    groups: npt.NDArray
+    patches: npt.NDArray
+
+    @classmethod
+    def of(cls, library: Library, pixels_per_patch: int | None = None, seed: int = 0) -> Samples:
+        """Pixels of a library of one angle, grouped by scan; at most so many of each patch, drawn at random.
+
+        Raises DataError when no pixel is usable.
+        """
+        rng = np.random.default_rng(seed)
+        x, names, groups, patches = [], [], [], []
+        for i, e in enumerate(library.entries):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                features = feature_matrix(e.h, e.v, e.p)
+            good = np.flatnonzero(usable(features))
+            at = rng.permutation(good)[:pixels_per_patch]
+            x.append(features[at])
+            names += [e.name] * at.size
+            groups += [e.scan] * at.size
+            patches += [i] * at.size
+        if not names:
+            raise DataError("the library holds no usable pixel", "nothing was trained", "polysight train")
+        return cls(np.concatenate(x), np.array(names), np.array(groups), np.array(patches))
+
+    def take(self, at: npt.NDArray) -> Samples:
+        """Some of the pixels, by index or by mask."""
+        return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at])
+
+    def joined(self, other: Samples, seed: int = 0) -> Samples:
+        """The same samples seen under a second angle, patch by patch.
+
+        Scans of one name belong together; where no name is common, the first scan here and the first there do, and so
+        on in their order. In such a pair the patches of a material are paired in their order, and their pixels at
+        random, for the pixels of two scans are not the same spots.
+
+        Raises DataError when no material was seen under both angles.
+        """
+        rng = np.random.default_rng(seed)
+        ours, theirs = np.unique(self.groups), np.unique(other.groups)
+        common = np.intersect1d(ours, theirs)
+        pairs = zip(common, common, strict=True) if common.size else zip(ours, theirs, strict=False)
+        left, right, groups, patches = [], [], [], []
+        for a, b in pairs:
+            for name in np.unique(self.names):
+                here = np.unique(self.patches[(self.groups == a) & (self.names == name)])
+                there = np.unique(other.patches[(other.groups == b) & (other.names == name)])
+                for p, q in zip(here, there, strict=False):
+                    i, j = np.flatnonzero(self.patches == p), np.flatnonzero(other.patches == q)
+                    n = min(i.size, j.size)
+                    left.append(rng.permutation(i)[:n])
+                    right.append(rng.permutation(j)[:n])
+                    groups += [a if a == b else f"{a} + {b}"] * n
+                    patches += [p] * n
+        if not groups:
+            raise DataError("no material was seen under both angles", "the scans' names differ", "train both angles")
+        i, j = np.concatenate(left), np.concatenate(right)
+        return Samples(np.hstack([self.x[i], other.x[j]]), self.names[i], np.array(groups), np.array(patches))

@@ -1,0 +1,124 @@
+"""The patches' ratios in sub-bands of the sweep: what tells a thin layer from a thick one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from host.imaging import ChannelImages
+from host.imaging.subbands import SubBand
+from host.materials.analyse import MaterialsResult, reference_error, smooth_inside, to_metal
+from host.materials.layers import Bands, Spectrum
+from host.materials.permittivity import inverse_spread, median_ratio
+from host.polarimetry import PlaneReference
+from shared.config import Chirp
+from shared.errors import DataError
+
+AMPLITUDE_ERROR = 0.1
+"""Relative standard deviation of |H| of a patch: its size, its edges and its tilt are in it, and in no ratio."""
+
+
+def band_rows(
+    found: MaterialsResult,
+    bands: Sequence[SubBand],
+    images: Sequence[ChannelImages],
+    leakage: tuple[complex, complex],
+    smooth_px: float,
+    references: Sequence[PlaneReference] | None = None,
+) -> dict[int, list[dict[str, Any]]]:
+    """Each patch's ratio in each sub-band, ready for materials.json.
+
+    Parameters
+    ----------
+    found
+        Patches and metal reference, from the whole sweep.
+    bands, images
+        Sub-bands and their image pairs, [K].
+    leakage, smooth_px
+        As for the whole sweep.
+    references
+        Metal scanned on its own, one for each sub-band; None: the metal region of the scene.
+
+    Returns
+    -------
+    Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, amplitude_h.
+
+    Raises
+    ------
+    DataError
+        when the reference was not imaged in these sub-bands.
+    """
+    if references is not None and len(references) != len(bands):
+        raise DataError(
+            f"the metal reference holds {len(references)} sub-bands, not {len(bands)}",
+            "a calibration file keeps none",
+            f"give the scan of the metal plate: --reference SCAN --bands {len(bands)}",
+        )
+    out: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
+    for k, (band, made) in enumerate(zip(bands, images, strict=True)):
+        reference = references[k] if references is not None else None
+        relative = to_metal(made.h, made.v, found.metal, leakage, reference)
+        h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
+        error = reference_error(h, v, found.metal, reference)
+        for r in found.patches:
+            at = r.patch.interior & made.valid
+            ratio = median_ratio(h[at], v[at])
+            std = math.hypot(inverse_spread(h[at], v[at]), error / abs(ratio)) if ratio else float("nan")
+            known = math.isfinite(abs(ratio)) and math.isfinite(std)
+            out[r.patch.label].append(
+                {
+                    "first_hz": band.first_hz,
+                    "last_hz": band.last_hz,
+                    "ratio": {"real": ratio.real, "imag": ratio.imag} if known else None,
+                    "inverse_ratio_std": std if known else None,
+                    "amplitude_h": float(np.nanmedian(np.abs(h[at]))) if known else None,
+                }
+            )
+    return out
+
+
+def bands_of_row(
+    row: Mapping[str, Any], chirp: Chirp, count: int = 1, amplitude_error: float = AMPLITUDE_ERROR
+) -> Bands | None:
+    """What :func:`host.materials.layers.fit_layer` needs of a row of materials.json.
+
+    Parameters
+    ----------
+    row
+        One segment.
+    chirp
+        Of the scan.
+    count
+        Sub-bands to use: those that were recorded with it, or 1: the whole sweep.
+    amplitude_error
+        Relative standard deviation of |H|; 0: |H| is not used.
+
+    Returns
+    -------
+    None when the segment has no usable ratio.
+
+    Raises
+    ------
+    DataError
+        when the segment was not processed with so many sub-bands.
+    """
+    parts = [row] if count == 1 else list(row.get("bands") or ())
+    if len(parts) != count:
+        there = f"{len(parts)} sub-bands" if parts else "no sub-bands"
+        raise DataError(
+            f"segment {row.get('label')} holds {there}, not {count}",
+            "sub-bands are imaged from the recorded rows",
+            f"process the scan again with --bands {count}",
+        )
+    if any(p.get("ratio") is None or not p.get("inverse_ratio_std") for p in parts):
+        return None
+    inverse = np.array([1 / complex(p["ratio"]["real"], p["ratio"]["imag"]) for p in parts])
+    sigma = np.array([float(p["inverse_ratio_std"]) for p in parts])
+    level = [p.get("amplitude_h") for p in parts]
+    if not amplitude_error or any(a is None for a in level):
+        return Bands(Spectrum.of(chirp, count), inverse, sigma)
+    amplitude = np.array(level, np.float64)
+    return Bands(Spectrum.of(chirp, count), inverse, sigma, amplitude, amplitude_error * amplitude)

@@ -1,0 +1,131 @@
+"""The best plans within a time: speeds, steps and bursts tried, the aperture kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+
+import msgspec
+import numpy as np
+
+from host.plan.changes import Changes
+from host.plan.forecast import Forecast, Noise, burst_facts, cautions, forecast, noise_facts
+from host.plan.timing import ROW_OVERHEAD_S, payload_bytes, run_up_mm, scan_time
+from host.plan.warn import MAX_STEPS_PER_S, Caution
+from host.radar.program import TRIGGER_MARGIN_US, chirp_us
+from host.radar.validator import INTER_FRAME_US
+from shared.config import Instrument
+from shared.errors import ConfigError
+
+_MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
+_MARGIN = 0.95  # of the time between two points that a burst may fill
+_MOST_TRAVEL_WAVELENGTHS = 0.5
+MAX_FRAMES = 65535
+"""Of a row, that a radar counts (host/radar/validator.py)."""
+
+
+def shortest_period_us(rig: Instrument) -> float:
+    """Shortest pulse period that the radars take (host/radar/validator.py), up to the next 10 us."""
+    return 10 * float(np.ceil((chirp_us(rig) + INTER_FRAME_US + TRIGGER_MARGIN_US) / 10))
+
+
+def propose(
+    rig: Instrument,
+    minutes: float,
+    count: int = 5,
+    noise: Noise | None = None,
+    row_overhead_s: float = ROW_OVERHEAD_S,
+    scene_mm: tuple[float, float] | None = None,
+) -> list[Forecast]:
+    """The plans with the least noise in the image that take no longer and have no aliases, best first.
+
+    For each pair of steps the best speed and burst; the aperture stays as large as the rig file's. Bursts never take
+    more than half a wavelength of travel.
+
+    Parameters
+    ----------
+    rig
+        Rig file, with what shall not be changed.
+    minutes
+        Time there is, homing not included.
+    count
+        Plans wanted; fewer, or none, where the time is too short.
+    noise, row_overhead_s, scene_mm
+        As for :func:`host.plan.forecast`.
+    """
+    noise = noise or Noise()
+    best: list[tuple[float, Instrument]] = []
+    for changed in _grids(rig):
+        tried = [(_score(p, noise), p) for p in _bursts(changed, minutes, row_overhead_s)]
+        if tried:
+            best.append(max(tried, key=lambda t: t[0]))
+    best.sort(key=lambda t: -t[0])
+    good = (p for _, p in best if not any(_rules_out(w) for w in cautions(p, noise, scene_mm)))
+    return [forecast(p, noise, row_overhead_s, scene_mm) for p in islice(good, count)]
+
+
+def _rules_out(caution: Caution) -> bool:
+    return caution.refused or caution.topic == "aliasing"
+
+
+def _score(rig: Instrument, noise: Noise) -> float:
+    return noise_facts(rig, noise).image_db - burst_facts(rig).edge_loss_db
+
+
+def _grids(rig: Instrument) -> Iterator[Instrument]:
+    """The rig file with other steps."""
+    for nx in _MULTIPLES:
+        for ny in _MULTIPLES:
+            steps = Changes(step_x_mm=nx * rig.grid.step_x_mm, step_y_mm=ny * rig.grid.step_y_mm)
+            try:
+                yield steps.apply(rig)
+            except ConfigError:
+                continue  # whole steps make this aperture larger than the travel
+
+
+def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[Instrument]:
+    """As many pulses as travel and time to the next position allow, at the slowest speed that keeps the time.
+
+    At the rig's period and the radars' shortest; all that fit, and as many as make a row whole packets.
+    """
+    for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
+        for whole in (False, True):
+            for speed in _speeds(rig, minutes):
+                plan = _with(rig, speed, 2, period)
+                pulses = _most_pulses(plan)
+                if whole:
+                    pulses = next((n for n in range(pulses, 1, -1) if _whole(plan, n)), 0)
+                if pulses < 2:
+                    break
+                plan = _with(rig, speed, pulses, period)
+                if scan_time(plan, row_overhead_s).minutes <= minutes:
+                    yield plan
+                    break
+
+
+def _with(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> Instrument:
+    """Another speed and burst, quickly: that they keep the rig file's rules is known."""
+    stage = msgspec.structs.replace(rig.stage, speed_mm_s=speed_mm_s)
+    burst = msgspec.structs.replace(rig.burst, pulses=pulses, period_us=period_us)
+    return msgspec.structs.replace(rig, stage=stage, burst=burst)
+
+
+def _most_pulses(rig: Instrument) -> int:
+    fits = _MARGIN * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
+    still = 1 + _MOST_TRAVEL_WAVELENGTHS * (rig.burst.pulses - 1) / burst_facts(rig).travel_wavelengths
+    return min(int(fits), int(still), MAX_FRAMES // rig.grid.columns)
+
+
+def _whole(rig: Instrument, pulses: int) -> bool:
+    return pulses * rig.grid.columns * rig.frame_bytes % payload_bytes(rig) == 0
+
+
+def _speeds(rig: Instrument, minutes: float) -> Iterator[float]:
+    """Whole speeds, ascending, from one that might keep the time to what stage and travel allow."""
+    length = (rig.grid.columns - 1) * rig.grid.step_x_mm
+    room = min(rig.stage.centre_x_mm, rig.stage.travel_x_mm - rig.stage.centre_x_mm)
+    slowest = max(1, int(rig.grid.rows * length / (60 * minutes)))
+    for speed in range(slowest, int(MAX_STEPS_PER_S / rig.stage.steps_per_mm) + 1):
+        at = msgspec.structs.replace(rig.stage, speed_mm_s=float(speed))
+        if length / 2 + run_up_mm(rig.grid, at) <= room:
+            yield float(speed)

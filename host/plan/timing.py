@@ -1,0 +1,138 @@
+"""How long the stage takes for a scan: rows with their ramps, turn-rounds, and what host and Pi add between rows.
+
+The stage's own sequence is in docs/spec/stage-line.md ("A row"); speeds are trapezoids of constant acceleration.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from host.capture.dca1000 import MAX_PAYLOAD_BYTES
+from shared.config import Grid, Instrument, Stage
+from shared.raster import burst_duration_s
+
+ROW_OVERHEAD_S = 0.3
+"""Standstill between rows once the data is there: row made durable, cards and radars armed, commands.
+
+Simulated: 0.14 and 0.29 s between rows of 350 points x 13 and 16 chirps on the simulated rig at real time, on a busy
+machine. Not measured on hardware; `polysight plan --like SCAN` takes it from a scan.
+"""
+
+TAIL_S = 2.0
+"""A card keeps a record's short last packet back for so long after the last data (docs/spec/dca1000.md, seen)."""
+
+_PACKET_OVERHEAD_BYTES = 14
+
+
+@dataclass(frozen=True)
+class ScanTime:
+    """Seconds of a scan, added up over its rows. Homing is not in it: it depends on where the stage stands.
+
+    Attributes
+    ----------
+    approach_s
+        From the home corner to the start of the first row.
+    measuring_s
+        At constant speed from each row's first point to its last.
+    ramps_s
+        Acceleration, slowing down, and the run-up of one step (or the backlash) on either side.
+    turns_s
+        Way from each row's end to the next one's beginning.
+    tail_s
+        Waiting for the cards' short last packets.
+    overhead_s
+        Standstill besides.
+    rows
+        Rows of the scan.
+    """
+
+    approach_s: float
+    measuring_s: float
+    ramps_s: float
+    turns_s: float
+    tail_s: float
+    overhead_s: float
+    rows: int
+
+    @property
+    def total_s(self) -> float:
+        """All of it."""
+        return self.approach_s + self.measuring_s + self.ramps_s + self.turns_s + self.tail_s + self.overhead_s
+
+    @property
+    def minutes(self) -> float:
+        """All of it, in minutes."""
+        return self.total_s / 60
+
+
+def straight_move_s(distance_mm: float, speed_mm_s: float, accel_mm_s2: float) -> float:
+    """From rest to rest over a distance: a trapezoid of speed, or a triangle where the speed is not reached."""
+    if distance_mm <= 0:
+        return 0.0
+    if distance_mm < speed_mm_s**2 / accel_mm_s2:
+        return 2 * math.sqrt(distance_mm / accel_mm_s2)
+    return distance_mm / speed_mm_s + speed_mm_s / accel_mm_s2
+
+
+def run_up_mm(grid: Grid, stage: Stage) -> float:
+    """From rest to the first point: the ramp v^2 / 2a, and a step (or the backlash) at constant speed."""
+    return stage.speed_mm_s**2 / (2 * stage.accel_mm_s2) + max(grid.step_x_mm, stage.backlash_mm)
+
+
+def row_motion_s(grid: Grid, stage: Stage) -> float:
+    """One row from rest to rest."""
+    length = (grid.columns - 1) * grid.step_x_mm + 2 * run_up_mm(grid, stage)
+    return straight_move_s(length, stage.speed_mm_s, stage.accel_mm_s2)
+
+
+def turn_s(grid: Grid, stage: Stage) -> float:
+    """From a row's end to the next one's beginning: y alone moves, from below where backlash is taken up."""
+    step, lost = grid.step_y_mm, stage.backlash_mm
+    legs = (step,) if lost <= step else (lost - step, lost)
+    return sum(straight_move_s(leg, stage.travel_speed_mm_s, stage.accel_mm_s2) for leg in legs)
+
+
+def payload_bytes(rig: Instrument) -> int:
+    """Payload of a full packet: what the card is told less its header's 14 bytes, at most 1456."""
+    return min(rig.card.packet_bytes - _PACKET_OVERHEAD_BYTES, MAX_PAYLOAD_BYTES)
+
+
+def whole_packets(rig: Instrument) -> bool:
+    """Whether a row fills whole packets, so that its last byte comes without the card's wait."""
+    return rig.row_bytes % payload_bytes(rig) == 0
+
+
+def tail_s(rig: Instrument) -> float:
+    """Waiting at the end of each row for the cards' last packet, after the stage has come to rest, seconds."""
+    if whole_packets(rig):
+        return 0.0
+    grid, stage = rig.grid, rig.stage
+    run_out = (row_motion_s(grid, stage) - (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s) / 2
+    return max(0.0, burst_duration_s(rig.burst) + TAIL_S - run_out)
+
+
+def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTime:
+    """How long a rig's scan takes, every row taken once.
+
+    Parameters
+    ----------
+    rig
+        Grid, stage and burst.
+    row_overhead_s
+        Standstill for each row besides motion and the wait for its last packet, seconds.
+    """
+    grid, stage = rig.grid, rig.stage
+    row = row_motion_s(grid, stage)
+    measuring = (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s
+    x = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - run_up_mm(grid, stage)
+    y = stage.centre_y_mm - (grid.rows - 1) / 2 * grid.step_y_mm
+    return ScanTime(
+        approach_s=straight_move_s(max(x, y), stage.travel_speed_mm_s, stage.accel_mm_s2),
+        measuring_s=grid.rows * measuring,
+        ramps_s=grid.rows * (row - measuring),
+        turns_s=(grid.rows - 1) * turn_s(grid, stage),
+        tail_s=grid.rows * tail_s(rig),
+        overhead_s=grid.rows * row_overhead_s,
+        rows=grid.rows,
+    )

@@ -1,0 +1,297 @@
+// The live view's page: hears the newest state from the server, shows it, and asks for what a button says.
+import { plot, raster } from "./plots.js";
+
+const SILENT_MS = 7000; // the server says something every two seconds
+const SIGNS = { good: "✓", done: "✓", warn: "!", bad: "✕", wait: "…" };
+const CHANNELS = [["h", "H", "s-polarised"], ["v", "V", "p-polarised"], ["p", "P = H / V", "not referenced to metal yet"]];
+const FEW = 4;
+
+const by = (id) => document.getElementById(id);
+const token = readToken();
+let state = null, motion = {}, source = null, heardAt = 0, allNotices = false, toldNotices = "", revision = -1;
+
+function readToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (given) {
+    sessionStorage.setItem("token", given);
+    history.replaceState(null, "", location.pathname); // not left where a screenshot shows it
+  }
+  return sessionStorage.getItem("token") ?? "";
+}
+
+function make(name, text, className) {
+  const node = document.createElement(name);
+  if (text !== undefined) node.textContent = text;
+  if (className) node.className = className;
+  return node;
+}
+
+/** Text with `commands` in it, as nodes. */
+function rich(text) {
+  return text.split("`").map((part, i) => (i % 2 ? make("code", part) : document.createTextNode(part)));
+}
+
+function tell(id, text) {
+  if (by(id).textContent === text.replaceAll("`", "") && by(id).hidden === !text) return; // screen readers read changes
+  by(id).replaceChildren(...rich(text));
+  by(id).hidden = !text;
+}
+
+export function span(seconds) {
+  if (seconds < 100) return `${Math.round(seconds)} s`;
+  const minutes = Math.round(seconds / 60);
+  return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
+}
+
+const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+const signed = (n) => String(Math.round(n)).replace("-", "−");
+const grouped = (n) => n.toLocaleString("en").replaceAll(",", "\u202f");
+
+// --- what is shown ---
+
+function showStatus() {
+  const { status, progress } = state;
+  by("status").dataset.level = status.level;
+  by("sign").textContent = SIGNS[status.level];
+  by("headline").textContent = status.headline;
+  tell("detail", status.detail.replace("{since}", span(Math.max(0, (motion.now_s ?? status.since_s) - status.since_s))));
+  tell("why", status.why && `Likely: ${status.why[0].toLowerCase()}${status.why.slice(1)}.`);
+  tell("do", status.do);
+  by("progress").hidden = !progress;
+  let left = "", ends = "";
+  if (progress) {
+    by("done").style.width = `${100 * progress.committed / progress.rows}%`;
+    by("count").textContent = `${progress.committed} of ${progress.rows} rows`;
+    const open = progress.committed < progress.rows;
+    if (open && Number.isFinite(motion.left_s)) {
+      left = motion.left_s ? `${span(motion.left_s)} left` : "nearly done";
+      ends = state.control.paused ? "once it goes on" : `ends about ${clock(motion.now_s + motion.left_s)}`;
+      if (motion.left_from !== "measured") ends += motion.left_from === "plan" ? ", by the plan" : ", a first guess";
+    } else if (open && state.control.running) {
+      ends = "time left: known after the first row";
+    }
+  }
+  by("left").textContent = left;
+  by("ends").textContent = ends;
+  const short = progress ? ` ${progress.committed}/${progress.rows}` : "";
+  document.title = `${SIGNS[status.level]}${short}${left ? ` · ${left}` : ""} · polysight`;
+}
+
+function showButtons() {
+  const { enabled, running, paused, asked } = state.control;
+  by("buttons").hidden = !enabled || !running;
+  by("pause").hidden = paused || asked === "pause";
+  by("continue").hidden = !(paused || asked === "pause");
+  const ending = asked === "stop" || asked === "abort";
+  for (const id of ["pause", "continue", "stop"]) by(id).disabled = ending;
+  by("abort").disabled = asked === "abort";
+}
+
+function buildChannels() {
+  const { width_mm: wide, height_mm: high } = state.pictures;
+  by("channels").replaceChildren(...CHANNELS.map(([key, name, note]) => {
+    const card = make("div", undefined, "channel");
+    const head = make("h3", `${name} `);
+    head.append(make("span", note));
+    card.append(head, ...["amplitude", "phase"].map((kind) => {
+      const figure = make("figure"), view = make("div", undefined, kind === "phase" || key === "p" ? "view fades" : "view"), caption = make("figcaption");
+      view.style.aspectRatio = `${wide} / ${high}`;
+      const picture = make("img");
+      picture.id = `${key}_${kind}`;
+      picture.alt = `${kind} of ${name}`;
+      picture.hidden = true;
+      view.append(make("span", "after the first row"), picture);
+      const bar = make("img");
+      bar.src = `api/bar/${kind}`;
+      bar.alt = "";
+      caption.append(make("span", kind), bar, make("span", ""));
+      figure.append(view, caption);
+      return figure;
+    }));
+    return card;
+  }));
+}
+
+function showImages() {
+  const p = state.pictures;
+  if (!by("h_amplitude")) buildChannels();
+  const waiting = p.waiting ? `, ${p.waiting} more on their way` : "";
+  const early = p.rows && p.rows < state.scan.rows / 3 ? "; sharp when more rows are in" : "";
+  by("images-note").textContent = `${p.rows} rows in${waiting}; ${p.width_mm} × ${p.height_mm} mm${early}`;
+  if (p.revision === revision) return;
+  revision = p.revision;
+  for (const [name, { low, high, unit }] of Object.entries(p.items)) {
+    const picture = by(name), caption = picture.closest("figure").querySelector("figcaption");
+    picture.src = `api/picture/${name}?${revision}`;
+    picture.hidden = false;
+    picture.parentNode.classList.add("filled");
+    caption.lastChild.textContent = `${signed(low)} to ${signed(high)}${unit === "°" ? "°" : ` ${unit}`}`;
+  }
+}
+
+function showStage() {
+  const { stage, row, point } = motion, notes = [];
+  if (row >= 0) notes.push(`row ${row}, point ${point}`);
+  if (stage) notes.push(`x ${signed(stage.x_mm)}, y ${signed(stage.y_mm)} mm`);
+  by("stage-note").textContent = notes.join(" · ");
+  raster(by("raster"), state, motion);
+}
+
+function showNotices() {
+  const told = JSON.stringify([state.notices, state.status.level, allNotices]);
+  if (told === toldNotices) return; // so that what is unfolded stays so
+  toldNotices = told;
+  const notices = state.notices, serious = notices.filter((n) => n.level !== "note");
+  by("faults").classList.toggle("news", serious.length > 0 && ["warn", "bad"].includes(state.status.level));
+  by("faults-note").textContent = notices.length ? `${notices.length}, the newest first` : "";
+  const shown = allNotices ? notices : notices.slice(0, FEW);
+  const items = shown.map((n) => {
+    const item = make("li");
+    item.dataset.level = n.level;
+    if (n.utc) item.append(make("time", `${clock(Date.parse(n.utc) / 1000)} `));
+    const what = make("b");
+    what.append(...rich(n.what));
+    item.append(what);
+    if (n.why) item.append(make("span", ` ${n.why}.`, "why"));
+    if (n.do) {
+      const todo = make("span", "→ ", "do");
+      todo.append(...rich(n.do));
+      item.append(todo);
+    }
+    if (n.detail) {
+      const more = make("details");
+      more.append(make("summary", "in full"), make("span", n.detail));
+      item.append(more);
+    }
+    return item;
+  });
+  if (!items.length) items.push(make("li", "Nothing that you need to know of.", "none"));
+  by("notices").replaceChildren(...items);
+  by("more").hidden = notices.length <= FEW;
+  by("more").textContent = allNotices ? "Fewer" : `All ${notices.length}`;
+}
+
+function showBoards() {
+  const table = make("table"), head = table.createTHead().insertRow(), body = table.createTBody();
+  head.append(make("th", ""), ...state.boards.map((b) => make("th", b.name)));
+  const line = (name, cell) => {
+    const row = body.insertRow();
+    row.append(make("th", name), ...state.boards.map((b) => {
+      const [text, level] = cell(b);
+      return make("td", text, level);
+    }));
+  };
+  const bad = (n) => [grouped(n), n ? "warn" : ""];
+  line("data", (b) => (b.frames_lost ? ["gaps", "warn"] : b.frames_expected ? ["✓ whole", "good"] : ["–", ""]));
+  line("frames lost", (b) => bad(b.frames_lost));
+  line("frames in all", (b) => [grouped(b.frames_expected), ""]);
+  if (state.boards.some((b) => "packets" in b.counts)) {
+    line("packets", (b) => [grouped(b.counts.packets ?? 0), ""]);
+    line("late or twice", (b) => [grouped((b.counts.late ?? 0) + (b.counts.duplicates ?? 0)), ""]);
+    line("dropped by this machine", (b) => bad(b.counts.kernel_drops ?? 0));
+  }
+  line("takes not counted", (b) => bad(b.retaken));
+  line("pulses missed", (b) => bad(b.counts.pulses_missed ?? 0));
+  line("positions masked", (b) => bad(b.masked));
+  by("board-table").replaceChildren(table);
+  const t = state.trigger;
+  by("trigger").textContent = t
+    ? `Triggers: ${grouped(t.pulses)} pulses; the longest ${t.width_max_us.toFixed(1)} µs of ${t.width_limit_us} allowed, `
+      + `the latest ${t.jitter_max_us.toFixed(1)} µs late.`
+    : "Triggers: nothing heard yet.";
+}
+
+function showPlots() {
+  const names = state.scan.receivers, p = state.profile, boards = state.sync.boards;
+  if (p) {
+    const levels = Object.values(p.boards).flat();
+    by("range-note").textContent = `row ${p.row}, dB below the direct path`;
+    plot(by("profile"), {
+      x: [p.excess_m[0], p.excess_m.at(-1)], y: [Math.max(-70, Math.floor(Math.min(...levels) / 10) * 10), 10],
+      xLabel: "path longer than the direct one, m", yLabel: "dB",
+      lines: names.filter((n) => p.boards[n]).map((n) => ({ x: p.excess_m, y: p.boards[n], name: n, style: `receiver${names.indexOf(n)}` })),
+      upright: [{ x: 0, name: "direct path" }], scene: p.scene_m, sceneName: "scene",
+    });
+  } else by("profile").replaceChildren(make("p", "After the first row.", "empty"));
+  const lines = names.filter((n) => boards[n]).map((n) => (
+    { x: boards[n].rows, y: boards[n].object_deg, name: n, style: `receiver${names.indexOf(n)}` }));
+  const values = lines.flatMap((l) => l.y).filter((v) => v !== null);
+  if (values.length) {
+    by("sync-note").textContent = "phase left over, by row";
+    plot(by("sync"), {
+      x: [0, Math.max(1, state.scan.rows - 1)], y: [0, Math.max(2 * state.sync.paper_deg, 1.15 * Math.max(...values))],
+      xLabel: "row", yLabel: "degrees (std)", lines, level: [{ y: state.sync.paper_deg, name: "the paper's" }],
+    });
+  } else by("sync").replaceChildren(make("p", "After the first row.", "empty"));
+}
+
+function showAll() {
+  showStatus();
+  showButtons();
+  showNotices();
+  const there = Boolean(state.scan);
+  for (const id of ["images", "stage", "boards", "range", "residual"]) by(id).hidden = !there;
+  if (!there) return;
+  by("scan").textContent = `${state.scan.folder} · ${state.scan.rig}`;
+  by("simulated").hidden = !state.scan.simulated;
+  showImages();
+  showStage();
+  showBoards();
+  showPlots();
+}
+
+// --- the server ---
+
+function connect() {
+  source?.close();
+  heardAt = Date.now();
+  source = new EventSource("api/events");
+  const heard = (take) => (event) => {
+    heardAt = Date.now();
+    document.body.classList.remove("lost");
+    take(JSON.parse(event.data));
+  };
+  source.addEventListener("alive", heard(() => {}));
+  source.addEventListener("state", heard((told) => { state = told; showAll(); }));
+  source.addEventListener("motion", heard((told) => {
+    motion = told;
+    if (state) showStatus();
+    if (state?.scan) showStage();
+  }));
+  source.onerror = lost;
+}
+
+function lost() {
+  document.body.classList.add("lost");
+  by("status").dataset.level = "wait";
+  by("sign").textContent = "?";
+  by("headline").textContent = "This page has lost the live view";
+  tell("detail", "It tries again by itself. The scan does not depend on it.");
+  tell("why", "Likely: `polysight preview` was ended, or the network is gone.");
+  tell("do", "");
+  document.title = "? · polysight";
+}
+
+setInterval(() => {
+  if (Date.now() - heardAt < SILENT_MS) return;
+  lost();
+  connect();
+}, 1000);
+
+async function ask(wish) {
+  by("answer").textContent = "…";
+  try {
+    const reply = await fetch(`api/control/${wish}`, { method: "POST", headers: { "X-Polysight-Token": token } });
+    const told = await reply.json();
+    by("answer").textContent = reply.ok ? "" : [told.what, told.why, told.do && `Do: ${told.do}`].filter(Boolean).join(". ");
+  } catch {
+    by("answer").textContent = "The live view did not answer; nothing was asked of the scan.";
+  }
+}
+
+for (const wish of ["pause", "continue", "stop"]) by(wish).addEventListener("click", () => ask(wish));
+by("abort").addEventListener("click", () => by("confirm").showModal());
+by("confirm").addEventListener("close", () => { if (by("confirm").returnValue === "yes") ask("abort"); });
+by("more").addEventListener("click", () => { allNotices = !allNotices; showNotices(); });
+new ResizeObserver(() => { if (state?.scan) { showStage(); showPlots(); } }).observe(document.body);
+connect();

@@ -1,0 +1,208 @@
+"""What a scan's own files say about it: rows, takes, counts of each board, times, and what went wrong.
+
+Gathered fact by fact and event by event, without files or clocks, so that the same files tell the same story to whoever
+begins to look later.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+from host.preview.words import Notice, of_fault, of_kept, of_rejection
+from host.store.manifest import Fact
+from shared.config import Instrument
+from shared.config import decode as decode_config
+from shared.messages import AnyEvent, Capture
+from shared.messages import Fault as FaultEvent
+from shared.raster import RasterPlan, plan_raster
+
+RowMark = Literal["committed", "kept", "rejected"]
+_RECENT_ROWS = 25  # whose times say how long a row takes
+_RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
+
+
+@dataclass
+class BoardCounts:
+    """What came from one board, over its committed rows; `retaken` counts takes that were rejected because of it."""
+
+    frames_expected: int = 0
+    frames_received: int = 0
+    missing_bytes: int = 0
+    counts: dict[str, int] = field(default_factory=dict)
+    retaken: int = 0
+
+
+@dataclass
+class TriggerHealth:
+    """The worst SYNC_IN pulses of one row, as the Pi measured them."""
+
+    width_max_ns: int = 0
+    jitter_max_ns: int = 0
+
+    def add(self, event: Capture) -> None:
+        """Take in one burst."""
+        self.width_max_ns = max(self.width_max_ns, event.width_max_ns)
+        self.jitter_max_ns = max(self.jitter_max_ns, event.jitter_ns)
+
+
+def seconds(utc: str) -> float:
+    """An ISO time as seconds since 1970."""
+    return datetime.fromisoformat(utc).timestamp()
+
+
+class Story:
+    """A scan as told by its manifest and its events.
+
+    Attributes
+    ----------
+    instrument, plan
+        Of the scan; the manifest's first fact has them.
+    takes
+        Committed rows and the take that counts, in the order they were committed.
+    marks
+        What became of each row so far.
+    ended
+        How the last run ended; None while it goes on, or when nobody could write it.
+    paused
+        Whether the scan waits because somebody asked for it.
+    run_seq
+        The events from this number on are of the last run.
+    """
+
+    def __init__(self, started: Fact) -> None:
+        self.started = started
+        self.instrument: Instrument = decode_config(started["instrument"], Instrument, "the manifest's instrument")
+        self.plan: RasterPlan = plan_raster(self.instrument.grid)
+        self.scan_id, self.simulated = str(started["scan_id"]), bool(started["simulated"])
+        self.takes: dict[int, int] = {}
+        self.marks: dict[int, RowMark] = {}
+        self.notices: list[Notice] = []
+        self.ended: Fact | None = None
+        self.paused = False
+        self.run_started_s = seconds(started.get("started_utc") or "1970-01-01T00:00:00+00:00")
+        self.last_commit_s = 0.0
+        self.trigger: dict[int, TriggerHealth] = {}
+        self.rows_since_trouble = 0  # rows committed whole since one was rejected or kept with gaps
+        self._rows: dict[int, dict[str, Any]] = {}
+        self._rejected: dict[str, int] = {b.name: 0 for b in self.instrument.recorded}
+        self._row_seconds: list[float] = []
+        self._paused_at = 0.0
+        self._fault_seqs: set[int] = set()
+
+    # --- the manifest ---
+
+    def add_fact(self, fact: Fact) -> None:
+        """Take in the next fact; unknown ones are passed over."""
+        tellers = {
+            "row_committed": self._row_committed,
+            "row_rejected": self._row_rejected,
+            "row_withdrawn": self._row_withdrawn,
+            "scan_resumed": self._scan_resumed,
+            "scan_paused": self._scan_paused,
+            "scan_continued": self._scan_continued,
+            "scan_ended": self._scan_ended,
+        }
+        if fact["fact"] in tellers:
+            tellers[fact["fact"]](fact)
+
+    def _row_committed(self, fact: Fact) -> None:
+        row, kept = int(fact["row"]), fact.get("kept_incomplete")
+        self.takes.pop(row, None)
+        self.takes[row] = int(fact["take"])
+        self.marks[row] = "kept" if kept else "committed"
+        self._rows[row] = fact["boards"]
+        self.rows_since_trouble = 0 if kept else self.rows_since_trouble + 1
+        if kept:
+            self.notices.append(of_kept(row, kept, fact.get("committed_utc", "")))
+        if not fact.get("committed_utc"):
+            return  # made in one step, by `polysight simulate`
+        at = seconds(fact["committed_utc"])
+        if self.last_commit_s > self.run_started_s:
+            self._row_seconds.append(at - self.last_commit_s)
+        self.last_commit_s = at
+
+    def _row_rejected(self, fact: Fact) -> None:
+        row, reasons = int(fact["row"]), [str(r) for r in fact["reasons"]]
+        self.marks[row] = "rejected"
+        self.rows_since_trouble = 0
+        for name in self._rejected:
+            self._rejected[name] += any(r.startswith(f"{name}:") for r in reasons)
+        self.notices.append(of_rejection(row, int(fact["take"]), reasons, fact.get("rejected_utc", "")))
+
+    def _row_withdrawn(self, fact: Fact) -> None:
+        row = int(fact["row"])
+        self.takes.pop(row, None)
+        self._rows.pop(row, None)
+        self.marks.pop(row, None)
+        why = "; ".join(map(str, fact["reasons"]))
+        self.notices.append(
+            Notice(
+                "warn",
+                f"Row {row} on the disk is not what was committed",
+                "The disk, or somebody, changed it",
+                "Nothing: it is taken again",
+                why,
+                row,
+                fact.get("withdrawn_utc", ""),
+            )
+        )
+
+    def _scan_resumed(self, fact: Fact) -> None:
+        self.ended, self.paused = None, False
+        self.run_started_s = seconds(fact["resumed_utc"])
+
+    def _scan_paused(self, fact: Fact) -> None:
+        self.paused, self._paused_at = True, seconds(fact["paused_utc"])
+
+    def _scan_continued(self, fact: Fact) -> None:
+        self.paused = False
+        if self.last_commit_s:
+            self.last_commit_s += seconds(fact["continued_utc"]) - self._paused_at  # a pause is no time of a row
+
+    def _scan_ended(self, fact: Fact) -> None:
+        self.ended, self.paused = fact, False
+
+    # --- the Pi's events ---
+
+    def add_events(self, events: Iterable[AnyEvent]) -> None:
+        """Take in journalled events; those that were taken in already change nothing."""
+        for event in events:
+            if isinstance(event, Capture):
+                self.trigger.setdefault(event.row_index, TriggerHealth()).add(event)
+            elif isinstance(event, FaultEvent) and event.seq not in self._fault_seqs:
+                self._fault_seqs.add(event.seq)
+                self.notices.append(of_fault(event))
+
+    # --- what follows from them ---
+
+    @property
+    def boards(self) -> dict[str, BoardCounts]:
+        """Counts over the committed rows, by board."""
+        found = {name: BoardCounts(retaken=n) for name, n in self._rejected.items()}
+        for boards in self._rows.values():
+            for name, told in boards.items():
+                board = found.setdefault(name, BoardCounts())
+                board.frames_expected += int(told["frames_expected"])
+                board.frames_received += int(told["frames_received"])
+                board.missing_bytes += int(told["missing_bytes"])
+                for kind in _RECEPTION:
+                    if kind in told:
+                        board.counts[kind] = board.counts.get(kind, 0) + int(told[kind])
+        return found
+
+    @property
+    def row_seconds(self) -> tuple[float, str] | None:
+        """How long a row takes, and from what that is known; None when it is not."""
+        if self._row_seconds:
+            return statistics.median(self._row_seconds[-_RECENT_ROWS:]), "measured"
+        if self.last_commit_s > self.run_started_s:
+            return self.last_commit_s - self.run_started_s, "first row"
+        if self.simulated:
+            return None  # nobody knows how fast the simulated time goes
+        stage, grid = self.instrument.stage, self.instrument.grid
+        ramps = 2 * stage.speed_mm_s / stage.accel_mm_s2
+        return grid.columns * grid.step_x_mm / stage.speed_mm_s + ramps + grid.step_y_mm / stage.speed_mm_s, "plan"

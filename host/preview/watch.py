@@ -1,0 +1,190 @@
+"""Keeps looking at one scan, and keeps the newest snapshot of it: what every page gets, whenever it comes.
+
+A snapshot is made once and kept as bytes, so that pages cost nothing but sending, however many there are and however
+slow they are, and all see the same.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from host.preview.follow import EventTail, ManifestTail
+from host.preview.listener import Heard, PiListener
+from host.preview.rows import RowViewer, Shown
+from host.preview.snapshot import Content, make_motion, make_snapshot
+from host.preview.story import Story
+from host.preview.verdict import Signs
+from host.scan.control import Wish, ask, last_sign_of_life
+from host.store.manifest import Manifest
+from host.store.scanfolder import EVENTS, MANIFEST
+from shared.errors import PolysightError
+
+_TURN_S = 0.2
+_LAPSE_S = 15.0  # the scan program touches its file once a second
+_GRACE_S = 6.0  # from a manifest's first line to the first sign of life
+_PI_LIMIT_S = 6.0
+_UNATTENDED_ROWS = 3.0  # a scan without signs of life lives while rows come, and for so many rows' time
+
+
+class Versioned(NamedTuple):
+    """Something that was published: its number and its JSON."""
+
+    version: int
+    data: bytes
+
+
+class Watch:
+    """Looks at a scan folder from a thread of its own, until :meth:`close`.
+
+    Parameters
+    ----------
+    folder
+        The scan folder; it may not be there yet. Nothing in it is written, but for what :meth:`ask` asks.
+    control
+        Whether wishes may be asked.
+    lapse_s
+        Silence of the scan program after which it counts as gone.
+    """
+
+    def __init__(self, folder: Path, control: bool = False, lapse_s: float = _LAPSE_S) -> None:
+        self.folder, self.control = folder, control
+        self._lapse_s = lapse_s
+        self._ended = threading.Event()
+        self._asked: tuple[Wish, int] | None = None  # and how many facts there were
+        self._looked = False
+        self.state, self.motion = Versioned(0, b"{}"), Versioned(0, b"{}")
+        self.shown = Shown()
+        self._begin()
+        self._turn()
+        self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look on."""
+        self._thread.start()
+
+    def _begin(self) -> None:
+        """Forget everything: another scan may be in the folder now."""
+        self._manifest, self._events = ManifestTail(self.folder / MANIFEST), EventTail(self.folder / EVENTS)
+        self._content = Manifest()
+        self._story: Story | None = None
+        self._viewer: RowViewer | None = None
+        self._listener: PiListener | None = None
+        self._problem = ""
+        self._life_seen: float | None = None
+        self._life_at = self._grown_at = float("-inf")
+
+    def _run(self) -> None:
+        while not self._ended.wait(_TURN_S):
+            self._turn()
+
+    def _turn(self) -> None:
+        """One look at everything; publishes what has changed."""
+        self._read()
+        self._attend()
+        self.shown = self._viewer.shown if self._viewer is not None else Shown()
+        heard = self._listener.heard if self._listener is not None else Heard()
+        content = Content(
+            self.folder, self._story, self._signs(heard), heard, self.shown, self._wish(), self.control, self._problem
+        )
+        self.state = _publish(self.state, make_snapshot(content))
+        self.motion = _publish(self.motion, make_motion(content))
+
+    def _read(self) -> None:
+        """Take in what the files have gained."""
+        facts = self._manifest.look()
+        if self._manifest.file.replaced:
+            self._close_parts()
+            self._begin()
+            facts = self._manifest.look()
+        if facts:
+            self._grown_at = time.monotonic() if self._looked else self._grown_at  # what was there need not be new
+        self._looked = True
+        self._content.facts += facts
+        for fact in facts:
+            try:
+                if self._story is None and fact["fact"] == "scan_started":
+                    self._story = Story(fact)
+                elif self._story is not None:
+                    self._story.add_fact(fact)
+            except (PolysightError, KeyError, TypeError, ValueError) as e:
+                self._problem = f"{self.folder / MANIFEST} holds a {fact['fact']} that is not understood: {e}"
+        if self._story is not None:
+            self._story.add_events(self._events.look())
+
+    def _attend(self) -> None:
+        """The row thread and the listener, as long as they are needed."""
+        story = self._story
+        if story is None:
+            return
+        if self._viewer is None:
+            self._viewer = RowViewer(self.folder, self._content)
+            self._viewer.start()
+        self._viewer.want(story.takes)
+        if story.ended is None and self._listener is None:
+            self._listener = PiListener(story.instrument, story.scan_id)
+        elif story.ended is not None and self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+    def _signs(self, heard: Heard) -> Signs:
+        """Whether the scan program and the Pi live."""
+        now, wall = time.monotonic(), time.time()
+        life = last_sign_of_life(self.folder)
+        if life is not None and life != self._life_seen:
+            age = max(0.0, wall - life) if self._life_seen is None else 0.0  # from then on changes count, not clocks
+            self._life_seen, self._life_at = life, now - age
+        known = None if self._story is None else self._story.row_seconds
+        patience = _GRACE_S if known is None else max(_GRACE_S, _UNATTENDED_ROWS * known[0])
+        alive = now - self._grown_at < patience if life is None else now - self._life_at < self._lapse_s
+        alive_s = 0 if alive else round(life or self._manifest.file.modified_s)
+        silent = now - heard.heard_s if heard.heard_s else None
+        return Signs(alive, alive_s, silent, _PI_LIMIT_S, wall)
+
+    def _wish(self) -> Wish | None:
+        """What was asked, until the manifest shows that it came to pass."""
+        if self._asked is None or self._story is None:
+            return None
+        wish, facts = self._asked
+        since = {f["fact"] for f in self._content.facts[facts:]}
+        if since & {"scan_ended", "scan_resumed", "scan_paused", "scan_continued"}:
+            self._asked = None
+            return None
+        return wish
+
+    def ask(self, wish: Wish) -> None:
+        """Ask the scan for something; returns when it has heard. Raises ScanError."""
+        before = len(self._content.facts)
+        ask(self.folder, wish)
+        paused = self._story is not None and self._story.paused
+        self._asked = None if wish is Wish.CONTINUE and not paused else (wish, before)
+
+    def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
+        """Until a snapshot meets a condition; whether it did within the limit."""
+        deadline = time.monotonic() + limit_s
+        while not condition(json.loads(self.state.data)):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(_TURN_S / 4)
+        return True
+
+    def _close_parts(self) -> None:
+        for part in (self._viewer, self._listener):
+            if part is not None:
+                part.close()
+
+    def close(self) -> None:
+        """Look no more."""
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._close_parts()
+
+
+def _publish(before: Versioned, content: dict[str, Any]) -> Versioned:
+    data = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+    return before if data == before.data else Versioned(before.version + 1, data)

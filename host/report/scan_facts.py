@@ -1,0 +1,51 @@
+"""scan.json: what products were made from and with: scan, rig file, versions, gains that were divided out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from host.imaging import ChannelImages
+from host.report.context import ReportContext
+from host.report.products import write_json
+from host.store.scanfolder import versions
+from host.store.source import Scan
+from shared.config import Instrument, to_builtins
+from shared.raster import RasterPlan
+
+SCAN = "scan.json"
+
+
+def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
+    """Gain and phase of each RX against its board's first one, by board: from the direct path, divided out."""
+    out = {}
+    for board, gains in images.rx_calibration.items():
+        relative = gains / gains[0]
+        out[board] = [
+            {"gain_db": float(20 * np.log10(abs(g))), "phase_deg": float(np.degrees(np.angle(g)))} for g in relative
+        ]
+    return out
+
+
+def with_scan(ctx: ReportContext, plan: RasterPlan, rig: Instrument, images: ChannelImages) -> ReportContext:
+    """A report's context with what it says of the scan itself: where its positions were, gains, the whole rig file."""
+    return replace(ctx, plan=plan, rx_gains=rx_gains(images), rig_file=tomli_w.dumps(to_builtins(rig)))
+
+
+def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
+    """Write scan.json, and return its content. `rig` is the one the images were made with."""
+    facts = {
+        "scan_id": source.scan_id,
+        "simulated": source.simulated,
+        "processed_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(),
+        "rx_gains": rx_gains(images),
+        "instrument": to_builtins(rig),
+    }
+    write_json(out / SCAN, facts)
+    return facts

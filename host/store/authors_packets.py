@@ -1,0 +1,263 @@
+"""One board's row of the published data: its packets, which of them arrived, and where its bursts belong.
+
+The card counts its packets, so a lost one is known by its number. A position at which the radar did not start leaves
+nothing but a longer pause: bursts of positions are about 90 ms apart and arrive within some milliseconds. A burst ends
+with a frame, and the pause falls within a packet of its end, so the frames of every burst can be counted.
+
+What cannot be placed is masked and counted, never put where it might belong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import DataError
+
+Gaps = list[tuple[int, int]]
+PACKET_BYTES = 1456  # payload of a full packet, where no log tells
+_UNEVEN = 0.25  # of the period between positions: a pause this far from a whole number of periods places nothing
+
+
+class PacketLog(NamedTuple):
+    """Packets that arrived, in order of their sequence number, without duplicates: payload bytes, unix seconds."""
+
+    sequence: NDArray[np.int64]
+    size: NDArray[np.int64]
+    at_s: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RowShape:
+    """What a whole row of one board is: positions, pulses of a burst, bytes of a frame."""
+
+    positions: int
+    pulses: int
+    frame_bytes: int
+
+    @property
+    def burst_bytes(self) -> int:
+        """Bytes of one position."""
+        return self.pulses * self.frame_bytes
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the row."""
+        return self.positions * self.burst_bytes
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What the card sent in one row, as far as it is known.
+
+    Attributes
+    ----------
+    data
+        uint8 [n], zero where lost.
+    lost
+        Byte ranges that never arrived.
+    packets_lost
+        How many packets they are.
+    start, at_s
+        Offset of each packet that arrived, and when it did; empty where no log tells.
+    packet_bytes
+        Payload of a full packet.
+    """
+
+    data: NDArray[np.uint8]
+    lost: Gaps
+    packets_lost: int
+    start: NDArray[np.int64]
+    at_s: NDArray[np.float64]
+    packet_bytes: int
+
+
+class Bursts(NamedTuple):
+    """Bursts of a stream: byte ranges [burst, 2], and when each began to arrive (unix seconds)."""
+
+    ranges: NDArray[np.int64]
+    at_s: NDArray[np.float64]
+
+
+def read_log(path: Path) -> PacketLog | None:
+    """A row's packet log; None when there is none. A header line is skipped.
+
+    Raises
+    ------
+    DataError
+        naming the line that is not a packet.
+    """
+    if not path.exists():
+        return None
+    lines = path.read_text(encoding="ascii", errors="replace").replace(";", ",").split("\n")
+    try:
+        table = _numbers(lines)
+    except ValueError:
+        try:
+            table = _numbers(lines[1:])  # a header
+        except ValueError:
+            table = _numbers_by_line(path, lines)
+    if not table.size:
+        return None
+    sequence, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
+    return PacketLog(sequence, table[first, 1].astype(np.int64), table[first, 2])
+
+
+def _numbers(lines: list[str]) -> NDArray[np.float64]:
+    filled = [line for line in lines if line.strip()]
+    if any(line.count(",") != 2 for line in filled):
+        raise ValueError("not three columns")
+    return np.array(",".join(filled).split(",") if filled else [], np.float64).reshape(-1, 3)
+
+
+def _numbers_by_line(path: Path, lines: list[str]) -> NDArray[np.float64]:
+    """The slow way: more columns than three are put up with, and a damaged line is named."""
+    rows = []
+    for number, line in enumerate(lines):
+        words = line.split(",")
+        try:
+            rows.append((float(int(words[0])), float(int(words[1])), float(words[2])))
+        except (ValueError, IndexError):
+            if number and line.strip():
+                raise DataError(f"{path}: line {number + 1} is not a packet: {line!r}", "a damaged file") from None
+    return np.array(rows, np.float64).reshape(-1, 3)
+
+
+def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled: bool) -> Stream:
+    """A row's stream from its file and its log.
+
+    In a zero-filled file a packet of zeros is a lost one, whatever the log says: no receiver is that quiet.
+
+    Raises
+    ------
+    DataError
+        when file and log are not of one recording.
+    """
+    raw = np.fromfile(file, np.uint8)
+    none = np.zeros(0, np.int64)
+    if log is None:
+        silent = _silent(raw, PACKET_BYTES) if zero_filled else np.zeros(0, bool)
+        return Stream(raw, _ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), none, np.zeros(0), PACKET_BYTES)
+    full = int(log.size.max())
+    first = _first_sequence(log, shape, full, raw if zero_filled else None)
+    start = (log.sequence - first) * full
+    end = int(start[-1] + log.size[-1])
+    if not zero_filled and raw.size != log.size.sum():
+        raise DataError(
+            f"{file}: {raw.size} bytes, its packet log says {log.size.sum()}",
+            "file and log are not of one recording, or one of them was cut",
+            "fetch both again",
+        )
+    if zero_filled:
+        end = max(end, raw.size)
+        data = raw if end == raw.size else np.concatenate([raw, np.zeros(end - raw.size, np.uint8)])
+    else:
+        data = raw if end == raw.size else _spread(raw, start, log.size, end)
+    count = -(-end // full)
+    there = np.zeros(count, bool)
+    there[start // full] = True
+    if zero_filled:
+        there &= ~_silent(data, full)
+        there[-(-raw.size // full) :] = False
+    arrived = there[start // full]
+    lost = _ranges(~there, full, end)
+    return Stream(data, lost, int(count - there.sum()), start[arrived], log.at_s[arrived], full)
+
+
+def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64], end: int) -> NDArray[np.uint8]:
+    """The packets of a file without the lost ones, each at its own place."""
+    data = np.zeros(end, np.uint8)
+    source = np.concatenate([[0], np.cumsum(size)])
+    breaks = np.flatnonzero(start[1:] != start[:-1] + size[:-1]) + 1  # runs of packets without a loss
+    for a, b in zip([0, *breaks], [*breaks, start.size], strict=True):
+        data[start[a] : start[b - 1] + size[b - 1]] = raw[source[a] : source[b]]
+    return data
+
+
+def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
+    """Packets that are all zero, bool [packet]."""
+    whole = data.size // packet
+    rows = data[: whole * packet].reshape(whole, packet)
+    wide = rows.view(np.uint64) if packet % 8 == 0 and data.ctypes.data % 8 == 0 else rows
+    tail = [not data[whole * packet :].any()] if data.size % packet else []
+    return np.append(~np.any(wide, axis=1), np.array(tail, bool))
+
+
+def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
+    """Sequence number of the row's first packet, which may itself be lost.
+
+    1 when the numbers fit a record that starts at 1 (the card's counters usually do). Else, where lost packets are in
+    the file, as many before the first that arrived as the file begins with packets of zeros; where they are not,
+    counted back from a short last packet if no position is missing; else the first that arrived.
+    """
+    expected, first = -(-shape.bytes // full), int(log.sequence[0])
+    if log.sequence[-1] <= expected:
+        return 1
+    if zero_filled is not None:
+        return first - int(np.argmin(np.append(_silent(zero_filled, full), False)))
+    complete = _pauses(log.at_s, shape.positions - 1).size == shape.positions - 1
+    return min(first, int(log.sequence[-1]) - expected + 1) if complete and log.size[-1] < full else first
+
+
+def _pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Indices of the packets that come after a pause between bursts, where there should be `count` pauses.
+
+    The `count` longest pauses are those between bursts, most of them between neighbours: half of a short one of them
+    parts the kinds.
+    """
+    steps = np.diff(at_s)
+    if count < 1 or steps.size < count:
+        return np.zeros(0, np.int64)
+    typical = np.sort(steps)[-count:][count // 4]
+    return np.flatnonzero(steps > typical / 2) + 1
+
+
+def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
+    """The bursts of a stream; None where no log tells when its packets came."""
+    if not stream.at_s.size:
+        return None
+    frame, end = shape.frame_bytes, stream.data.size
+    after = _pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
+    ends = np.zeros(after.size, np.int64)
+    before_end = np.minimum(stream.start[after - 1] + stream.packet_bytes, end)
+    for i, (low, high) in enumerate(zip(before_end, stream.start[after] + stream.packet_bytes, strict=True)):
+        # The burst ends in the packet that straddles the pause: a whole number of bursts if one fits, else of frames.
+        begun = ends[i - 1] if i else 0
+        whole = begun + -(-(low - begun) // shape.burst_bytes) * shape.burst_bytes
+        ends[i] = whole if whole < high else -(-low // frame) * frame
+    edges = np.concatenate([[0], ends, [-(-end // frame) * frame]])
+    return Bursts(np.stack([edges[:-1], edges[1:]], axis=1), stream.at_s[np.concatenate([[0], after])])
+
+
+def period_s(bursts: Bursts) -> float | None:
+    """Time from one position to the next, if most positions follow one another; None for fewer than two bursts."""
+    return float(np.quantile(np.diff(bursts.at_s), 0.25)) if bursts.at_s.size > 1 else None
+
+
+def positions_of(own: Bursts, others: list[Bursts], positions: int, period: float | None) -> NDArray[np.int64] | None:
+    """Position of each burst; None where it cannot be told.
+
+    Positions follow each other evenly, so a step of two periods is a position at which no radar started. The boards
+    are triggered together and their packets timed by one clock: only if all boards together span the row is it known
+    which position is the first.
+    """
+    times = np.sort(np.concatenate([b.at_s for b in (own, *others)]))
+    if period is None or period <= 0 or positions < 2:
+        return None
+    events = times[np.concatenate([[True], np.diff(times) > period / 2])]
+    steps = np.diff(events) / period
+    if np.any(np.abs(steps - np.round(steps)) > _UNEVEN):
+        return None
+    index = np.concatenate([[0], np.cumsum(np.round(steps).astype(np.int64))])
+    at = index[np.searchsorted(events, own.at_s, side="right") - 1]
+    return at if index[-1] == positions - 1 and np.all(np.diff(at) > 0) else None
+
+
+def _ranges(missing: NDArray[np.bool_], unit: int, end: int) -> Gaps:
+    """Runs of True, each `unit` bytes, as (start, stop) up to `end`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+    return [(int(a) * unit, min(int(b) * unit, end)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

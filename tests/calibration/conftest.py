@@ -1,0 +1,58 @@
+"""Small simulated scans of rigs whose truth differs from what their rig file says."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import pytest
+
+from shared.config import Instrument, decode, load_instrument, to_builtins
+from simulators.scene import decode_scene
+from simulators.simulate import simulate
+
+REPO = Path(__file__).resolve().parents[2]
+Change = Callable[[dict[str, Any]], None]
+
+
+def rig_of(change: Change = lambda _table: None, **tables: dict[str, Any]) -> Instrument:
+    """The published rig, changed: whole tables, then by hand. Bursts are short."""
+    table = to_builtins(load_instrument(REPO / "instrument.toml"))
+    table["burst"] |= {"pulses": 4}
+    for name, more in tables.items():
+        table[name] |= more
+    change(table)
+    return decode(table, Instrument, "test")
+
+
+def believe(folder: Path, rig: Instrument) -> None:
+    """Let a scan folder's manifest say that it was taken with this rig."""
+    path = folder / "manifest.jsonl"
+    first, rest = path.read_text().split("\n", 1)
+    fact = json.loads(first)
+    del fact["crc"]
+    fact["instrument"] = to_builtins(rig)
+    plain = json.dumps(fact, sort_keys=True, separators=(",", ":"))
+    fact["crc"] = f"{crc32(plain.encode()):08x}"
+    path.write_text(json.dumps(fact, sort_keys=True, separators=(",", ":")) + "\n" + rest)
+
+
+@pytest.fixture(scope="session")
+def make_rig() -> Callable[..., Instrument]:
+    return rig_of
+
+
+@pytest.fixture(scope="session")
+def scan_of() -> Callable[..., Path]:
+    """A simulated scan of the true rig, in a folder that says it was the believed one."""
+
+    def make(folder: Path, true: Instrument, believed: Instrument | None = None, **scene: Any) -> Path:
+        simulate(true, decode_scene({"name": "test", **scene}, "test"), folder)
+        if believed is not None:
+            believe(folder, believed)
+        return folder
+
+    return make

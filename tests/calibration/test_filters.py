@@ -1,0 +1,82 @@
+"""The filter sweep: corners that the rig file does not know are recovered from scans at several start frequencies."""
+
+import numpy as np
+import pytest
+
+from host.calibration.files import FilterFile, read
+from host.calibration.filters import BIN_HZ, LEAST, binned
+from host.calibration.in_force import load_calibration
+from host.cli import main
+from host.pipeline import Pipeline
+from host.store.scanfolder import ScanFolder
+from host.sync.hpf import HighPass, high_pass
+
+OFFSETS_HZ = (60e3, 250e3, 500e3, 850e3, 1250e3)
+TRUE_KHZ = (235.0, 700.0)
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory, make_rig, scan_of):
+    """One power cycle of a rig with other filters than its rig file says, at several start frequencies."""
+    folder, made = tmp_path_factory.mktemp("sweep"), []
+    for k, offset_hz in enumerate(OFFSETS_HZ):
+
+        def programmed(table, offset_hz=offset_hz):
+            for board in table["boards"]:
+                if board["role"] != "transmit":
+                    board["start_offset_hz"] = offset_hz
+
+        tables = {"grid": {"columns": 8, "rows": 3}, "burst": {"pulses": 8}, "image": {"columns": 20, "rows": 20}}
+        believed = make_rig(programmed, **tables)
+        corners = {"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}
+        true = make_rig(programmed, chirp=corners, **tables)
+        made.append(scan_of(folder / f"{k}", true, believed, seed=2, disturbances={"if_offset_hz": 0.0}))
+    return made
+
+
+@pytest.fixture(scope="module")
+def found(scans, tmp_path_factory):
+    """The calibration file of the sweep."""
+    out = tmp_path_factory.mktemp("found")
+    assert main(["calibrate", "hpf", *map(str, scans), "--out", str(out)]) == 0
+    return next(out.iterdir())
+
+
+def test_unknown_corners_are_recovered(scans, found):
+    file = read(found, FilterFile, "hpf")
+    for board in file.boards.values():
+        corners, errors = np.array(board.corners_khz), np.array(board.standard_error_khz)
+        np.testing.assert_allclose(corners, TRUE_KHZ, rtol=0.15)
+        assert np.all(np.abs(corners - TRUE_KHZ) < 6 * errors)
+        assert board.programmed_khz == [175.0, 350.0]
+        assert board.residual_db < 0.5
+    assert (file.simulated, len(file.sources)) == (True, len(scans))
+
+
+def test_processing_uses_the_filter_that_the_rig_file_names(found, tmp_path, make_rig, scan_of):
+    rig = make_rig(grid={"columns": 4, "rows": 2}, image={"columns": 20, "rows": 20}, calibration={"hpf": str(found)})
+    pipeline = Pipeline(ScanFolder.load(scan_of(tmp_path / "scan", rig)))
+    for name, setup in pipeline.setups.items():
+        measured = HighPass(tuple(1e3 * c for c in read(found, FilterFile, "hpf").boards[name].corners_khz))
+        assert setup.equaliser.model == measured != high_pass(rig.chirp)
+    assert load_calibration({"hpf": found}).high_pass("LS") is None
+
+
+def test_one_start_frequency_alone_is_refused(scans, tmp_path, capsys):
+    assert main(["calibrate", "hpf", str(scans[-1]), "--out", str(tmp_path / "c")]) == 3
+    assert "sweep" in capsys.readouterr().err
+    assert not (tmp_path / "c").exists()
+
+
+def test_bins_hold_the_mean_signal_of_enough_chirps_each():
+    rng = np.random.default_rng(1)
+    f = rng.uniform(0.2e6, 1.2e6, 3000)
+    noise = np.full(f.size, 4.0)
+    middles, level = binned(f, (f / 1e4) ** 2 + noise, noise)
+    np.testing.assert_allclose(level, middles / 1e4, rtol=BIN_HZ / 0.2e6)
+    assert np.all(np.diff(middles) > 0)
+    few = np.ones(LEAST - 1)
+    assert binned(1e5 * few, few, 0 * few)[0].size == 0
+    enough = np.ones(LEAST)
+    assert binned(-1e5 * enough, enough, 0 * enough)[0].size == 0
+    assert binned(1e5 * enough, enough, enough / 2)[0].size == 0  # noise

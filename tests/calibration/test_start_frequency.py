@@ -1,0 +1,87 @@
+"""Start frequencies: what is advised puts the direct path in the middle of the band, wherever it was."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from host.calibration.files import StartFile, read
+from host.calibration.start_frequency import by_geometry, start_of
+from host.cli import main
+from host.radar.validator import direct_if_hz
+from shared.config import to_builtins
+
+TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {"columns": 20, "rows": 20}}
+
+
+def offset(value_hz):
+    def change(table):
+        for board in table["boards"]:
+            if board["role"] != "transmit":
+                board["start_offset_hz"] = value_hz
+
+    return change
+
+
+@pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
+def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_middle(make_rig, if_mode):
+    """Law: true IF + change of offset = middle, if the rig file's expectation is within half a sample rate of it."""
+    rig = make_rig(offset(123e3), chirp={"if_mode": if_mode})
+    board, rate = rig.receivers[0], rig.chirp.sample_rate_hz
+    middle = 0.45 * rate if if_mode == "complex1x" else 0.0
+    rng = np.random.default_rng(3)
+    for true_hz in rng.uniform(-4e6, 6e6, 50):
+        seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
+        found = start_of(rig, board, true_hz + rng.uniform(-0.4, 0.4) * rate, seen, 1.0, 10)
+        assert true_hz + found.start_offset_hz - board.start_offset_hz == pytest.approx(middle, abs=1.0)
+
+
+def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
+    rig = make_rig(offset(50e3))
+    board = rig.receivers[1]
+    better = msgspec.structs.replace(board, start_offset_hz=by_geometry(rig, board))
+    assert direct_if_hz(rig, better) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)  # steps of 54 Hz
+
+
+def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_rig, scan_of, tmp_path, capsys):
+    """The boards were programmed 260 kHz away from what the rig file says, and their crystals differ."""
+    wrong = {"if_offset_hz": 260e3, "crystal_ppm": {"receive_h": 0.8, "receive_v": -1.1}}
+
+    def advice(rig, name):
+        folder = scan_of(tmp_path / name, rig, seed=4, disturbances=wrong)
+        assert main(["calibrate", "start-frequency", str(folder), "--out", str(tmp_path / name / "c")]) == 0
+        boards = read(next((tmp_path / name / "c").iterdir()), StartFile, "start_frequency").boards
+        told = capsys.readouterr().out
+        assert all(
+            f"start_offset_hz = {b.start_offset_hz:.0f}" in told and f'name = "{n}"' in told for n, b in boards.items()
+        )
+        return {n: to_builtins(b) for n, b in boards.items()}
+
+    first = advice(make_rig(offset(300e3), **TABLES), "first")
+
+    def advised(table):
+        for board in table["boards"]:
+            if board["name"] in first:
+                board["start_offset_hz"] = first[board["name"]]["start_offset_hz"]
+
+    second = advice(make_rig(advised, **TABLES), "second")
+    for name, board in second.items():
+        assert abs(first[name]["start_offset_hz"] - 300e3) > 100e3
+        error = np.hypot(board["direct_if_standard_error_hz"], first[name]["direct_if_standard_error_hz"])
+        assert abs(board["start_offset_hz"] - board["start_offset_was_hz"]) < 5 * error
+        assert board["direct_if_hz"] == pytest.approx(board["middle_hz"], abs=5 * error)
+
+
+def test_without_a_direct_path_the_geometry_is_named(make_rig, scan_of, tmp_path, capsys):
+    rig = make_rig(offset(790e3), **TABLES)
+    folder = scan_of(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
+    assert main(["calibrate", "start-frequency", str(folder), "--out", str(tmp_path / "c")]) == 3
+    told = capsys.readouterr().err
+    assert f"start_offset_hz = {by_geometry(rig, rig.receivers[0]):.0f} for RH" in told
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize("what", ["direct-path", "hpf", "metal", "start-frequency", ""])
+def test_help_has_an_example(what, capsys):
+    with pytest.raises(SystemExit):
+        main(["calibrate", *([what] if what else []), "--help"])
+    assert "example:" in capsys.readouterr().out

@@ -1,0 +1,159 @@
+"""The checker finds what is wrong with a page, says where, and stays silent where nothing is."""
+
+from __future__ import annotations
+
+import pytest
+
+from docs.check.looking import page_faults
+from docs.check.pages import read_page
+from docs.check.running import run_page, script_of
+
+
+def page(tmp_path, text):
+    path = tmp_path / "page.md"
+    path.write_text(text, encoding="utf-8")
+    (tmp_path / "other.md").write_text("# Two words, `code` and more\n\n## Again\n\n## Again\n", encoding="utf-8")
+    return read_page(path)
+
+
+SOUND = """# Page
+
+[there](other.md), [part](other.md#two-words-code-and-more), [second](other.md#again-1), [here](#page), [out](https://a.b/c)
+
+Say `polysight scan`, `polysight-pi home --json`, `make demo` or `polysight` and `ls -l`.
+
+```sh rig
+polysight scan --config instrument.toml --out scans/one   # a comment
+cat > truth.json <<'END'
+{"a": "it's"} # polysight nonsense
+END
+for n in 1 2; do
+  echo 'polysight
+    nonsense'; polysight scan --out scans/$n
+done
+cd x && polysight process scans/one \\
+  --out out/one > log 2>&1 | tail
+```
+```console
+$ polysight validate scans/one
+scans/one: polysight nonsense is only output here
+```
+```sh hardware
+ssh -t pi@host sudo -u polysight /opt/polysight/venv/bin/polysight-pi check --config /etc/polysight/instrument.toml
+make -C arduino_stage firmware; make flash PORT=/dev/ttyACM0
+systemctl status polysight-pi
+.venv/bin/python -m pytest tests/stage --stage-port /dev/ttyACM0 -v
+python -m simulators.rig --config instrument.toml --dir rig --pattern
+```
+```python
+from host.imaging import ImageBuilder
+```
+```toml
+[pi]
+trigger_in = 26
+```
+"""
+
+
+def test_a_sound_page_has_no_faults(tmp_path):
+    assert page_faults(page(tmp_path, SOUND)) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("[a](gone.md)", "no such file"),
+        ("![a](gone.png)", "no such file"),
+        ('<img src="gone.png">', "no such file"),
+        ("[a](other.md#gone)", "no such heading"),
+        ("[a](#gone)", "no such heading"),
+        ("say `polysight skan`", "no subcommand 'skan'"),
+        ("say `polysight scan --fast`", "no option --fast"),
+        ("say `make demmo`", "no target demmo"),
+        ("```\npolysight scan --fast\n```", "no option --fast"),
+        ("```sh\npolysight skan\n```", "invalid choice: 'skan'"),
+        ("```sh\npolysight scan --out a --fast\n```", "unrecognized arguments: --fast"),
+        ("```sh hardware\npolysight scan\n```", "--out"),
+        ("```sh minutes\ncd x && sudo -u y polysight-pi jog --dz 1\n```", "--dz"),
+        ("```console\n$ polysight validate\n```", "SCAN"),
+        ("```sh\npython -m simulators.gone\n```", "no module"),
+        ("```sh\npython -m simulators.stage --config a --link b --gone\n```", "--gone"),
+        ("```sh\nmake reproduce WAY=1\n```", "no variable WAY"),
+        ("```sh\npython -m pytest tests/gone\n```", "no path tests/gone"),
+        ("```sh\npython -m pytest tests/stage --stage-portt x\n```", "no option --stage-portt"),
+        ("```sh sometimes\nls\n```", "unknown mark 'sometimes'"),
+        ("```python\nfrom host.imaging import Gone\n```", "has no Gone"),
+        ("```python\nfrom host.gone import a\n```", "No module named"),
+        ("```python\nx = (\n```", "python block"),
+        ("```toml\nx =\n```", "toml block"),
+    ],
+)
+def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
+    faults = page_faults(page(tmp_path, f"# Page\n\n{text}\n"))
+    assert len(faults) == 1
+    assert fault in faults[0]
+    line = 4 if text.startswith("```") and "unknown mark" not in fault else 3
+    assert faults[0].split(":")[1] in (str(line), "4")
+
+
+RUN = """# Page
+
+```sh
+echo first > made
+```
+1. In a list:
+
+   ```console
+   $ cat made
+   first
+   $ touch second
+   ```
+```sh hardware
+touch never
+```
+```sh asks
+touch never
+```
+"""
+
+
+def folder(tmp_path):
+    """A folder to run in, and beside it the one of the runner."""
+    copy = tmp_path / "scratch/copy"
+    copy.mkdir(parents=True)
+    return copy
+
+
+def test_commands_run_in_the_order_of_the_page_and_only_those_that_may(tmp_path):
+    copy = folder(tmp_path)
+    run = run_page(page(tmp_path, RUN), copy)
+    assert run.failed_line == 0, run.output
+    assert {p.name for p in copy.iterdir()} == {"made", "second"}
+
+
+def test_a_failing_command_is_named_by_its_line(tmp_path):
+    copy = folder(tmp_path)
+    run = run_page(page(tmp_path, "# Page\n\n```sh\ntrue\n\necho seen\nls /gone\ntouch never\n```\n"), copy)
+    assert run.failed_line == 7
+    assert "seen" in run.output
+    assert not (copy / "never").exists()
+
+
+def test_an_unset_variable_and_a_failure_in_a_pipe_are_failures(tmp_path):
+    for command in ("echo $GONE_AWAY", "false | cat"):
+        assert run_page(
+            page(tmp_path, f"# Page\n\n```sh\n{command}\n```\n"), folder(tmp_path / command[:4])
+        ).failed_line
+
+
+def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
+    run = run_page(page(tmp_path, "# Page\n\n```sh\nsleep 1000\n```\n"), folder(tmp_path), limit_s=1.0)
+    assert run.failed_line
+
+
+def test_the_script_has_the_lines_of_the_page(tmp_path):
+    made = page(tmp_path, RUN)
+    lines = script_of(made).splitlines()
+    assert lines[3] == "echo first > made"
+    assert lines[8] == "cat made"
+    assert sum(bool(line) for line in lines) == 4

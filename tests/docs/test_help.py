@@ -1,0 +1,60 @@
+"""Every command line has help with an example that it would take, and README names every command."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from docs.check.commands import command_faults, parser_of
+from docs.check.pages import ROOT
+
+MODULES = (
+    "host.cli", "pi_controller.cli", "host.radar", "docs.check", "simulators", "simulators.rig", "simulators.cards",
+    "simulators.stage", "simulators.wires", "simulators.uno", "simulators.replay",
+)  # fmt: skip
+
+
+def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """A parser and all its subcommands'."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                yield from leaves(sub)
+
+
+def parsers() -> list[argparse.ArgumentParser]:
+    found = [parser_of(module) for module in MODULES]
+    return [leaf for parser in found if parser is not None for leaf in leaves(parser)]
+
+
+@pytest.mark.parametrize("parser", parsers(), ids=lambda p: p.prog.replace(" ", "-"))
+def test_help_has_an_example_that_works(parser):
+    text = parser.format_help()
+    _, found, examples = text.partition("example")
+    assert found, f"`{parser.prog} --help` shows no example"
+    lines = re.findall(r"^(?:s?: *|  +)((?:polysight|python -m)\S*(?: .*)?)$", examples, re.MULTILINE)
+    lines = [re.split(r", |   ", line)[0].strip() for line in lines]  # a remark may follow
+    assert any(line.startswith(parser.prog) for line in lines), f"no example of {parser.prog} in {examples!r}"
+    assert [f for line in lines for f in command_faults(line)] == []
+
+
+@pytest.mark.parametrize("parser", parsers(), ids=lambda p: p.prog.replace(" ", "-"))
+def test_every_option_is_explained(parser):
+    assert parser.description
+    dumb = [a.dest for a in parser._actions if not a.help and not isinstance(a, argparse._SubParsersAction)]
+    assert not dumb, f"{parser.prog}: no help for {dumb}"
+
+
+def test_readme_names_every_command():
+    block = (ROOT / "README.md").read_text(encoding="utf-8").split("## Commands")[1]
+    for module, program in (("host.cli", "polysight"), ("pi_controller.cli", "polysight-pi")):
+        parser = parser_of(module)
+        assert parser is not None
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                missing = [name for name in action.choices if not re.search(rf"\b{program}\b.*\b{name}\b", block)]
+                assert not missing, f"README's list of commands lacks {missing}"

@@ -1,0 +1,69 @@
+"""README and docs as they are: their links lead somewhere, and the commands they show exist."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+
+from docs.check.looking import page_faults
+from docs.check.pages import ROOT, all_pages, read_page
+from host.materials.truth import truth_plates
+from host.radar.usb import PRODUCT, VENDOR
+from shared.errors import PolysightError
+from shared.faults import EXPLANATIONS, PiFault
+
+
+def test_links_and_commands():
+    faults = [fault for path in all_pages() for fault in page_faults(read_page(path))]
+    assert not faults, "\n".join(faults)
+
+
+def test_every_page_is_found_from_the_index():
+    linked = {(ROOT / "docs" / t.partition("#")[0]).resolve() for _, t in read_page(ROOT / "docs/README.md").links}
+    pages = {p for folder in ("how-to", "spec", "decisions") for p in (ROOT / "docs" / folder).glob("*.md")}
+    assert not {p.name for p in pages - linked}
+
+
+def test_fault_numbers_and_exit_statuses_are_told():
+    text = (ROOT / "docs/how-to/when-it-goes-wrong.md").read_text(encoding="utf-8")
+    for fault in PiFault:
+        e = EXPLANATIONS[fault]
+        assert f"| {int(fault)} | {e.what} | {e.why} | {e.remedy} |" in text
+    kinds = {PolysightError, *PolysightError.__subclasses__()}
+    told = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
+    assert {kind.exit_status for kind in kinds} | {0, 130} == told
+
+
+def test_the_drawing_shows_the_rig_file_and_the_sketch():
+    drawing = (ROOT / "docs/images/wiring.svg").read_text(encoding="utf-8")
+    rig = tomllib.loads((ROOT / "instrument.toml").read_text(encoding="utf-8"))
+    pin = dict(re.findall(r"PIN_(\w+) = (\d+)", (ROOT / "arduino_stage/board.h").read_text(encoding="ascii")))
+    assert f"GPIO {rig['pi']['trigger_in']} (" in drawing
+    assert f"GPIO {rig['pi']['sync_out'][0]} (" in drawing
+    assert f"D{pin['TRIGGER']} trigger" in drawing
+    for name in ("LEFT", "RIGHT", "X"):
+        assert f"D{pin[name + '_PUL']}/D{pin[name + '_DIR']}" in drawing
+    assert f"D{pin['ENABLE']}  enable" in drawing
+    for board in rig["boards"]:
+        assert f">{board['name']}  " in drawing
+        assert "DCA1000EVM  ." + board["card_address"].rpartition(".")[2] in drawing
+        assert board["host_address"] in drawing
+
+
+def test_what_the_installation_writes_is_what_the_programs_want():
+    text = (ROOT / "docs/how-to/install.md").read_text(encoding="utf-8")
+    rig = tomllib.loads((ROOT / "instrument.toml").read_text(encoding="utf-8"))
+    assert f'ATTR{{idVendor}}=="{VENDOR:04x}", ATTR{{idProduct}}=="{PRODUCT:04x}"' in text
+    assert f"net.core.rmem_max = {rig['card']['receive_buffer_bytes']}" in text
+    assert {board["host_address"] for board in rig["boards"]} == {re.findall(r"addresses ([\d.]+)/24", text)[0]}
+    assert f"cd {rig['pi']['key_dir'].removesuffix('/keys')}\n" in (ROOT / "docs/how-to/bring-up.md").read_text()
+    assert rig["pi"]["key_dir"] in text
+
+
+def test_the_hand_written_truth_is_understood():
+    (block,) = [b for b in read_page(ROOT / "docs/how-to/add-a-material.md").blocks if b.language == "json"]
+    metal, material = truth_plates(json.loads(block.text))
+    assert (metal.metal, material.metal) == (True, False)
+    assert material.permittivity == 3.1 - 0.05j
+    assert metal.centre_mm == (-60.0, 0.0)

@@ -1,0 +1,226 @@
+"""The bytes that the pages show are what the pages say: decoded, or made anew, by the code."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import struct
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from docs.check.pages import ROOT, read_page
+from host.capture import dca1000
+from host.capture.eeprom import EepromSettings
+from host.radar import commands, events
+from host.radar.commands import Command, DeviceConfiguration
+from host.radar.messages import Direction, Kind, SubBlock, decode
+from host.radar.program import program
+from shared import messages, stage_line
+from shared.config import NativeRadar, Radar, load_instrument
+
+SPEC = ROOT / "docs/spec"
+
+
+def text(page: str) -> str:
+    return (SPEC / page).read_text(encoding="utf-8")
+
+
+def rows(page: str, heading: str) -> list[list[str]]:
+    """Cells of every table row under a heading."""
+    section = re.split(rf"^#+ {heading}\n", text(page), flags=re.MULTILINE)[1].split("\n#")[0]
+    return [[c.strip() for c in line.strip("|").split("|")] for line in section.splitlines() if line.startswith("| ")]
+
+
+def shown(page: str, *labels: str) -> bytes:
+    """The bytes behind a label (a line's first words) in a text block of a page."""
+    label = " +".join(map(re.escape, labels))
+    found = re.search(rf"^{label} +((?:[0-9a-f]{{2,12}} ?)+)(?: |$)", text(page), re.MULTILINE)
+    assert found, labels
+    return bytes.fromhex(found[1])
+
+
+# --- Pi and host ------------------------------------------------------------------------------------------------------
+
+READERS = {
+    "event": messages.unpack_event, "command": messages.unpack_command, "reply": messages.unpack_reply,
+    "kept": messages.unpack_kept,
+}  # fmt: skip
+
+
+def wire_examples() -> list[tuple[str, bytes, dict[str, object]]]:
+    """(kind, bytes, content) of each `hex` block and the `json` block behind it."""
+    blocks = read_page(SPEC / "wire.md").blocks
+    pairs = [(a, b) for a, b in itertools.pairwise(blocks) if a.language == "hex"]
+    return [(a.info[1], bytes.fromhex(a.text), json.loads(b.text)) for a, b in pairs]
+
+
+@pytest.mark.parametrize(("kind", "raw", "content"), wire_examples(), ids=lambda v: v if isinstance(v, str) else "")
+def test_wire_examples_hold_what_the_page_says(kind, raw, content):
+    if kind == "journal":
+        size, seq, crc = struct.unpack_from("<III", raw)
+        assert size == len(raw) - 12
+        assert crc == messages.zlib.crc32(raw[4:8] + raw[12:])
+        kind, raw = "event", raw[12:]
+        assert seq == content["seq"]
+    message = msgspec.to_builtins(READERS[kind](raw))
+    assert {key: message[key] for key in content} == content  # later minor versions add fields
+    assert {"type", "version"} <= set(content)
+
+
+def test_there_are_examples_of_every_kind():
+    assert {kind for kind, _, _ in wire_examples()} == {"event", "command", "reply", "journal"}
+
+
+def declared(union: object) -> list[type]:
+    return list(getattr(union, "__args__", ()))
+
+
+@pytest.mark.parametrize(
+    "message", [m for u in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply) for m in declared(u)]
+)
+def test_the_page_names_every_message_and_field(message):
+    page = "\n".join(line for line in text("wire.md").splitlines() if f"`{message.__name__}`" in line)
+    assert page, message
+    common = {f.name for f in msgspec.structs.fields(messages.Event)} if issubclass(message, messages.Event) else set()
+    for field in msgspec.structs.fields(message):
+        assert field.name in common | {"version"} or f"`{field.name}`" in page, (message.__name__, field.name)
+
+
+def test_types_follow_from_names_as_the_page_says():
+    """Floats end in _mm, _mm_s or _us; everything else that is a number is an integer."""
+    for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
+        for message in declared(union):
+            for field in msgspec.structs.fields(message):
+                is_float = field.type is float
+                assert is_float == field.name.endswith(("_mm", "_mm_s", "_us")), (message.__name__, field.name)
+
+
+def test_what_may_be_left_out():
+    told = text("wire.md").split("These may be left out:")[1].split("\n*")[0]
+    for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
+        for message in declared(union):
+            for field in msgspec.structs.fields(message):
+                if field.default is not msgspec.NODEFAULT and field.name != "version":
+                    assert f"`{field.name}`" in told, (message.__name__, field.name)
+
+
+# --- stage line -------------------------------------------------------------------------------------------------------
+
+
+def test_stage_line_examples_are_a_dialogue():
+    example = text("stage-line.md").split("## Example")[1].split("```")[1]
+    sent, answered = [], []
+    for line in re.findall(r"^(?:->|<-) \S.*\*[0-9A-F]{4}$", example, re.MULTILINE):
+        raw = line[3:].encode("ascii") + b"\n"
+        if line.startswith("->"):
+            sent.append(stage_line.Command.decode(raw))
+            assert sent[-1].encode() == raw
+        else:
+            answered.append(stage_line.Reply.decode(raw))
+            assert answered[-1].encode() == raw
+    assert [c.sequence for c in sent] == list(range(1, len(sent) + 1))
+    assert {r.sequence for r in answered if r.kind in ("ok", "error")} == {c.sequence for c in sent}
+    assert {r.kind for r in answered} == {"banner", "ok", "done", "status", "error"}
+
+
+# --- capture card -----------------------------------------------------------------------------------------------------
+
+
+def test_card_requests():
+    requests = {
+        ("record start", "request"): (dca1000.Code.RECORD_START, b""),
+        ("configure FPGA", "request"): (dca1000.Code.CONFIGURE_FPGA, dca1000.configure_fpga_data()),
+        ("packets", "request"): (dca1000.Code.CONFIGURE_PACKET, dca1000.configure_packet_data(1470, 25.0)),
+        ("version", "request"): (dca1000.Code.VERSION, b""),
+    }
+    for labels, (code, data) in requests.items():
+        raw = shown("dca1000.md", *labels)
+        assert raw == dca1000.encode_request(code, data)
+        assert dca1000.decode_request(raw) == (code, data)
+    settings = EepromSettings.of_board(load_instrument(ROOT / "instrument.toml").by_name("RH"), "12:34:56:78:90:13")
+    code, data = dca1000.decode_request(shown("dca1000.md", "EEPROM of RH", "request"))
+    assert (code, data) == (dca1000.Code.CONFIGURE_EEPROM, settings.encode())
+
+
+def test_card_replies():
+    lines = re.findall(r"^ +reply +([0-9a-f ]+)$", text("dca1000.md"), re.MULTILINE)
+    replies = [dca1000.decode_reply(bytes.fromhex(line)) for line in lines]
+    assert [r.code for r in replies] == [5, 3, 0x0E]
+    assert [r.status for r in replies[:2]] == [0, 0]
+    assert str(dca1000.decode_version(replies[2].status)) == "2.8"
+    ended = dca1000.decode_reply(shown("dca1000.md", "record completed", "status"))
+    assert (ended.code, ended.status) == (dca1000.Code.STATUS, dca1000.Status.RECORD_COMPLETED)
+
+
+def test_card_status_bits():
+    bits = dict(re.findall(r"\| (\d+) \| ([A-Z_]+) (?=\|)", text("dca1000.md")))
+    assert bits == {str(s.value.bit_length() - 1): s.name for s in dca1000.Status}
+
+
+def test_data_packet_headers():
+    for label, number in (("first", 1), ("second", 2), ("46th", 46)):
+        header = shown("dca1000.md", label)
+        sequence, count = dca1000.decode_packet_header(header + b"x")
+        assert (sequence, count) == (number, (number - 1) * dca1000.MAX_PAYLOAD_BYTES)
+
+
+# --- radar link -------------------------------------------------------------------------------------------------------
+
+
+def published_rig():
+    """The published rig under native control, with the start offset that the page tells."""
+    rig = load_instrument(ROOT / "instrument.toml")
+    boards = tuple(b if b.role == "transmit" else msgspec.structs.replace(b, start_offset_hz=790e3) for b in rig.boards)
+    radar = Radar(control="native", native={b.name: NativeRadar(usb_serial=b.name) for b in boards})
+    return msgspec.structs.replace(rig, boards=boards, radar=radar)
+
+
+def test_sub_blocks_are_those_of_the_published_rig():
+    rig = published_rig()
+    made = program(rig, rig.by_name("RH"))
+    sent: list[Command] = [DeviceConfiguration(), *made.basic, *made.waveform, *made.frames(rig.grid.columns * 16)]
+    table = {row[0]: row[3] for row in rows("mmwavelink.md", "Sub-blocks")}
+    for one in sent:
+        number = f"0x{one.ID:04X}"
+        told = table[number]
+        raw = shown("mmwavelink.md", number) if told == "see below" else bytes.fromhex(told.strip("`"))
+        assert raw == one.block().data, number
+    order = [row[0] for row in rows("mmwavelink.md", "Sub-blocks")]
+    places = [order.index(f"0x{one.ID:04X}") for one in sent]
+    assert places == sorted(places)
+
+
+def test_the_page_names_every_sub_block_that_is_sent():
+    page = text("mmwavelink.md")
+    numbers = {c.ID for c in vars(commands).values() if isinstance(c, type) and isinstance(getattr(c, "ID", None), int)}
+    bare = {c.ID for c in vars(commands).values() if isinstance(c, commands.Bare)}
+    assert len(numbers | bare) > 20
+    assert not [hex(n) for n in numbers | bare if f"0x{n:04X}" not in page]
+
+
+def test_whole_messages():
+    for label, number, what in (("frame start", 3, 1), ("stop 4", 4, 4)):
+        told = decode(shown("mmwavelink.md", f"{label}, sequence {number}"))
+        assert (told.direction, told.kind, told.sequence) == (Direction.HOST_TO_RF, Kind.COMMAND, number)
+        assert told.blocks == (SubBlock(0x0140, struct.pack("<HH", what, 0)),)
+
+
+def test_events():
+    table = {row[0]: row[1:] for row in rows("mmwavelink.md", "Events")[2:]}
+    assert {int(number, 16): name for number, (name, *_) in table.items()} == {
+        number: name for number, (name, _) in events._EVENTS.items()
+    }
+    for number, (*_, fatal) in table.items():
+        told = any(events.decode_event(SubBlock(int(number, 16), bytes([k, 0, 0, 0] * 6))).fatal for k in range(255))
+        assert told == (fatal != "no"), number
+
+
+def test_pages_name_files_that_exist():
+    for page in sorted(SPEC.glob("*.md")):
+        for path in re.findall(
+            r"`((?:host|shared|simulators|pi_controller|arduino_stage|tests)/[\w/.]+\w)`", text(page.name)
+        ):
+            assert (ROOT / Path(path)).exists(), f"{page.name} names {path}"

@@ -1,0 +1,56 @@
+"""A rig whose start frequencies are programmed, benches for single checks, and simulated frames of a board at rest."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from host.calibration.direct_signal import find_direct
+from host.doctor.bench import Bench, System, Wanted
+from host.sync import BoardSetup
+from shared.config import Instrument, decode, load_instrument, to_builtins
+from simulators.radar import SimulatedRig
+from simulators.scene import decode_scene
+
+REPO = Path(__file__).resolve().parents[2]
+QUICK = System(write_speed=lambda _folder: 200e6)
+FRAMES = 32
+
+
+def rig_with(offset_hz=790e3, **tables):
+    table = to_builtins(load_instrument(REPO / "instrument.toml"))
+    for board in table["boards"]:
+        board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else offset_hz
+    for name, change in tables.items():
+        table[name] |= change
+    return decode(table, Instrument, "test")
+
+
+RIG = rig_with()
+SMALL = {
+    "name": "s",
+    "grid": {"columns": 4, "rows": 2},
+    "points": [{"position_mm": [0.0, 0.0], "amplitude": [0.3, 0.0]}],
+}
+
+
+def frames_of(board, rig=RIG, **disturbances):
+    """Frames of a board at rest, int16 [frame, sample, 2, rx]; simulated."""
+    scene = decode_scene({**SMALL, "disturbances": {"if_offset_hz": 0.0, **disturbances}}, "test")
+    radar = SimulatedRig(rig, scene)
+    return radar.chirps(board, np.zeros(FRAMES), np.zeros(FRAMES)).reshape(FRAMES, -1, 2, 4)
+
+
+@functools.cache
+def setup_of(board):
+    """The board's setup, which no start frequency changes."""
+    return BoardSetup.of(RIG, RIG.by_name(board))
+
+
+def signal_of(board, rig=RIG, **disturbances):
+    words = frames_of(board, rig, **disturbances)
+    return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), setup_of(board))
+
+
+def bench_of(rig=RIG, out=Path(), system=QUICK, **more):
+    return Bench(Wanted(Path("rig.toml"), out), system, given=rig, **more)

@@ -1,0 +1,209 @@
+"""Each check of this machine alone, and the order of the walk."""
+
+import dataclasses
+from pathlib import Path
+
+import msgspec
+import pytest
+import tomli_w
+from doctor_case import QUICK, RIG, bench_of, rig_with
+
+from host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from host.capture.hops import route_interface
+from host.cli import main
+from host.doctor import kernel
+from host.doctor.bench import Bench, System, Wanted
+from host.doctor.check_config import check_config
+from host.doctor.check_disk import check_disk, check_time
+from host.doctor.check_network import check_network
+from host.doctor.finding import Finding, error, ok
+from host.doctor.walk import CHECKS, _try, walk
+from host.scan.run import HARDWARE_BACKEND
+from shared.config import to_builtins
+from shared.messages import HelloReply
+
+# --- the rig file ---
+
+
+@pytest.mark.parametrize("broken", ["nonsense = 1\n", 'name = "x"\n', "[[[\n", None])
+def test_a_bad_rig_file_is_the_first_and_only_error(tmp_path, broken, capsys):
+    path = tmp_path / "rig.toml"
+    if broken is not None:
+        path.write_text(broken)
+    assert main(["doctor", "--config", str(path), "--no-pulse"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("error       config")
+    told = [line for line in lines if line.startswith("not checked")]
+    assert len(told) == len(CHECKS) - 2  # all but the rig file and this machine's clock
+    assert all(line.endswith("config failed") for line in told)
+    assert lines[-1].endswith("begin with config")
+
+
+def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(tomli_w.dumps(to_builtins(rig_with(stage={"speed_mm_s": 200.0}))))
+    with Bench(Wanted(path), QUICK) as bench:
+        found = {f.check: f for f in walk(bench)}
+    assert found["config"].verdict == "error"
+    assert "burst of 16" in found["config"].found
+
+
+@pytest.mark.parametrize(
+    ("backend", "verdict"), [("wires", "ok"), (HARDWARE_BACKEND, "error")], ids=["simulated rig", "real rig"]
+)
+def test_calibration_files(tmp_path, backend, verdict):
+    board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    file = FilterFile(**head("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board})
+    bench = bench_of(rig_with(calibration={"hpf": str(write(file, tmp_path))}))
+    bench.hello = HelloReply(pi_release="", firmware="", backend=backend, state="homed", scan_id="", last_seq=0)
+    found = walk_one(bench, "calibration")
+    assert (found.verdict, "simulated" in found.found) == (verdict, verdict == "error")
+    assert walk_one(bench_of(rig_with(calibration={"hpf": "/nowhere.toml"})), "calibration").verdict == "error"
+
+
+def walk_one(bench, name):
+    """One check alone, its errors turned into findings as the walk does."""
+    return _try(next(c for c in CHECKS if c.name == name), bench, None)
+
+
+# --- this machine ---
+
+
+def test_a_clock_that_was_lost(tmp_path):
+    found = next(
+        f for f in walk(Bench(Wanted(tmp_path / "none"), System(wall_ns=lambda: 0))) if f.check == "host clock"
+    )
+    assert found.verdict == "error"
+    found = [
+        f
+        for f in walk(Bench(Wanted(tmp_path / "none"), System(clock_is_synchronised=lambda: False)))
+        if f.check == "host clock"
+    ]
+    assert found[0].verdict == "warning"
+    assert kernel.clock_is_synchronised() in (True, False, None)
+
+
+def test_a_disk_that_is_full_and_one_that_is_slow(tmp_path):
+    full = rig_with(limits={"free_disk_bytes": 1 << 60})
+    assert "too full" in check_disk(bench_of(full, tmp_path)).why
+    needed = check_disk(bench_of(rig_with(limits={"free_disk_bytes": 0}, grid={"rows": 2}), tmp_path)).facts[
+        "scan_bytes_s"
+    ]
+    for factor, verdict in ((0.5, "error"), (1.5, "warning"), (3.0, "ok")):
+        slow = System(write_speed=lambda _f, speed=factor * needed: speed)
+        small = rig_with(limits={"free_disk_bytes": 0}, grid={"rows": 2})
+        assert check_disk(bench_of(small, tmp_path / "not" / "yet", slow)).verdict == verdict
+
+
+def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel, "_PROBE_BYTES", 2 << 20)
+    assert kernel.write_speed(tmp_path) > 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_published_scan_takes_two_hours(tmp_path):
+    found = check_time(bench_of(RIG, tmp_path))
+    assert found.facts["seconds"] == pytest.approx(200 * 38, rel=0.05)  # 35 s a row, and its ends
+    assert found.facts["bytes"] == 2 * 70_000 * 65_536
+
+
+def kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
+    """What the kernel shows of one interface whose subnet is 192.168.33.0/24."""
+    net = tmp_path / "sys/class/net/eth7"
+    (net / "statistics").mkdir(parents=True)
+    for name, value in (("mtu", mtu), ("speed", speed), ("statistics/rx_missed_errors", lost)):
+        (net / name).write_text(f"{value}\n")
+    (tmp_path / "proc/net").mkdir(parents=True)
+    route = "Iface Destination Gateway Flags RefCnt Use Metric Mask MTU Window IRTT\n"
+    route += "eth7 0021A8C0 00000000 0001 0 0 0 00FFFFFF 0 0 0\n"
+    (tmp_path / "proc/net/route").write_text(route)
+    assert route_interface("192.168.33.181", tmp_path) == "eth7"
+    return System(root=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ({}, ""),
+        ({"mtu": 1400}, "mtu 1500"),
+        ({"speed": 100}, "gigabit"),
+        ({"lost": 7}, "ethtool -S"),
+        ({"speed": -1}, ""),
+    ],
+)
+def test_a_network_interface_that_does_not_suit_a_card(tmp_path, kind, words):
+    found = check_network(bench_of(RIG, system=kernel_root(tmp_path, **kind)), RIG.by_name("RH"))
+    assert found.verdict == ("warning" if words else "ok")
+    assert words in found.remedy
+    assert "eth7" in found.found
+
+
+# --- the walk ---
+
+
+def test_every_need_is_a_check_before_it():
+    known = set()
+    for check in CHECKS:
+        assert set(check.needs) | set(check.unless) <= known
+        known.add(check.name)
+
+
+def outcome(wrong):
+    """The walk with every check replaced: those named are wrong, all others ok."""
+
+    def run(check):
+        def answer(bench: Bench, board=None) -> Finding:
+            if check.name == "config":
+                bench.given = msgspec.structs.replace(RIG, name="x")
+            title = check.name if board is None else f"{check.name} {board.name}"
+            return error("broken", "", "") if title in wrong else ok("fine")
+
+        return dataclasses.replace(check, run=answer)
+
+    return [run(check) for check in CHECKS]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "untried"),
+    [
+        (
+            "pi",
+            {
+                "pi clock",
+                "rig is free",
+                "stage",
+                "trigger line",
+                "pulses",
+                "radar",
+                "level",
+                "direct path",
+                "trigger skew",
+            },
+        ),
+        ("stage", {"trigger line"}),
+        ("card RH", {"buffer RH", "radar RH", "level RH", "direct path RH", "trigger skew"}),
+        ("disk", set()),
+        ("direct path RV", {"trigger skew"}),
+    ],
+)
+def test_only_what_depends_on_a_broken_hop_is_left_out(monkeypatch, wrong, untried):
+    monkeypatch.setattr("host.doctor.walk.CHECKS", outcome({wrong}))
+    found = {f.check: f for f in walk(Bench(Wanted(Path("x"))))}
+    left_out = {n for n, f in found.items() if f.verdict == "not checked"}
+    both = {f"{n} {b}" for n in untried for b in ("RH", "RV")}
+    assert left_out == {n for n in found if n in untried or n in both}
+    assert {found[n].found for n in left_out} <= {f"{wrong} failed"}
+
+
+def test_help_has_an_example(capsys):
+    with pytest.raises(SystemExit):
+        main(["doctor", "--help"])
+    assert "example:" in capsys.readouterr().out
+
+
+def test_config_is_read_from_the_file(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(tomli_w.dumps(to_builtins(RIG)))
+    bench = Bench(Wanted(path))
+    assert check_config(bench).verdict == "ok"
+    assert bench.rig == RIG

@@ -1,0 +1,137 @@
+"""`polysight preview` beside a real scan of the simulated rig: it follows, it asks, and it sees the scan die."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any
+from urllib.error import URLError
+from urllib.request import Request, urlopen
+
+import pytest
+
+from host.store.validate import validate
+
+LIMIT_S = 120.0
+ROWS = 40
+SCENE = """name = "a metal plate"
+seed = 3
+[grid]
+columns = 10
+rows = 40
+step_x_mm = 10.0
+step_y_mm = 5.0
+[burst]
+pulses = 2
+[image]
+columns = 20
+rows = 20
+pixel_mm = 8.0
+[[plates]]
+name = "copper"
+centre_mm = [0.0, 0.0]
+size_mm = [60.0, 60.0]
+metal = true
+"""
+pytestmark = pytest.mark.xdist_group("rig")
+
+
+class View:
+    """The live view's process, asked over HTTP."""
+
+    def __init__(self, rig) -> None:
+        self._program = rig.start("polysight", "preview", rig.folder / "scan", "--port", "0", "--control")
+        rig.wait_for(lambda: "token=" in self._program.err, "the address of the live view")
+        found = re.search(r"(http://127\.0\.0\.1:\d+)/#token=(\S+)", self._program.err)
+        assert found is not None, self._program.err
+        self._address, self._token = found.groups()
+
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._program.process.pid
+
+    def state(self) -> dict[str, Any]:
+        """What a page is told."""
+        with suppress(URLError), urlopen(f"{self._address}/api/state", timeout=LIMIT_S) as reply:
+            return json.load(reply)
+        return {"status": {"headline": "not there yet"}}
+
+    def ask(self, wish: str) -> None:
+        """What a button does."""
+        headers = {"X-Polysight-Token": self._token}
+        with urlopen(Request(f"{self._address}/api/control/{wish}", b"", headers), timeout=LIMIT_S) as reply:
+            assert reply.status == 200
+
+    def wait(self, condition: Callable[[dict[str, Any]], object], what: str) -> dict[str, Any]:
+        """The first state that meets a condition."""
+        deadline = time.monotonic() + LIMIT_S
+        while not condition(state := self.state()):
+            assert self._program.process.poll() is None, self._program.err
+            assert time.monotonic() < deadline, f"not within {LIMIT_S:g} s: {what}; the view says {state}"
+            time.sleep(0.2)  # what looks on here costs the scan time
+        return state
+
+    def wait_headline(self, headline: str) -> dict[str, Any]:
+        """Until the page says so."""
+        return self.wait(lambda s: s["status"]["headline"] == headline, headline)
+
+
+def priority(pid: int) -> int:
+    """Nice value of a process."""
+    return os.getpriority(os.PRIO_PROCESS, pid)
+
+
+def shown(state: dict[str, Any]) -> int:
+    return (state.get("pictures") or {"rows": 0})["rows"]
+
+
+@pytest.fixture
+def slow_rig(make_rig, tmp_path) -> Iterator[Any]:
+    """A rig that takes a while for its many short rows."""
+    made = make_rig(tmp_path, time_scale=10.0, scene=SCENE)
+    try:
+        made.begin()
+        yield made
+    finally:
+        made.close()
+
+
+def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):
+    rig = slow_rig
+    view = View(rig)
+    view.wait_headline("No scan here yet")
+    scan = rig.scan("--no-process")
+
+    state = view.wait(lambda s: shown(s) >= 1, "the first row's image")
+    assert priority(view.pid) > priority(scan.process.pid)  # the scan goes first
+    assert state["scan"]["simulated"] is True
+    assert state["marks"].startswith("c")
+    assert state["control"] == {"enabled": True, "running": True, "paused": False, "asked": None}
+
+    view.ask("pause")
+    paused = view.wait_headline("Paused")
+    rows = paused["progress"]["committed"]
+    assert 1 <= rows < ROWS
+    assert rig.committed() == rows
+    view.ask("continue")
+    view.wait(lambda s: shown(s) > rows, "rows after the pause")
+
+    scan.kill()
+    gone = view.wait_headline("The scan program is gone")
+    assert "polysight resume" in gone["status"]["do"]
+
+    again = rig.start("polysight", "resume", rig.folder / "scan", "--no-process")
+    view.wait(lambda s: s["control"]["running"], "that the scan goes on is seen")
+    view.wait(lambda s: s["progress"]["committed"] > gone["progress"]["committed"], "rows after the kill")
+    view.ask("abort")
+    ended = view.wait_headline("Stopped on request")
+    assert ended["progress"]["committed"] < ROWS
+    assert again.wait().status != 0
+    assert [f for f in validate(rig.folder / "scan") if f.severity == "error"] == []
+    state = view.wait(lambda s: shown(s) == s["progress"]["committed"], "every row's image")
+    assert state["boards"][0]["frames_lost"] == 0

@@ -1,0 +1,76 @@
+"""The examples run as they are, one after another, in a folder of their own."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from host.materials import Library
+from shared.config import load_instrument
+from simulators.scene import decode_scene
+from simulators.simulate import simulate
+
+REPO = Path(__file__).resolve().parents[2]
+SCRIPTS = REPO / "examples" / "scripts"
+LIMIT = 20  # lines from raw data to the image, imports included
+
+
+def run(name: str) -> dict:
+    return runpy.run_path(str(SCRIPTS / f"{name}.py"))
+
+
+def code_lines(cells: str) -> list[str]:
+    return [line for line in cells.splitlines() if line.strip() and not line.startswith("#")]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("examples")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(made)
+        yield made
+
+
+@pytest.mark.xdist_group("examples")
+def test_raw_to_image(folder):
+    grid = {"columns": 21, "rows": 21, "step_x_mm": 8.0, "step_y_mm": 6.0}
+    image = {"columns": 40, "rows": 40, "pixel_mm": 2.0}
+    raw = {"name": "a point", "grid": grid, "burst": {"pulses": 2}, "image": image}
+    scene = decode_scene({**raw, "points": [{"position_mm": [10.0, -6.0]}]}, "test")
+    simulate(load_instrument(REPO / "instrument.toml"), scene, folder / "out" / "points")
+    images = run("raw_to_image")["images"]
+    row, column = np.unravel_index(np.argmax(np.abs(images.h_raw)), images.h_raw.shape)
+    centre = (images.x_m.mean(), images.y_m.mean())
+    found = 1e3 * (images.x_m[column] - centre[0]), 1e3 * (images.y_m[row] - centre[1])
+    assert found == pytest.approx((10.0, -6.0), abs=2.0)
+    assert (folder / "out" / "points-h.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_raw_to_image_takes_twenty_lines():
+    to_the_image, _, _ = (SCRIPTS / "raw_to_image.py").read_text(encoding="utf-8").rpartition("# %%")
+    assert len(code_lines(to_the_image)) <= LIMIT
+
+
+@pytest.mark.xdist_group("examples")
+def test_own_scene_then_own_material(folder, capsys):
+    run("own_scene")
+    assert (folder / "out" / "own-products" / "report.html").exists()
+    segments = json.loads((folder / "out" / "own-products" / "materials.json").read_text())["segments"]
+    mine = next(s for s in segments if s["truth"] and s["truth"]["name"] == "my material")
+    assert mine["permittivity"]["real"] == pytest.approx(6.0, rel=0.1)
+    capsys.readouterr()
+    told = run("own_material")
+    assert abs(told["expected"]) == pytest.approx(np.hypot(mine["ratio"]["real"], mine["ratio"]["imag"]), rel=0.1)
+    assert "expected: |P|" in capsys.readouterr().out
+    assert "my material" in Library.load(folder / "out" / "own-library.npz").names
+
+
+@pytest.mark.parametrize("script", sorted(SCRIPTS.glob("*.py")), ids=lambda p: p.stem)
+def test_examples_hold_no_logic_and_no_private_names(script):
+    code = code_lines(script.read_text(encoding="utf-8"))
+    assert not [line for line in code if line.lstrip().startswith(("def ", "class ", "if ", "while ", "try"))]
+    assert not [line for line in code if "import _" in line or "._" in line]

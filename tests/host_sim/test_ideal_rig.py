@@ -1,0 +1,21 @@
+"""A scan of an ideal rig is processed as one: what its scene switched off is not taken away once more."""
+
+import pytest
+
+from host.materials import Classifier, Library
+from host.options import LIBRARY
+
+pytestmark = pytest.mark.xdist_group("host_sim")
+
+
+def test_all_nine_plates_of_an_ideal_scan_are_named_right(imaged):
+    """No filter and no leakage in the data: the recorded rig says so, and neither is corrected."""
+    scan = imaged("nine-materials", ideal=True)
+    rig = scan.rig
+    assert (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) == (0.0, 0.0)
+    assert rig.polarimetry.leakage_h == rig.polarimetry.leakage_v == (0.0, 0.0)
+    assert all(setup.equaliser is None for setup in scan.pipeline.setups.values())
+    found = scan.pipeline.find_materials(scan.images, None, Classifier(Library.load(LIBRARY)), scan.plates)
+    assert [p.verdict.name for p in found.patches] == [p.truth.name for p in found.patches]
+    assert len(found.patches) == 9
+    assert found.metal.certain

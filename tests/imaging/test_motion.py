@@ -1,0 +1,66 @@
+"""The filter that undoes the stage's travel within a burst."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from host.imaging.motion import REACH, burst_filters, undo_burst_motion
+
+COUNT, MIDDLE = 61, slice(REACH, -REACH)
+
+
+@pytest.fixture(scope="module")
+def fast(published):
+    """A rig whose bursts fill nearly all of the way from point to point: 16 pulses at 100 mm/s in steps of 2.5 mm."""
+    grid = msgspec.structs.replace(published.grid, columns=100, rows=8, step_x_mm=2.5, step_y_mm=4.0)
+    stage = msgspec.structs.replace(published.stage, speed_mm_s=100.0)
+    return msgspec.structs.replace(published, grid=grid, stage=stage)
+
+
+def burst_mean(turns, rig):
+    """A wave that turns by so many cycles a position, averaged over each position's burst."""
+    pulse = (np.arange(rig.burst.pulses) - (rig.burst.pulses - 1) / 2) * rig.burst.period_us * 1e-6
+    offsets = pulse * rig.stage.speed_mm_s / rig.grid.step_x_mm
+    return np.exp(2j * np.pi * turns * (np.arange(COUNT)[:, None] + offsets)).mean(axis=1).astype(np.complex64)
+
+
+@pytest.mark.parametrize(
+    ("turns", "centre"), [(-0.4, 0.0), (-0.2, 0.0), (0.0, 0.0), (0.1, 0.0), (0.3, 0.0), (0.0, 0.1), (0.35, 0.1)]
+)
+def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
+    """Whatever part of its turning burst alignment has undone."""
+    still = np.exp(2j * np.pi * turns * np.arange(COUNT))
+    average = burst_mean(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
+    valid, turn = np.ones(COUNT, bool), np.full(COUNT, 2 * np.pi * centre)
+    undone = undo_burst_motion(average, valid, turn, burst_filters(fast))
+    np.testing.assert_allclose(undone[MIDDLE], still[MIDDLE], atol=6e-3)
+    assert turns == centre or abs(average[30]) < 1 - 1.2 * (turns - centre) ** 2
+
+
+def test_a_slow_stage_and_one_pulse_need_no_filter(published):
+    slow = msgspec.structs.replace(published, burst=msgspec.structs.replace(published.burst, pulses=1))
+    np.testing.assert_allclose(burst_filters(slow), np.eye(REACH + 1)[np.zeros(REACH + 1, int)], atol=1e-6)
+
+
+def test_masked_positions_and_ends_are_neither_used_nor_changed(fast):
+    """A filter reaches as far as all is valid: what a masked position holds does not matter."""
+    rng = np.random.default_rng(1)
+    samples = (rng.standard_normal((2, COUNT)) + 1j * rng.standard_normal((2, COUNT))).astype(np.complex64)
+    valid = np.ones(COUNT, bool)
+    valid[[20, 21, 40]] = False
+    turn, filters = rng.uniform(-1, 1, COUNT), burst_filters(fast)
+    first = undo_burst_motion(samples, valid, turn, filters)
+    other = np.where(valid, samples, 1e6).astype(np.complex64)
+    np.testing.assert_array_equal(undo_burst_motion(other, valid, turn, filters)[:, valid], first[:, valid])
+    for alone in (0, COUNT - 1, 19, 22):
+        np.testing.assert_array_equal(first[:, alone], samples[:, alone])
+
+
+def test_a_row_run_the_other_way_is_filtered_alike(fast):
+    rng = np.random.default_rng(2)
+    samples = (rng.standard_normal((2, COUNT)) + 1j * rng.standard_normal((2, COUNT))).astype(np.complex64)
+    valid, turn = rng.uniform(size=COUNT) < 0.9, rng.uniform(-1, 1, COUNT)
+    filters = burst_filters(fast)
+    there = undo_burst_motion(samples, valid, turn, filters)
+    back = undo_burst_motion(samples[:, ::-1], valid[::-1], -turn[::-1], filters)
+    np.testing.assert_allclose(back[:, ::-1], there, atol=1e-5)

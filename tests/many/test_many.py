@@ -1,0 +1,238 @@
+"""Many scans at once: each on its own, finished ones passed over, a failing one alone, a table at the end."""
+
+import json
+import sys
+import time
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+
+from host import many
+from host.cli import main
+from host.cli_process import table
+from host.many import MARK, Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
+from shared.errors import ConfigError
+
+WORKER = """
+import json, os, pickle, sys, time
+from pathlib import Path
+class Job:
+    name = property(lambda self: self.out.name)
+class Light(pickle.Unpickler):  # without the host's imports, which take seconds
+    def find_class(self, module, name):
+        return Job if name == "Job" else super().find_class(module, name)
+job = Light(sys.stdin.buffer).load()
+out = Path(job.out)
+out.mkdir(parents=True, exist_ok=True)
+with (out.parent / "runs.txt").open("a") as f:
+    f.write(job.name + "\\n")
+if job.name == "bad":
+    sys.exit("no row is recorded whole\\n  why: it is bad\\n  do: nothing")
+if job.name == "killed":
+    os.kill(os.getpid(), 9)
+if job.name == "slow":
+    time.sleep(600)
+for name in ("image.npz", "quality.json"):
+    (out / name).write_text("{}")
+(out / ".finished.json").write_text(json.dumps({"made_with": job.made_with, "memory_gb": 0.5}))
+"""
+
+
+@pytest.fixture
+def worker(tmp_path, monkeypatch):
+    """In place of the program that processes a scan: one that does as the scan's name says."""
+    file = tmp_path / "worker.py"
+    file.write_text(WORKER)
+    monkeypatch.setattr(many, "PROGRAM", (sys.executable, str(file)))
+
+
+def scans(folder, *names):
+    for name in names:
+        (folder / name).mkdir(parents=True)
+        (folder / name / "data_collection_cfg.json").write_text('{"total_x": 5, "total_y": 4}')
+    return [folder / n for n in names]
+
+
+def jobs(folder, *names, **options):
+    found = scans_of([folder])
+    assert sorted(p.name for p in found) == sorted(names)
+    return jobs_of(found, folder.parent / "out", Namespace(data=found, config=None, **options), lambda _: None)
+
+
+def runs(folder):
+    return sorted((folder / "out" / "runs.txt").read_text().split())
+
+
+@pytest.mark.usefixtures("worker")
+def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not_finished(tmp_path, capsys):
+    names = ("a", "bad", "c", "killed")
+    scans(tmp_path / "in", *names)
+    first = process_many(jobs(tmp_path / "in", *names, metal=None), tmp_path / "out", 2)
+    assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
+    assert [o.name for o in first] == list(names)
+    told = {o.name: o.message for o in first}
+    assert told["bad"] == "no row is recorded whole"
+    assert "signal 9" in told["killed"]
+    assert first[0].memory_gb == 0.5
+    assert runs(tmp_path) == sorted(names)
+    summary = json.loads((tmp_path / "out" / "processed.json").read_text())
+    assert [s["status"] for s in summary["scans"]] == ["done", "failed", "done", "failed"]
+
+    again = process_many(jobs(tmp_path / "in", *names, metal=None), tmp_path / "out", 2)
+    assert [o.status for o in again] == ["skipped", "failed", "skipped", "failed"]
+    assert runs(tmp_path) == sorted([*names, "bad", "killed"])
+    assert "2 finished before, 2 to process" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
+    (folder,) = scans(tmp_path / "in", "a")
+    library, rig = tmp_path / "library.npz", tmp_path / "rig.toml"
+    library.write_bytes(b"1")
+    rig.write_text("1")
+
+    def job(config=rig, **changes):
+        options = {"metal": None, "library": library, **changes}
+        return jobs_of([folder], tmp_path / "out", Namespace(data=[folder], **options), lambda _: config)[0]
+
+    assert not finished(job())
+    process_many([job()], tmp_path / "out", 1)
+    assert finished(job())
+    assert not finished(job(metal=(0.0, 0.0, 1.0, 1.0)))
+    assert not finished(job(library=None))
+    assert not finished(job(config=None))
+    library.write_bytes(b"2")
+    assert not finished(job())
+    library.write_bytes(b"1")
+    assert finished(job())
+    rig.write_text("2")
+    assert not finished(job())
+    rig.write_text("1")
+    (folder / "0_0.bin").write_bytes(b"more")
+    assert not finished(job())
+    (folder / "0_0.bin").unlink()
+    assert finished(job())
+    (tmp_path / "out" / "a" / "image.npz").unlink()
+    assert not finished(job())
+    process_many([job()], tmp_path / "out", 1, again=True)
+    (tmp_path / "out" / "a" / MARK).write_text("[1]")
+    assert not finished(job())
+
+
+@pytest.mark.usefixtures("worker")
+def test_ended_early_its_programs_end_too(tmp_path):
+    scans(tmp_path / "in", "slow", "slow2")
+    todo = jobs(tmp_path / "in", "slow", "slow2")
+    results = many.run_here(todo, 2)
+    first = next(results)  # slow2, which is not slow
+    assert (first.name, first.status) == ("slow2", "done")
+    began = time.monotonic()
+    results.close()
+    assert time.monotonic() - began < 300  # and not the 600 s that it sleeps
+    assert not finished(todo[0])
+
+
+def test_names_folders_and_what_is_a_scan(tmp_path):
+    found = scans(tmp_path / "unsynced", "s1", "s2")
+    (tmp_path / "unsynced" / "notes").mkdir()
+    raw = tmp_path / "raw" / "s1"
+    raw.mkdir(parents=True)
+    (raw / "RH_synced.npy").touch()
+    assert scans_of([tmp_path / "unsynced"]) == found
+    assert scans_of([raw, found[1]]) == [raw, found[1]]
+    assert scans_of([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
+    with pytest.raises(ConfigError, match="two scans are named s1"):
+        jobs_of([found[0], raw], tmp_path / "out", Namespace(data=[]), lambda _: None)
+
+
+def test_scans_at_a_time_follow_cores_and_memory():
+    need = memory_bytes(70_000)
+    assert at_once(70_000, cores=8, free_bytes=100 * need) == 8
+    assert at_once(70_000, cores=8, free_bytes=3 * need) == 2
+    assert at_once(70_000, cores=8, free_bytes=0) == 1
+    assert many.free_memory_bytes() > 0
+    assert many.cores() >= 1
+
+
+def test_the_table_names_every_scan_and_counts(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "quality.json").write_text('{"boards": {"RH": {"positions": 200, "positions_masked": 3}}}')
+    (tmp_path / "a" / "materials.json").write_text('{"segments": [1, 2]}')
+    text = table([Outcome("a", "done", 61.0, 0.54), Outcome("b", "failed", 2.0, 0.0, "broken")], tmp_path)
+    head, a, b, end = text.splitlines()
+    assert head.split() == ["scan", "result", "seconds", "memory", "masked", "patches"]
+    assert a.split() == ["a", "done", "61", "0.5", "GB", "1.5", "%", "2"]
+    assert b.split() == ["b", "failed", "2", "broken"]
+    assert "2 scans: 1 done, 1 failed" in end
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_wrong_folder_fails_and_the_status_says_so(tmp_path, capsys):
+    scans(tmp_path / "in", "a", "bad")
+    command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
+    assert main([*command, "--jobs", "1"]) == 1
+    assert "2 scans: 1 done, 1 failed" in capsys.readouterr().out
+    assert main([*command[:2], "--out", str(tmp_path / "one")]) != 0  # a single one as ever: no worker, its own error
+    assert "out/one" not in capsys.readouterr().out
+    (tmp_path / "file").touch()
+    assert main([*command[:3], "--out", str(tmp_path / "file")]) == 2
+
+
+def test_without_dask_the_line_that_installs_it_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "dask", None)
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    scans(tmp_path / "in", "a")
+    command = ["process", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--dask", "tcp://127.0.0.1:1"]
+    assert main(command) == 2
+    assert "pip install 'polysight-host[dask]'" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_dask_cluster_does_the_same(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
+    scans(tmp_path / "in", "a", "bad", "c")
+    todo = jobs(tmp_path / "in", "a", "bad", "c")
+    # Threads of this process stand for the workers: the programs they start are their own all the same.
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
+    assert [o.status for o in outcomes] == ["done", "failed", "done"]
+    assert all(finished(j) == (j.name != "bad") for j in todo)
+    with pytest.raises(ConfigError, match="no Dask scheduler"):
+        list(many.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
+
+
+@pytest.mark.timeout(900)
+def test_real_scans_end_to_end(tmp_path, capsys):
+    """A simulated scan and a damaged one by the real program; then the mark holds."""
+    from shared.config import load_instrument
+    from simulators.scene import decode_scene
+    from simulators.simulate import simulate
+
+    rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+    scene = {
+        "name": "plate",
+        "grid": {"columns": 13, "rows": 15, "step_x_mm": 16.0, "step_y_mm": 8.0},
+        "burst": {"pulses": 2},
+        "image": {"columns": 30, "rows": 30, "pixel_mm": 4.0},
+        "plates": [{"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}],
+    }
+    simulate(rig, decode_scene(scene, "t"), tmp_path, layout="authors")
+    broken = tmp_path / "unsynced" / "broken"
+    broken.mkdir()
+    (broken / "data_collection_cfg.json").write_text("{")
+    command = ["process", str(tmp_path / "unsynced"), "--out", str(tmp_path / "out")]
+    assert main(command) == 1
+    told = capsys.readouterr().out
+    assert "broken  failed" in told
+    assert "not JSON" in told
+    assert "plate   done" in told
+    assert (tmp_path / "out" / "plate" / "report.html").exists()
+    mark = json.loads((tmp_path / "out" / "plate" / MARK).read_text())
+    assert {"versions", "options", "data"} == set(mark["made_with"])
+    assert len(mark["made_with"]["options"]["config"]) == 64  # digest of the rig file
+    (broken / "data_collection_cfg.json").unlink()
+    assert main(command) == 0
+    assert "1 skipped" in capsys.readouterr().out

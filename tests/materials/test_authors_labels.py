@@ -1,0 +1,88 @@
+"""The published label folders: boxes become library entries, whichever way the images are stored."""
+
+import json
+
+import numpy as np
+import pytest
+
+from host.materials.authors_labels import (
+    PIXELS,
+    TURNS,
+    entries_of_boxes,
+    label_folders,
+    read_labelled_scan,
+    reading_of,
+    told_angle,
+)
+from host.polarimetry import ratio_from_permittivity
+from shared.errors import DataError
+from simulators.authors_forms import Errors, Material, write_labels
+
+MATERIALS = {
+    "Copper plate": Material("copper", None),
+    "acrylic_3mm": Material("acrylic", 4.0 - 0.4j, 3.0),
+    "ceramic": Material("ceramic", 4.75 - 2.43j),
+}
+BOXES = {"Copper plate": (10, 12, 40, 50), "acrylic_3mm": (60, 20, 85, 40), "ceramic": (100, 90, 130, 140)}
+
+
+def labelled(folder, seed=1, name="scan_7", **more):
+    return write_labels(folder, name, BOXES, MATERIALS, 60.0, Errors(0.005, 0.01), seed, **more)
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down):
+    scan = read_labelled_scan(labelled(tmp_path, upside_down=upside_down))
+    how = reading_of([scan])
+    assert ("last row" in how) == upside_down
+    entries = {e.name: e for e in entries_of_boxes(scan.turned(how), 60.0)}
+    assert set(entries) == set(BOXES)
+    for name, e in entries.items():
+        eps = MATERIALS[name].permittivity
+        true = 1.0 if eps is None else complex(ratio_from_permittivity(eps, np.radians(60.0)))
+        assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.05)
+        assert (e.scan, e.incidence_deg, e.reference, e.simulated) == ("scan_7", 60.0, "Copper plate", True)
+        assert e.h.size == PIXELS
+
+
+@pytest.mark.parametrize("how", list(TURNS))
+def test_the_right_reading_is_found_among_all(tmp_path, how):
+    scan = read_labelled_scan(labelled(tmp_path))
+    back = {
+        "x to the right, y along the rows": lambda a: a,
+        "y from the last row": lambda a: a[::-1],
+        "x and y swapped": lambda a: a.T,
+        "x and y swapped, y from the last row": lambda a: a[::-1].T,
+    }[how]
+    for name in ("sar_h", "sar_v"):
+        np.save(tmp_path / scan.scan / f"{name}.npy", back(np.load(tmp_path / scan.scan / f"{name}.npy")))
+    assert reading_of([read_labelled_scan(tmp_path / scan.scan)]) == how
+
+
+def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
+    folder = labelled(tmp_path)
+    text = json.loads((folder / "scan_7.json").read_text())
+    del text["labels"]["Copper plate"]
+    (folder / "scan_7.json").write_text(json.dumps(text))
+    with pytest.raises(DataError, match="none of its boxes is of metal"):
+        entries_of_boxes(read_labelled_scan(folder), 60.0)
+    np.save(folder / "sar_h.npy", np.ones(3))
+    with pytest.raises(DataError, match=r"sar_h.npy: float64 \(3,\)"):
+        read_labelled_scan(folder)
+    np.save(folder / "sar_h.npy", np.array([{}], dtype=object), allow_pickle=True)
+    with pytest.raises(DataError, match="not an image"):
+        read_labelled_scan(folder)
+    (folder / "scan_7.json").unlink()
+    with pytest.raises(DataError, match="no such label file"):
+        read_labelled_scan(folder)
+
+
+def test_folders_and_angles(tmp_path):
+    labelled(tmp_path)
+    labelled(tmp_path, name="another")
+    (tmp_path / "empty").mkdir()
+    assert [f.name for f in label_folders(tmp_path)] == ["another", "scan_7"]
+    assert label_folders(tmp_path / "none") == []
+    assert told_angle(["a scan", "plates_at_55deg"]) == 55.0
+    assert told_angle(["60 degrees"]) == 60.0
+    assert told_angle(["scan 12"]) is None

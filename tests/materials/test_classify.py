@@ -1,0 +1,188 @@
+"""The model a library is used with, several incidence angles together, and `polysight classify` as typed."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from host.cli import main
+from host.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
+from host.materials.models import DISCRIMINANT, MODELS, PAPER
+from host.materials.patches import PATCHES, match_patches, pack_patches, read_patches
+from host.report.assemble import classifier_sentence
+from host.reproduce.patches import Errors, draw, groups
+from shared.errors import DataError
+
+ANGLES = (55.0, 60.0)
+
+
+@pytest.fixture(scope="module")
+def powders():
+    """A fitted library of four materials under two angles, drawn pixel by pixel."""
+    drawn = [draw(groups()["powders"].materials, a, Errors(0.03, 0.05), 3, 4, 6).library() for a in ANGLES]
+    entries = [replace(e, scan=f"{e.scan} at {e.incidence_deg:g}") for lib in drawn for e in lib.entries]
+    return fit_library(Library(tuple(entries), {}, "drawn"))
+
+
+@pytest.fixture(scope="module")
+def seen(synthetic):
+    """Images of nine plates under both angles: four placements to learn from, one to name."""
+
+    def at(angle, seed):
+        return replace(synthetic(seed, theta=np.radians(angle)), theta=np.radians(angle))
+
+    entries = [
+        e
+        for angle in ANGLES
+        for seed in range(1000, 1004)
+        for e in entries_of(TrainingScan(f"{angle:g}-{seed}", at(angle, seed).analyse(), True, seed))
+    ]
+    return Library(tuple(entries)), {angle: at(angle, 1) for angle in ANGLES}
+
+
+@pytest.fixture
+def folders(seen, tmp_path):
+    """What `polysight process` leaves of the two scans, as far as naming needs it."""
+    library, scenes = seen
+    library.save(tmp_path / "library.npz")
+    for angle, scene in scenes.items():
+        folder = tmp_path / f"{angle:g}"
+        folder.mkdir()
+        (folder / PATCHES).write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))
+    return tmp_path
+
+
+def test_the_model_chosen_is_the_best_and_is_recorded_for_each_angle_and_for_both(powders, tmp_path):
+    powders.save(tmp_path / "powders.npz")
+    library = Library.load(tmp_path / "powders.npz")
+    assert set(library.fit["angles"]) == {"55", "60", "55+60"}
+    for fit in library.fit["angles"].values():
+        shares = {model: told["pixels"] + told["patches"] for model, told in fit["judged"].items()}
+        assert shares[fit["model"]] == max(shares.values())
+        assert fit["pixel_accuracy"] == fit["judged"][fit["model"]]["pixels"]
+        assert "4 scans" in fit["split"]
+    for angles in ((55.0,), (60.0,), ANGLES):
+        fit = library.fit_of(angles)
+        classifier = Classifier(library, angles_deg=angles)
+        assert classifier.model == fit["model"]
+        told = classifier_sentence(classifier)
+        assert fit["model"] in told
+        assert f"{100 * fit['pixel_accuracy']:.1f} % of the pixels" in told
+        assert "optimistic" in told
+        assert "simulated" in told
+
+
+def test_two_scans_are_enough_to_learn_from():
+    drawn = draw(groups()["powders"].materials, 60.0, Errors(0.003, 0.005), 3, scans=2, pixels=6)
+    library = fit_library(drawn.library())
+    assert library.fit_of([60.0])["pixel_accuracy"] > 0.8
+    named = Classifier(library).scan([s.x for s in [drawn.samples().take(drawn.samples().patches == 1)]])
+    assert named[0].verdict.name == drawn.materials[1].name
+
+
+def test_another_model_can_be_asked_for_and_the_report_says_so(powders):
+    knn = Classifier(powders, model="knn", angles_deg=[60.0])
+    assert knn.model == PAPER
+    if powders.at(60.0).fit["model"] != PAPER:
+        assert "not the one chosen" in classifier_sentence(knn)
+    with pytest.raises(DataError, match="guess"):
+        Classifier(powders, model="guess", angles_deg=[60.0])
+
+
+def test_an_angle_the_library_does_not_hold_is_refused(powders):
+    with pytest.raises(DataError, match=r"50\.0 degrees"):
+        Classifier(powders, angles_deg=[50.0])
+    with pytest.raises(DataError, match="55, 60"):
+        Classifier(powders)
+
+
+@pytest.mark.parametrize("model", [None, "knn", "discriminant", "own-spread"])
+def test_patches_under_two_angles_are_named_together(seen, model):
+    library, scenes = seen
+    scans = [_seen(scene) for scene in scenes.values()]
+    matched = match_patches(scans)
+    assert len(matched) == 9
+    named = Classifier(library, model=model, angles_deg=ANGLES).scan([m.features for m in matched])
+    assert sum(n.verdict.name == m.truth for n, m in zip(named, matched, strict=True)) >= 8
+    for n in named:
+        assert 0 < n.verdict.confidence <= 1
+        assert sum(n.verdict.votes.values()) == pytest.approx(1)
+
+
+def _seen(scene):
+    from pathlib import Path
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / PATCHES
+        path.write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))
+        return read_patches(path)
+
+
+def test_patches_match_by_place_alone(seen):
+    scans = [_seen(scene) for scene in seen[1].values()]
+    there = scans[1]
+    reordered = replace(there, patches=there.patches[::-1])
+    assert [m.label for m in match_patches([scans[0], reordered])] == [m.label for m in match_patches(scans)]
+    far = replace(there, patches=tuple(replace(p, centre_mm=(p.centre_mm[0] + 300, 0.0)) for p in there.patches))
+    assert match_patches([scans[0], far]) == []
+    without = replace(there, patches=there.patches[1:])
+    assert len(match_patches([scans[0], without])) == 8
+
+
+def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(seen):
+    classifier = Classifier(seen[0], model="discriminant", angles_deg=[55.0])
+    x = _seen(seen[1][55.0]).patches[0].features.copy()
+    x[0, 2] = np.nan
+    broken, empty, lost = classifier.scan([x, np.zeros((0, 4)), np.full((2, 4), np.nan)])
+    assert broken.names[0] == UNKNOWN
+    assert np.isinf(broken.distance[0])
+    assert broken.verdict.pixels == len(x) - 1
+    assert empty.verdict.name == lost.verdict.name == UNKNOWN
+    assert lost.names.tolist() == [UNKNOWN] * 2
+
+
+def test_two_scans_as_typed(folders, capsys):
+    arguments = ["classify", str(folders / "55"), str(folders / "60"), "--library", str(folders / "library.npz")]
+    assert main([*arguments, "--model", "discriminant", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["source"] == "simulated"
+    assert told["incidence_deg"] == pytest.approx(ANGLES)
+    assert told["model"] == DISCRIMINANT
+    assert sum(p["name"] == p["truth"] for p in told["patches"]) >= 8
+    assert main([*arguments, "--model", "knn"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("simulated: 9 patches at 55.0 and 60.0 degrees")
+    assert "of 9 patches named right" in out
+    assert PAPER in out
+
+
+def test_one_scan_and_wrong_folders_as_typed(folders, capsys):
+    library = ["--library", str(folders / "library.npz")]
+    assert main(["classify", str(folders / "60"), *library]) == 0
+    assert "9 patches at 60.0 degrees" in capsys.readouterr().out
+    assert main(["classify", str(folders / "60"), str(folders), *library]) != 0
+    assert "polysight process" in capsys.readouterr().err
+    (folders / "60" / PATCHES).write_bytes(b"no archive")
+    assert main(["classify", str(folders / "60"), *library]) != 0
+    assert PATCHES in capsys.readouterr().err
+
+
+def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):
+    """It loads for a second or two, which nobody waits for who does not use it."""
+    powders.save(tmp_path / "l.npz")
+    code = (
+        "import sys; from pathlib import Path; from host.materials import Classifier, Library;"
+        f"Classifier(Library.load(Path({str(tmp_path / 'l.npz')!r})), model='discriminant', angles_deg=[55.0]);"
+        "sys.exit('sklearn' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_every_short_name_is_a_model():
+    from host.materials.models import SHORT
+
+    assert set(SHORT.values()) <= set(MODELS)

@@ -1,0 +1,162 @@
+"""What a plan gives: laws of noise, motion and aliases, each against an independent computation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from host.imaging import ImageBuilder, backproject
+from host.imaging.facts import board_facts
+from host.imaging.grid import Antennas
+from host.plan import Changes, Noise, field_limits, forecast, propose
+from host.plan.field import PhaseSlope
+from host.plan.forecast import aperture_of, burst_facts, cautions, noise_facts
+from shared.errors import ConfigError
+from shared.geometry import specular_midpoint_m
+
+
+def test_without_changes_the_rig_file_stays(rig):
+    assert Changes().apply(rig) == rig
+
+
+def test_a_new_step_keeps_the_aperture(rig):
+    changed = Changes(step_x_mm=6.0, step_y_mm=4.0).apply(rig).grid
+    assert (changed.columns - 1) * 6.0 == pytest.approx(698, abs=3)
+    assert (changed.rows - 1) * 4.0 == pytest.approx(398, abs=2)
+
+
+def test_a_plan_that_breaks_a_rule_names_it(rig):
+    with pytest.raises(ConfigError, match="does not fit the travel"):
+        Changes(width_mm=900.0).apply(rig)
+
+
+def test_noise_falls_with_chirps_and_positions(rig):
+    one, four = (noise_facts(Changes(pulses=n).apply(rig), Noise(0.0, "")) for n in (4, 16))
+    assert four.position_db - one.position_db == pytest.approx(10 * np.log10(4))
+    assert four.image_db - one.image_db == pytest.approx(10 * np.log10(4))
+    assert one.direct_phase_rad / four.direct_phase_rad == pytest.approx(2.0)
+    half = noise_facts(Changes(step_y_mm=4.0).apply(rig), Noise(0.0, ""))
+    assert noise_facts(rig, Noise(0.0, "")).image_db - half.image_db == pytest.approx(
+        10 * np.log10(200 / 101), abs=0.05
+    )
+
+
+def test_image_noise_is_that_of_a_weighted_sum(rig):
+    """Noise through taper and window, summed as the imager sums, beside a point's sum."""
+    small = Changes(columns=16, rows=12).apply(rig)
+    aperture, taper = aperture_of(small)
+    rng = np.random.default_rng(1)
+    rx, samples = len(aperture.antennas.rx_m), slice(*small.chirp.linear_samples)
+    window = np.hanning(samples.stop - samples.start + 2)[1:-1]
+    weight = taper[None, :, :, None] * window
+    noise_power = 10 ** (-3 / 10) / small.burst.pulses  # 3 dB a chirp
+    trials = []
+    for _ in range(60):
+        shape = (rx, *taper.shape, window.size)
+        noise = (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) * np.sqrt(noise_power / 2)
+        trials.append((weight * noise).sum())
+    measured = 20 * np.log10((weight.sum() * rx) / np.sqrt(np.mean(np.abs(trials) ** 2)))
+    assert noise_facts(small, Noise(3.0, "")).image_db == pytest.approx(measured, abs=1.5)
+
+
+def test_motion_within_a_burst_costs_what_the_sum_over_its_pulses_says(rig):
+    moving = Changes(speed_mm_s=100.0, period_us=1200.0).apply(rig)
+    told, antennas = burst_facts(moving), Antennas.of(moving, moving.receivers[0])
+    middle = np.array(specular_midpoint_m(moving, moving.receivers[0]))
+    f = moving.chirp.first_sample_hz + moving.chirp.hz_per_sample * 96
+    x = -(moving.grid.columns - 1) / 2 * 2e-3 + 100e-3 * 1.2e-3 * (np.arange(16) - 7.5)
+    from_stage = middle - np.outer(x, [1, 0, 0])
+    away_tx, away_rx = from_stage - antennas.tx_m, from_stage - antennas.rx_m[0]
+    path = np.linalg.norm(away_tx, axis=1) + np.linalg.norm(away_rx, axis=1)
+    loss = -20 * np.log10(abs(np.mean(np.exp(2j * np.pi * f * path / 299792458.0))))
+    assert told.travel_mm == pytest.approx(1.8)
+    assert told.edge_loss_db == pytest.approx(loss, rel=0.2)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_ghosts_lie_where_the_backprojected_image_has_them(rig, axis):
+    """A point seen from a line of positions: the strongest response away from it is at the alias-free distance."""
+    step = (16.0, 8.0)[axis]
+    n = 30
+    changed = Changes(**({"step_x_mm": step, "columns": n} if axis == 0 else {"step_y_mm": step, "rows": n})).apply(rig)
+    free_m = field_limits(changed).alias_free_mm[axis] / 1e3
+    f = np.array([rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 192])
+    slope, a = PhaseSlope(rig, axis), Antennas.of(rig, rig.receivers[0])
+    # From the middle of the aperture's middle half the object and its ghost lie symmetrically.
+    middle = np.array(specular_midpoint_m(rig, rig.receivers[0]))
+    unit = np.eye(3)[axis]
+    offsets = np.outer((np.arange(5) - 2) * step / 1e3, unit)
+    point = middle - free_m / 2 * unit
+
+    def path(voxel):
+        return sum(np.linalg.norm(voxel - p - offsets, axis=1) for p in (a.tx_m, a.rx_m[0]))
+
+    samples = np.exp(2j * np.pi * np.outer(path(point), f) / 299792458.0)
+    places = np.linspace(0.5, 1.6, 441) * free_m
+    voxels = point + np.outer(places, unit)
+    reference = np.full(len(offsets), 0.0)
+    image = np.abs(backproject(samples, f, a.tx_m + offsets, a.rx_m[0] + offsets, voxels, reference))
+    ghost = places[int(np.argmax(image))]
+    assert image.max() > 0.8 * len(offsets)
+    assert slope.at(ghost - free_m / 2, float(f[0])) > slope.at(-free_m / 2, float(f[0]))
+    assert ghost == pytest.approx(free_m, rel=0.3)
+
+
+def test_resolution_is_what_quality_json_will_say(rig):
+    small = Changes(columns=60, rows=40, step_x_mm=8.0, step_y_mm=6.0).apply(rig)
+    board = next(iter(ImageBuilder(small).boards.values()))
+    board.valid[:] = True
+    said = board_facts(board)
+    told = forecast(small).response
+    assert said["point_width_mm"] == pytest.approx(told.width_mm, abs=2e-3)
+    assert said["point_limit_mm"] == pytest.approx(told.limit_mm, abs=2e-3)
+    assert said["point_paper_mm"] == pytest.approx(told.paper_mm, abs=2e-3)
+
+
+def test_the_published_plan_is_possible_and_takes_two_hours(rig):
+    told = forecast(rig)
+    assert told.possible
+    assert not forecast(Changes(columns=20, rows=20, speed_mm_s=100.0).apply(rig)).possible
+    assert told.time.minutes == pytest.approx(120, rel=0.06)
+    assert told.raw_bytes == 2 * 200 * 350 * 16 * 4096
+    assert told.noise.position_db == pytest.approx(17.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "topic", "words", "refused"),
+    [
+        (Changes(speed_mm_s=100.0), "burst", "too fast for the burst", True),
+        (Changes(speed_mm_s=120.0, pulses=2), "speed", "at most 100 mm/s", True),
+        (Changes(speed_mm_s=100.0, pulses=2, width_mm=760.0), "run-up", "narrow the grid", True),
+        (Changes(step_x_mm=2.001, pulses=2), "step x", "not whole", True),
+        (Changes(step_y_mm=8.0), "aliasing", "in y, steps of 8 mm", False),
+        (Changes(height_mm=200.0), "aperture", "flat plates are mirrors", False),
+        (Changes(speed_mm_s=40.0, step_x_mm=4.0, pulses=120, period_us=800.0), "motion", "wavelengths", False),
+        (Changes(speed_mm_s=40.0), "speed", "published rig", False),
+        (Changes(period_us=500.0), "radar", "inter-frame time", False),
+        (Changes(), "IF", "start_offset_hz", False),
+        (Changes(), "card", "with 13 pulses it would not", False),
+    ],
+)
+def test_what_is_wrong_is_said_in_words(rig, changes, topic, words, refused):
+    told = cautions(changes.apply(rig), Noise())
+    found = [w for w in told if w.topic == topic and words in w.text]
+    assert len(found) == 1, told
+    assert found[0].refused is refused
+    assert [w.refused for w in told] == sorted((w.refused for w in told), reverse=True)
+
+
+def test_proposals_keep_the_time_and_nothing_refuses_them(rig):
+    plans = propose(rig, 30.0, count=2)
+    assert len(plans) == 2
+    assert [p.noise.image_db for p in plans] == sorted((p.noise.image_db for p in plans), reverse=True)
+    for plan in plans:
+        assert plan.possible
+        assert plan.time.minutes <= 30.0
+        assert not [w for w in plan.warnings if w.topic in ("aliasing", "motion")]
+    # More time never gives a worse image.
+    assert propose(rig, 60.0, count=1)[0].noise.image_db > plans[0].noise.image_db
+
+
+def test_too_little_time_has_no_plan(rig):
+    assert propose(rig, 1.0) == []

@@ -1,0 +1,113 @@
+"""The time of a scan: equal to the simulated stage's own clock, and the law of adding up."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from host.plan import Changes, row_motion_s, scan_time, straight_move_s
+from host.plan.timing import TAIL_S, tail_s, turn_s, whole_packets
+from pi_controller.rows import stage_row
+from shared.config import Instrument
+from shared.raster import plan_raster
+from shared.stage_line import Command, Parameter
+from shared.wires import WireEdge
+from simulators.stage_motion import TICK_HZ
+from simulators.stage_python import PythonStage, Rig
+
+
+class Stage:
+    """The simulated stage, homed, set up as the Pi sets it up; it moves in virtual time."""
+
+    def __init__(self, rig: Instrument) -> None:
+        s = rig.stage
+        self.board, self._sequence = PythonStage(Rig(s.steps_per_mm)), 0
+        self.command("HELLO")
+        for parameter, value in (
+            (Parameter.ACCEL, s.accel_mm_s2 * s.steps_per_mm),
+            (Parameter.HEARTBEAT, 60_000),
+            (Parameter.TRAVEL_X, s.travel_x_mm * s.steps_per_mm),
+            (Parameter.TRAVEL_Y, s.travel_y_mm * s.steps_per_mm),
+            (Parameter.TRAVEL_SPEED, s.travel_speed_mm_s * s.steps_per_mm),
+            (Parameter.BACKLASH, s.backlash_mm * s.steps_per_mm),
+        ):
+            self.command("SET", int(parameter), round(value))
+        self.command("ENABLE", 1)
+        self.seconds("HOME")
+        self.board.wires.clear()
+
+    def command(self, verb: str, *args: int) -> None:
+        self.board.replies.clear()
+        self.board.receive(Command(self._sequence, verb, args).encode())
+        self._sequence += 1
+        assert self.board.replies.startswith(b"ok"), self.board.replies
+
+    def seconds(self, verb: str, *args: int) -> float:
+        """From a motion command to its end."""
+        began = self.board.tick
+        self.command(verb, *args)
+        while b"done" not in self.board.replies:
+            assert b"alarm" not in self.board.replies, self.board.replies
+            self.board.advance(self.board.tick + TICK_HZ // 1000, 0)
+        return (self.board.tick - began) / TICK_HZ
+
+
+def scanned(rig: Instrument) -> tuple[float, list[int]]:
+    """Seconds of motion of a whole scan from the home corner, and the times of its triggers, ns."""
+    stage = Stage(rig)
+    total = sum(stage.seconds("ROW", *stage_row(row, rig.stage, rig.stage.speed_mm_s)) for row in plan_raster(rig.grid))
+    edges = [w.t_ns for w in stage.board.wires if isinstance(w, WireEdge) and w.value]
+    return total, edges
+
+
+@pytest.mark.parametrize(
+    ("speed", "step_x", "step_y", "accel", "backlash"),
+    [
+        (20.0, 2.0, 2.0, 200.0, 0.0),
+        (100.0, 2.0, 2.0, 200.0, 0.0),
+        (60.0, 5.0, 10.0, 400.0, 0.0),
+        (40.0, 2.0, 2.0, 200.0, 3.0),
+        (40.0, 2.0, 6.0, 200.0, 3.0),
+    ],
+)
+def test_the_estimate_is_the_simulated_stage_own_time(rig, speed, step_x, step_y, accel, backlash):
+    rig = Changes(speed_mm_s=speed, step_x_mm=step_x, step_y_mm=step_y, columns=30, rows=5, accel_mm_s2=accel).apply(
+        rig
+    )
+    rig = msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, backlash_mm=backlash))
+    estimate = scan_time(rig, 0.0)
+    total, edges = scanned(rig)
+    # Ramps begin at some steps/s, not at rest, and the clock is read every millisecond: a few ms a leg.
+    legs = 3 * rig.grid.rows
+    assert estimate.total_s - estimate.tail_s == pytest.approx(total, abs=0.02 * legs)
+    assert len(edges) == 30 * 5
+    measuring = [(row[-1] - row[0]) / 1e9 for row in zip(*[iter(edges)] * 30, strict=True)]
+    assert sum(measuring) == pytest.approx(estimate.measuring_s, rel=1e-5)
+
+
+def test_a_row_is_its_motion_and_its_turn(rig):
+    ten, eleven = (scan_time(Changes(rows=n).apply(rig), 0.25) for n in (10, 11))
+    more = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + 0.25 + tail_s(rig)
+    # One row more, and the first one half a step nearer to the corner.
+    assert eleven.total_s - ten.total_s == pytest.approx(more + eleven.approach_s - ten.approach_s)
+
+
+@settings(max_examples=50)
+@given(st.floats(0.01, 800), st.floats(1, 100), st.floats(10, 2000))
+def test_moves_take_no_less_than_at_full_speed_and_no_less_than_acceleration_allows(distance, speed, accel):
+    took = straight_move_s(distance, speed, accel)
+    assert took >= distance / speed
+    assert took >= 2 * (distance / accel) ** 0.5 * (1 - 1e-12)
+    assert took <= distance / speed + 2 * (distance / accel) ** 0.5
+
+
+def test_a_row_of_whole_packets_is_not_waited_for(rig):
+    # 350 columns x 13 frames x 4096 bytes = 12,800 packets of 1456 bytes.
+    whole, short = Changes(pulses=13).apply(rig), Changes(pulses=16).apply(rig)
+    assert whole_packets(whole)
+    assert not whole_packets(short)
+    assert tail_s(whole) == 0.0
+    run_out = (row_motion_s(short.grid, short.stage) - 698 / 20) / 2
+    assert tail_s(short) == pytest.approx(TAIL_S + 15 * 1.5e-3 - run_out)

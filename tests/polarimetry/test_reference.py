@@ -1,0 +1,86 @@
+"""A metal plate scanned on its own: gains that vary over the plane are divided out, masked where it is weak."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from host.polarimetry import fresnel, plane_reference
+from shared.errors import DataError
+
+THETA = np.radians(55.0)
+X, Y = np.arange(60) * 2e-3, np.arange(50) * 2e-3
+
+
+def gains(rng, depth):
+    """Slowly varying gain of each channel over the plane."""
+    y, x = np.meshgrid(Y / Y[-1], X / X[-1], indexing="ij")
+    a = rng.uniform(-1, 1, (4, 3))
+    waves = [c[0] * np.sin(2 * x + c[1]) + c[2] * np.cos(2 * y) for c in a]
+    return [np.exp(depth * (waves[i] + 1j * waves[i + 2])) for i in (0, 1)]
+
+
+def noisy(image, rng, noise):
+    return image + noise / np.sqrt(2) * (rng.standard_normal(image.shape) + 1j * rng.standard_normal(image.shape))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-3.1, 3.1), st.floats(-100, 100))
+def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
+    """Whatever the plates' distance and tilt: a phase common to both channels is not the reference's business."""
+    light = gains(np.random.default_rng(seed), 0.3)
+    common = np.exp(1j * (phase + tilt * X))[None, :]
+    reference = plane_reference(-light[0] * common, -light[1] * common, X, Y)
+    r = fresnel(4 - 0.4j, THETA)
+    got = reference.apply(light[0] * r[0], light[1] * r[1])
+    at = reference.valid
+    assert at.mean() > 0.9
+    np.testing.assert_allclose(got.p[at], r[0] / r[1], rtol=0.06)
+    np.testing.assert_allclose(np.abs(got.h[at]), abs(r[0]), rtol=0.06)
+    # In the middle, where the window sees both sides, next to nothing is left.
+    np.testing.assert_allclose(got.p[15:-15, 15:-15], r[0] / r[1], rtol=0.012)
+
+
+def test_speckle_of_the_plate_is_smoothed_and_told():
+    rng = np.random.default_rng(3)
+    one = np.ones((Y.size, X.size), complex)
+    reference = plane_reference(noisy(one, rng, 0.05), noisy(one, rng, 0.05), X, Y)
+    p = (reference.h / reference.v)[reference.valid]
+    assert np.std(p) < 0.01
+    assert reference.spread == pytest.approx(0.05, rel=0.2)  # a part of V / H: two channels, half of each
+
+
+def test_weak_parts_and_the_rim_are_masked():
+    rng = np.random.default_rng(4)
+    h = np.where(X[None, :] < 0.07, 1.0, 0.01) * np.ones((Y.size, 1), complex)
+    reference = plane_reference(noisy(h, rng, 0.01), noisy(h, rng, 0.01), X, Y, smooth_mm=4.0)
+    assert reference.valid[:, X < 0.06].all()
+    assert not reference.valid[:, X > 0.068].any()
+    assert np.isnan(reference.h[:, -1]).all()
+    got = reference.apply(h, h)
+    assert np.isnan(got.p[:, -1]).all()
+    np.testing.assert_allclose(got.p[reference.valid], 1, atol=0.02)
+    assert reference.facts()["share_of_plane"] == pytest.approx(reference.valid.mean(), abs=1e-3)
+
+
+def test_the_mean_is_one_number_and_usable_everywhere():
+    light = gains(np.random.default_rng(5), 0.02)
+    reference = plane_reference(*light, X, Y)
+    mean = reference.mean()
+    assert mean.valid.all()
+    assert np.unique(mean.h).size == np.unique(mean.v).size == 1
+    assert mean.h[0, 0] / mean.v[0, 0] == pytest.approx(np.mean(light[0] / light[1]), rel=0.01)
+    assert mean.spread > reference.spread  # the variation over the plane is in it
+    assert "one number" in mean.how
+    assert reference.facts()["ratio_variation_db"] > 0.01
+
+
+def test_what_is_no_metal_plate_is_refused():
+    dark = np.zeros((Y.size, X.size), complex)
+    with pytest.raises(DataError, match="no metal plate"):
+        plane_reference(dark, dark, X, Y)
+    spots = dark.copy()
+    spots[::10, ::10] = 1.0
+    with pytest.raises(DataError, match="no metal plate"):
+        plane_reference(spots, spots, X, Y, smooth_mm=2.0)
+    with pytest.raises(DataError, match="different pixels"):
+        plane_reference(dark + 1, dark + 1, X, Y).check_axes(X + 1e-3, Y)

@@ -1,0 +1,72 @@
+"""Reflection of layered media against `tmm` (S. J. Byrnes), an independent implementation by transfer matrices.
+
+`tmm` works in exp(-i omega t): its index is the conjugate of ours, and so are its coefficients. Its r_p has the
+opposite sign (a perfect conductor has r_p = +1 there, -1 in Eq. 2 of the paper).
+"""
+
+import numpy as np
+import pytest
+import tmm
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from host.polarimetry import fresnel, multilayer
+from shared.units import SPEED_OF_LIGHT_M_S
+
+media = st.tuples(st.floats(1.0, 12.0), st.floats(0.0, 20.0)).map(lambda e: complex(e[0], -e[1]))
+lossless = st.floats(1.0, 12.0).map(complex)
+thickness = st.floats(0.05e-3, 4e-3)
+angle = st.floats(0.0, 1.4)
+frequency = st.floats(76e9, 81e9)
+
+
+def by_tmm(eps, thickness_m, frequency_hz, theta):
+    """(r_s, r_p) in our signs, and the transmitted powers (T_s, T_p); a half space ends the stack."""
+    index = [1.0, *(np.conj(np.sqrt(complex(e))) for e in eps)]
+    inside = [np.inf, *thickness_m, np.inf]
+    wave = SPEED_OF_LIGHT_M_S / frequency_hz
+    s, p = (tmm.coh_tmm(pol, index, inside, theta, wave) for pol in "sp")
+    return (np.conj(s["r"]), -np.conj(p["r"])), (s["T"], p["T"])
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(media, thickness), max_size=4), media, frequency, angle)
+def test_random_stacks_agree_with_tmm(layers, last, f, theta):
+    eps, inside = [e for e, _ in layers] + [last], [d for _, d in layers]
+    expected, _ = by_tmm(eps, inside, f, theta)
+    got = multilayer(eps, inside, f, theta)
+    np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-10)
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(lossless, thickness), min_size=1, max_size=4), frequency, angle)
+def test_energy_is_conserved_by_lossless_layers(layers, f, theta):
+    eps, inside = zip(*layers, strict=True)
+    r = multilayer(list(eps), list(inside), f, theta)  # air follows
+    _, passed = by_tmm([*eps, 1.0], inside, f, theta)
+    np.testing.assert_allclose(np.abs(r) ** 2 + passed, 1.0, atol=1e-9)
+    mirrored = multilayer([*eps, 1 - 1e16j], list(inside), f, theta)
+    np.testing.assert_allclose(np.abs(mirrored), 1.0, atol=1e-6)
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(media, thickness), min_size=1, max_size=3), media, frequency, angle)
+def test_a_passive_stack_gives_back_no_more_than_it_gets(layers, last, f, theta):
+    r = multilayer([e for e, _ in layers] + [last], [d for _, d in layers], f, theta)
+    assert np.all(np.abs(r) <= 1 + 1e-9)
+
+
+@settings(max_examples=40)
+@given(media, media, frequency, angle)
+def test_an_infinite_or_invisible_second_medium_is_fresnel(eps, second, f, theta):
+    np.testing.assert_allclose(multilayer(eps, np.inf, f, theta), fresnel(eps, theta), rtol=1e-12)
+    np.testing.assert_allclose(multilayer([eps, eps], [1e-3], f, theta), fresnel(eps, theta), rtol=1e-9, atol=1e-12)
+    # A lossy layer thick enough hides what is behind it.
+    dark = complex(eps.real, min(eps.imag, -1.0))
+    np.testing.assert_allclose(multilayer([dark, second], [1.0], f, theta), fresnel(dark, theta), rtol=1e-9)
+
+
+def test_a_known_number():
+    """Water at 75 GHz behind 3 mm of glass, 55 degrees, 78.6 GHz."""
+    expected, _ = by_tmm([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0))
+    assert multilayer([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0)) == pytest.approx(expected)

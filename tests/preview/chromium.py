@@ -1,0 +1,166 @@
+"""Headless Chromium, driven over its DevTools protocol: as much of it as these tests need.
+
+Protocol: https://chromedevtools.github.io/devtools-protocol/ (Page, Runtime, Emulation).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from urllib.request import urlopen
+
+from websockets.sync.client import connect
+
+LIMIT_S = 60.0
+DESK, PHONE = (1400, 900, False), (390, 844, True)  # width, height, whether it is a phone
+
+
+def find_chromium() -> str | None:
+    """The browser's program; None where there is none."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+class Browser:
+    """One window of a browser with a profile of its own.
+
+    Parameters
+    ----------
+    folder
+        For its profile.
+    dark
+        Whether pages are told that dark colours are preferred.
+    """
+
+    def __init__(self, folder: Path, dark: bool = False) -> None:
+        program = find_chromium()
+        assert program is not None
+        profile = folder / "profile"
+        command = [
+            program,
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+        ]
+        command += ["--disable-background-networking", "--disable-component-update", "--remote-debugging-port=0"]
+        command += [f"--user-data-dir={profile}", "about:blank"]
+        self._log = (folder / "chromium.log").open("wb")
+        self._process = subprocess.Popen(command, stdout=self._log, stderr=self._log)
+        try:
+            address = self._page(profile / "DevToolsActivePort")
+            self._stack = ExitStack()
+            self._socket = self._stack.enter_context(connect(address, max_size=None, open_timeout=LIMIT_S))
+        except BaseException:
+            self._end()
+            raise
+        self._count = 0
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        for domain in ("Page", "Runtime", "Network", "Log"):
+            self.call(f"{domain}.enable")
+        self.call("Emulation.setScrollbarsHidden", hidden=True)
+        self.call(
+            "Emulation.setEmulatedMedia",
+            features=[{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}],
+        )
+
+    def _page(self, told: Path) -> str:
+        """Address of the first page's DevTools socket."""
+        deadline = time.monotonic() + LIMIT_S
+        while not (told.exists() and told.read_text().count("\n")):
+            assert self._process.poll() is None, "Chromium ended; see chromium.log"
+            assert time.monotonic() < deadline, "Chromium does not start"
+            time.sleep(0.05)
+        port = told.read_text().split()[0]
+        while time.monotonic() < deadline:
+            with urlopen(f"http://127.0.0.1:{port}/json/list", timeout=LIMIT_S) as reply:
+                for target in json.load(reply):
+                    if target["type"] == "page":
+                        return target["webSocketDebuggerUrl"]
+            time.sleep(0.05)
+        raise AssertionError("Chromium has no page")
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the protocol; events that come meanwhile are kept where they matter."""
+        self._count += 1
+        self._socket.send(json.dumps({"id": self._count, "method": method, "params": parameters}))
+        while True:
+            told = json.loads(self._socket.recv(timeout=LIMIT_S))
+            if told.get("id") == self._count:
+                assert "error" not in told, (method, told["error"])
+                return told["result"]
+            self._note(told.get("method", ""), told.get("params", {}))
+
+    def _note(self, event: str, what: dict[str, Any]) -> None:
+        if event == "Runtime.exceptionThrown":
+            self.errors.append(str(what["exceptionDetails"].get("exception", {}).get("description")))
+        elif event == "Log.entryAdded" and what["entry"]["level"] == "error":
+            self.errors.append(f"{what['entry']['text']} {what['entry'].get('url', '')}")
+        elif event == "Network.requestWillBeSent":
+            self.requests.append(what["request"]["url"])
+
+    def size(self, width: int, height: int, phone: bool) -> None:
+        """The window's size in CSS pixels."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=2 if phone else 1,
+            mobile=phone,
+        )
+
+    def open(self, url: str) -> None:
+        """Go to a page."""
+        self.call("Page.navigate", url=url)
+
+    def value(self, expression: str) -> Any:
+        """What a JavaScript expression is in the page."""
+        told = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in told, told["exceptionDetails"]
+        return told["result"].get("value")
+
+    def text(self, element: str) -> str:
+        """What an element, by its id, says."""
+        return self.value(f"document.getElementById('{element}')?.innerText ?? ''")
+
+    def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
+        """Until an expression is true in the page."""
+        deadline = time.monotonic() + limit_s
+        while not self.value(f"Boolean({expression})"):
+            assert time.monotonic() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"
+            time.sleep(0.05)
+
+    def screenshot(self, path: Path) -> None:
+        """The whole page as PNG."""
+        told = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
+        path.write_bytes(base64.b64decode(told["data"]))
+
+    def _end(self) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._log.close()
+
+    def close(self) -> None:
+        """End the browser."""
+        self._stack.close()
+        self._end()
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,174 @@
+"""What is missing in the published raw rows is masked and counted; what is not masked is what was sent."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from host.store.authors import RowLosses, open_scan
+from host.store.authors_settings import mirrored
+from shared.config import Burst, Grid, load_instrument
+from shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
+from shared.raster import plan_raster
+from simulators.authors_layout import AuthorsLayout
+
+ROOT = Path(__file__).parents[2]
+COLUMNS, ROWS, PULSES = 9, 4, 3
+BASE = load_instrument(ROOT / "instrument.toml")
+RIG = msgspec.structs.replace(
+    BASE,
+    grid=Grid(columns=COLUMNS, rows=ROWS, step_x_mm=2.0, step_y_mm=2.0),
+    burst=Burst(pulses=PULSES, period_us=1500.0),
+)
+FRAME = RIG.frame_bytes
+BURST = PULSES * FRAME
+PACKET = 1456
+
+
+def plan_of(by_columns):
+    grid = RIG.grid
+    if by_columns:
+        grid = Grid(columns=ROWS, rows=COLUMNS, step_x_mm=2.0, step_y_mm=2.0)
+    return plan_raster(grid)
+
+
+def record(folder, skipped=None, lost=None, zero_filling=True, by_columns=False):
+    """Write random rows; returns the folder and what was sent, {(board, row): bytes of the whole row}."""
+    layout = AuthorsLayout(folder, RIG, "scan", 1.7e9, zero_filling, by_columns, skipped)
+    layout.start()
+    sent = {}
+    for row in plan_of(by_columns):
+        payloads = {}
+        for k, board in enumerate(RIG.boards):
+            rng = np.random.default_rng([k, row.index])
+            payloads[board.name] = rng.integers(1, 2**15, (row.points * PULSES, 256, 8)).astype(np.int16)
+            sent[board.name, row.index] = payloads[board.name].view(np.uint8).ravel()
+        gaps = {b.name: (lost or {}).get((b.name, row.index), []) for b in RIG.boards}
+        layout.write_row(row, payloads, gaps)
+    return layout.folder, sent
+
+
+def packets(*numbers):
+    return [(k * PACKET, (k + 1) * PACKET) for k in numbers]
+
+
+def check(data, sent):
+    """Nothing is invented; returns what is masked, bool [byte]."""
+    mask = np.zeros(sent.size, bool) if data.mask is None else data.mask
+    np.testing.assert_array_equal(data.payload[~mask], sent[~mask])
+    assert not data.payload[mask].any()
+    return mask
+
+
+@pytest.mark.parametrize("by_columns", [False, True])
+@pytest.mark.parametrize("zero_filling", [True, False])
+@pytest.mark.parametrize("seed", range(6))
+def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path, seed, zero_filling, by_columns):
+    rng = np.random.default_rng(seed)
+    plan = plan_of(by_columns)
+    skipped, lost = {}, {}
+    for row in plan:
+        for board in ("RH", "RV"):
+            gone = np.flatnonzero(rng.random(plan.columns) < 0.25)
+            skipped[board, row.index] = set(gone.tolist())
+            left = (plan.columns - gone.size) * BURST // PACKET
+            numbers = np.flatnonzero(rng.random(left) < 0.03)
+            lost[board, row.index] = packets(*numbers.tolist())
+    folder, sent = record(tmp_path, skipped, lost, zero_filling, by_columns)
+    scan = open_scan(folder, BASE)
+    assert list(scan.rows()) == list(range(plan.rows))
+    for row in plan:
+        for board in ("RH", "RV"):
+            mask = check(scan.read_row(board, row.index), sent[board, row.index])
+            gone = skipped[board, row.index]
+            missing = len(gone) * BURST + sum(b - a for a, b in lost[board, row.index])
+            assert mask.reshape(plan.columns, -1)[sorted(gone)].all()
+            assert mask.sum() in (missing, mask.size)  # the transmitter's board was never missing: it tells all places
+            assert mask.sum() == missing or len(gone) > plan.columns - 3
+    told = scan.recording()["boards"]
+    for board in ("RH", "RV"):
+        assert told[board]["positions_short"] == 0
+        if not told[board]["rows_not_placed"]:
+            assert told[board]["positions_missing"] == sum(len(skipped[board, r.index]) for r in plan)
+            count = sum((b - a) // PACKET for r in plan for a, b in lost[board, r.index])
+            assert told[board]["packets_lost"] == count
+
+
+@pytest.mark.parametrize("gone", [{0}, {COLUMNS - 1}, {0, 1, 5}])
+def test_the_other_boards_tell_which_end_is_missing(tmp_path, gone):
+    folder, sent = record(tmp_path, {("RH", 2): gone})
+    scan = open_scan(folder, BASE)
+    mask = check(scan.read_row("RH", 2), sent["RH", 2])
+    np.testing.assert_array_equal(mask.reshape(COLUMNS, -1).all(axis=1), np.isin(range(COLUMNS), list(gone)))
+    assert scan.recording()["boards"]["RH"]["positions_missing"] == len(gone)
+
+
+def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
+    folder, sent = record(tmp_path, {(b.name, 2): {0} for b in RIG.boards})
+    scan = open_scan(folder, BASE)
+    for board in ("RH", "RV"):
+        assert check(scan.read_row(board, 2), sent[board, 2]).all()
+        assert scan.recording()["boards"][board]["rows_not_placed"] == 1
+
+
+@pytest.mark.parametrize("zero_filling", [True, False])
+def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling):
+    folder, sent = record(tmp_path, zero_filling=zero_filling)
+    short = 4
+    file, log = folder / "RH" / "0_0.bin", folder / "RH" / "0_0_log.csv"
+    cut = slice(short * BURST + FRAME, short * BURST + 2 * FRAME)  # one of its frames was never made
+    raw = np.delete(np.fromfile(file, np.uint8), cut)
+    file.write_bytes(raw.tobytes())
+    times = np.loadtxt(log, delimiter=",")
+    lines = []
+    for k, start in enumerate(range(0, raw.size, PACKET)):
+        end = min(start + PACKET, raw.size) - 1
+        true_end = end if end < cut.start else end + FRAME
+        at = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
+        lines.append(f"{k + 1},{end + 1 - start},{at:.6f}")
+    log.write_text("\n".join(lines))
+    scan = open_scan(folder, BASE)
+    mask = check(scan.read_row("RH", 0), sent["RH", 0])
+    np.testing.assert_array_equal(mask.reshape(COLUMNS, -1).all(axis=1), np.arange(COLUMNS) == short)
+    assert mask.sum() == BURST
+    assert scan._losses["RH"][0] == RowLosses(positions_short=1)
+
+
+def test_without_a_log_zeros_are_lost_packets_and_a_short_row_is_masked(tmp_path):
+    folder, sent = record(tmp_path, lost={("RV", 1): packets(3, 4, 10)})
+    for log in (folder / "RV").glob("*_log.csv"):
+        log.unlink()
+    short = folder / "RV" / "0_0.bin"
+    short.write_bytes(short.read_bytes()[:-BURST])
+    scan = open_scan(folder, BASE)
+    mask = check(scan.read_row("RV", 1), sent["RV", 1])
+    assert mask.sum() == 3 * PACKET
+    assert check(scan.read_row("RV", 0), sent["RV", 0]).all()
+    assert check(scan.read_row("RV", 2), sent["RV", 2]).sum() == 0
+    told = scan.recording()["boards"]["RV"]
+    assert (told["packets_lost"], told["rows_not_placed"], told["rows_absent"]) == (3, 1, 0)
+
+
+def test_columns_are_rows_of_the_mirrored_rig(tmp_path):
+    folder, _ = record(tmp_path, by_columns=True)
+    assert (folder / "RH" / "0_0.bin").exists()
+    assert (folder / "RH" / f"1_{ROWS - 1}.bin").exists()
+    scan = open_scan(folder, BASE)
+    assert (scan.plan.columns, scan.plan.rows) == (ROWS, COLUMNS)
+    assert scan.recording()["direction"] == "col"
+    back = mirrored(scan.instrument)
+    assert (back.grid.columns, back.grid.rows) == (COLUMNS, ROWS)
+
+
+def test_a_mirror_changes_no_path_and_twice_is_nothing():
+    other = mirrored(BASE)
+    assert mirrored(other) == BASE
+    assert incidence_deg(other, other.receivers[0]) == pytest.approx(incidence_deg(BASE, BASE.receivers[0]))
+    assert tx_position_m(other) == pytest.approx(
+        (tx_position_m(BASE)[1], tx_position_m(BASE)[0], tx_position_m(BASE)[2])
+    )
+    for a, b in zip(BASE.receivers, other.receivers, strict=True):
+        assert direct_path_m(BASE, a) == pytest.approx(direct_path_m(other, b))
+        for p, q in zip(rx_positions_m(BASE, a), rx_positions_m(other, b), strict=True):
+            assert q == pytest.approx((p[1], p[0], p[2]))

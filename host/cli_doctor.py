@@ -6,12 +6,17 @@ import argparse
 from pathlib import Path
 
 from host.cli_materials import Add
+from shared.errors import ConfigError
 
 
 def _doctor(args: argparse.Namespace) -> int:
     from host.doctor.bench import Wanted
     from host.doctor.command import doctor
 
+    if args.move and not args.pulse:
+        raise ConfigError(
+            "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out"
+        )
     return doctor(Wanted(args.config, args.out, args.move, args.pulse, args.bursts), args.json)
 
 
@@ -35,7 +40,10 @@ def add_doctor_command(add: Add, rig: Path) -> None:
         "--out", type=Path, default=Path(), metavar="DIR", help="where scans will go: its disk is tried (default: here)"
     )
     sub.add_argument(
-        "--move", action="store_true", help="THE STAGE MOVES: home it and run a short row, to try the trigger line"
+        "--move",
+        action="store_true",
+        help="THE STAGE MOVES: home it and run a short row, to try the trigger line; each of its points is a burst of"
+        " SYNC_IN pulses",
     )
     sub.add_argument(
         "--no-pulse",

@@ -87,6 +87,8 @@ def scan(config: Path, folder: Path, truth: Path | None, options: Options, keep_
     """Run a new scan and process it; returns the exit status. Raises PolysightError."""
     rig = load_instrument(config)
     _check_new(folder)
+    if truth is not None and not truth.is_file():
+        raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
 
     def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
         def told(progress: ScanProgress) -> None:

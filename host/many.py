@@ -107,10 +107,13 @@ def _absolute(value: Any) -> Any:
     return value.absolute() if isinstance(value, Path) else value
 
 
+NOT_DATA = ("products", "products-export", "control")  # folders of a scan
+
+
 def made_with(data: Path, options: Mapping[str, Any]) -> dict[str, Any]:
     """What products depend on: releases, options (files by their digest), and the data's files by size and time."""
     told = {key: _told(value) for key, value in sorted(options.items())}
-    files = sorted(p for p in data.rglob("*") if p.is_file() and "products" not in p.relative_to(data).parts)
+    files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
     listing = [f"{p.relative_to(data)} {s.st_size} {s.st_mtime_ns}" for p in files for s in (p.stat(),)]
     return {"versions": versions(), "options": told, "data": hashlib.sha256("\n".join(listing).encode()).hexdigest()}
 

@@ -200,6 +200,13 @@ class Executor:
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
         spec = check_pulses(command.pulses, command.period_us, command.width_us, self._check_width)
+        if spec.pulses * spec.period_ns > m.MOST_PULSES_S * 1e9:
+            raise RefusedError(
+                PiFault.NOT_READY,
+                f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MOST_PULSES_S:g} s",
+                "nothing else is answered meanwhile",
+                "ask for fewer pulses",
+            )
         self._pulsing.append(request.answer)
         self._loop.send(spec)
 

@@ -60,7 +60,10 @@ class Chirp(_Section, frozen=True):
         _require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
         _require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
         a, b = self.linear_samples
-        _require(0 <= a < b <= self.samples, f"linear_samples must be a range inside 0..{self.samples}")
+        _require(
+            a >= 0 and a + 12 <= b <= self.samples,
+            f"linear_samples must be a range of 12 samples or more inside 0..{self.samples}",
+        )
 
     @property
     def first_sample_hz(self) -> float:

@@ -17,7 +17,8 @@ from shared.errors import ProtocolError, VersionError
 from shared.raster import RasterPlan, Row
 
 WIRE_VERSION = "1.0"
-MOST_PULSES = 256  # of one `Pulse`: it is answered well before anybody's patience ends
+MOST_PULSES = 256  # of one `Pulse` ...
+MOST_PULSES_S = 2.0  # ... and how long they may last: it is answered well before anybody's patience ends
 Natural = Annotated[int, msgspec.Meta(ge=0)]
 RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]

@@ -12,7 +12,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No test asserts on wall-clock speed, Hypothesis' deadline included: the machine may be busy.
-settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# The same examples every time; `--long` looks for new ones.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+settings.register_profile("searching", settings.get_profile("patient"), derandomize=False)
 settings.load_profile("patient")
 
 
@@ -23,3 +25,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     group.addoption("--uml", action="store_true", help="build a user-mode Linux and run the chain on its GPIO chip")
     group.addoption("--long", action="store_true", help="the full number of randomised rows and random bytes")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--long"):
+        settings.load_profile("searching")

@@ -69,7 +69,7 @@ class DirectSignal:
         chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
         middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (a + b - 1) / 2
         expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
-        later = (expected - self.if_hz) / chirp.slope_hz_per_s
+        later = (expected - unwrapped(self.if_hz, rig)) / chirp.slope_hz_per_s
         return float(later.mean()), float(later.std(ddof=1) / np.sqrt(later.size)) if later.size > 1 else np.inf
 
 
@@ -77,6 +77,14 @@ def band_hz(rig: Instrument) -> tuple[float, float]:
     """IF that the receiver keeps: 0..0.9 sample rates (complex 1x) or +-0.45 (complex 2x)."""
     width = PASSBAND * rig.chirp.sample_rate_hz
     return (0.0, width) if rig.chirp.if_mode == "complex1x" else (-width / 2, width / 2)
+
+
+def unwrapped(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64]:
+    """IFs [chirp] of one direct path about their circular mean: unbroken where jitter crosses the band's edge."""
+    rate = rig.chirp.sample_rate_hz
+    middle = np.angle(np.exp(2j * np.pi * if_hz / rate).sum()) * rate / (2 * np.pi)
+    middle += rate * round((if_hz.mean() - middle) / rate)
+    return middle + (if_hz - middle + rate / 2) % rate - rate / 2
 
 
 def jitter_hz(rig: Instrument) -> float:

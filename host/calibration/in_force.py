@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
+from host.imaging.grid import image_grid
 from host.store import manifest
 from host.store.scanfolder import MANIFEST, ScanFolder
 from shared.config import Board, Instrument, MountStep, to_builtins
@@ -147,8 +148,10 @@ def checked(rig: Instrument, simulated: bool) -> Calibration:
         when a file is not what it should be, or comes from simulated data and the scan does not.
     """
     calibration = of_rig(rig)
-    calibration.rig(rig)
-    calibration.reference()
+    placed, reference = calibration.rig(rig), calibration.reference()
+    if reference is not None:
+        grid = image_grid(placed)
+        reference.check_axes(grid.x_m, grid.y_m)
     for kind, fact in calibration.facts().items():
         if fact["simulated"] and not simulated:
             raise ConfigError(
@@ -167,16 +170,19 @@ def keep_in_scan(rig: Instrument, folder: Path, simulated: bool) -> dict[str, An
     """
     calibration = checked(rig, simulated)
     taken = (folder / MANIFEST).exists() and manifest.read(folder / MANIFEST).length > 0
+    paths = calibration.paths or {}
+    names = [path.name for path in paths.values()]
     facts = {}
-    for kind, path in (calibration.paths or {}).items():
-        copy = folder / FOLDER / path.name
+    for kind, path in paths.items():
+        name = path.name if names.count(path.name) == 1 else f"{kind}-{path.name}"
+        copy = folder / FOLDER / name
         if not taken:
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copy)
             if kind == "metal" and calibration.metal is not None:
                 shutil.copyfile(path.parent / calibration.metal.images, copy.parent / calibration.metal.images)
         facts[kind] = {
-            "file": f"{FOLDER}/{path.name}",
+            "file": f"{FOLDER}/{name}",
             "crc32": f"{zlib.crc32(path.read_bytes()):08x}",
             "copied_from": str(path),
         }

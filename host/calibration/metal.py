@@ -59,5 +59,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path)
         digest = f"{zlib.crc32(images.read_bytes()):08x}"
         path.unlink()
     except OSError as e:
+        path.unlink(missing_ok=True)
+        images.unlink(missing_ok=True)
         raise DeviceError(f"{images}: {e.strerror}", "the disk is full, or a permission", "free space") from None
     return write(msgspec.structs.replace(file, images=images.name, images_crc32=digest), out)

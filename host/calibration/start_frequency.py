@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.calibration.direct_signal import band_hz, find_direct
+from host.calibration.direct_signal import band_hz, find_direct, unwrapped
 from host.calibration.files import BoardStart
 from host.calibration.rows import board_rows
 from host.radar.validator import direct_if_hz
@@ -42,6 +42,7 @@ def fit_start(source: ScanSource, board_name: str) -> BoardStart:
             "it lies outside the band and is filtered away, or something stands in it",
             f"by geometry alone start_offset_hz = {by_geometry(rig, board):.0f} for {board_name}; scan again with it",
         )
+    if_hz = unwrapped(if_hz, rig)
     return start_of(rig, board, expected, float(if_hz.mean()), float(if_hz.std() / np.sqrt(if_hz.size)), if_hz.size)
 
 

@@ -66,8 +66,8 @@ def capture(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str, Captu
     frames = bursts * rig.burst.pulses
     with (
         tempfile.TemporaryDirectory(prefix="polysight-doctor-") as folder,
+        CaptureRig(rig) as cards,  # first: ports that a scan holds refuse before a radar is touched
         radar_control(rig) as radars,
-        CaptureRig(rig) as cards,
     ):
         for board in rig.recorded:
             (Path(folder) / "raw" / board.name).mkdir(parents=True)

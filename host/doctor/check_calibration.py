@@ -10,8 +10,8 @@ from host.scan.run import HARDWARE_BACKEND
 
 def check_calibration(bench: Bench) -> Finding:
     """What a scan would copy into its folder."""
-    real = bench.hello is not None and bench.hello.backend == HARDWARE_BACKEND
-    facts = checked(bench.rig, simulated=not real).facts()
+    simulated = bench.hello is not None and bench.hello.backend != HARDWARE_BACKEND
+    facts = checked(bench.rig, simulated).facts()
     if not facts:
         return ok("none named: geometry, filters and metal as the rig file and the scene have them")
     return ok("; ".join(f"{kind} of {fact['made_utc'][:10]}" for kind, fact in facts.items()), **facts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.calibration.direct_signal import DirectSignal, band_hz, find_direct, jitter_hz
+from host.calibration.direct_signal import DirectSignal, band_hz, find_direct, jitter_hz, unwrapped
 from host.doctor.bench import Bench
 from host.doctor.finding import Finding, error, not_checked, ok, warning
 from shared.config import Board, Instrument
@@ -53,7 +53,8 @@ def judge(rig: Instrument, board: Board, signal: DirectSignal) -> Finding:
             " frequencies of both",
             **facts,
         )
-    middle, std = float(np.median(signal.if_hz)), float(signal.if_hz.std())
+    if_hz = unwrapped(signal.if_hz, rig)
+    middle, std = float(np.median(if_hz)), float(if_hz.std())
     told = f"at {middle / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
     facts |= {"if_hz": middle, "std_hz": std, "amplitude": float(np.sqrt(np.median(signal.power)))}
     if outside:

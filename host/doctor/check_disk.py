@@ -7,22 +7,16 @@ from pathlib import Path
 
 from host.doctor.bench import Bench
 from host.doctor.finding import Finding, error, ok, warning
+from host.plan.timing import scan_time
 from shared.config import Instrument
 from shared.errors import ConfigError
 
-CARD_TAIL_S = 2.0  # a card sends its short last packet so long after the last data
 SPARE = 2.0  # the disk should take so many times what comes
 
 
 def row_s(rig: Instrument) -> float:
-    """About how long a row takes, from one row's first point to the next one's: seconds.
-
-    Points at constant speed, both ramps, the step to the next row, and the end of the cards' record.
-    """
-    stage, grid = rig.stage, rig.grid
-    ramps = 2 * stage.speed_mm_s / stage.accel_mm_s2
-    turn = 2 * (grid.step_y_mm / stage.accel_mm_s2) ** 0.5  # short: the stage never reaches its travel speed
-    return (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s + ramps + turn + CARD_TAIL_S
+    """How long a row takes, from one row's first point to the next one's, as `polysight plan` has it: seconds."""
+    return scan_time(rig).total_s / rig.grid.rows
 
 
 def scan_bytes(rig: Instrument) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.calibration.direct_signal import DirectSignal
+from host.calibration.direct_signal import DirectSignal, unwrapped
 from host.doctor.bench import Bench
 from host.doctor.finding import Finding, error, not_checked, ok, warning
 from shared.config import Instrument
@@ -27,7 +27,7 @@ def judge(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     later = {b.name: signals[b.name].later_s(rig) for b in (h, v)}
     skew = later[v.name][0] - later[h.name][0]
     unsure = float(np.hypot(later[h.name][1], later[v.name][1]))
-    jitter = max(float(signals[b.name].if_hz.std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
+    jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
     ppm = {b.name: signals[b.name].crystal_ppm(rig) for b in (h, v)}
     told = f"{v.name} starts {skew * 1e9:+.2f} +- {unsure * 1e9:.2f} ns after {h.name}; " + ", ".join(
         f"{name} {mean * 1e9:+.1f} ns after the transmitter, crystal {ppm[name]:+.2f} ppm"

@@ -12,7 +12,7 @@ from host.radar.interface import RadarState
 from host.scan.pi_client import RefusedError
 from shared.config import Board
 from shared.faults import PiFault, explain
-from shared.messages import MOST_PULSES
+from shared.messages import MOST_PULSES, MOST_PULSES_S
 
 
 def check_pulses(bench: Bench) -> Finding:
@@ -23,9 +23,15 @@ def check_pulses(bench: Bench) -> Finding:
         return not_checked("no card can be used")
     from host.doctor.capture import capture, only
 
-    rig = only(bench.rig, bench.sound)
+    rig, burst = only(bench.rig, bench.sound), bench.rig.burst
+    period_s = burst.period_us * 1e-6
     try:
-        bursts = max(1, min(bench.wanted.bursts, MOST_PULSES // rig.burst.pulses))
+        bursts = min(bench.wanted.bursts, MOST_PULSES // burst.pulses, int(MOST_PULSES_S / (burst.pulses * period_s)))
+        if not bursts:
+            return not_checked(
+                f"a burst of {burst.pulses} pulses every {burst.period_us:g} us is longer than the Pi sends at rest",
+                f"`polysight scan` can use it; here at most {MOST_PULSES} pulses or {MOST_PULSES_S:g} s",
+            )
         bench.captured, sent = capture(rig, bench.pi, bursts)
     except RefusedError as e:
         if e.number != PiFault.BAD_REQUEST:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 
 from host.doctor.bench import Bench
+from host.doctor.check_pi import check_free
 from host.doctor.finding import Finding, error, not_checked, ok, warning
 from host.scan.ready import make_ready
 from host.scan.stop import StopRequest
@@ -30,6 +31,9 @@ def check_trigger(bench: Bench) -> Finding:
             "edges come only from a moving stage",
             f"`polysight doctor --move` homes it and runs {POINTS} points: keep clear of the stage",
         )
+    bench.hello = bench.pi.hello()  # a scan may have begun meanwhile, and beginning a run would end it
+    if (busy := check_free(bench)).verdict == "error":
+        return busy
     row = _run(bench)
     facts = {"points": row.points, "edges": row.edges, "pulses": row.pulses, "fault": row.fault}
     told = f"{row.points} points passed, {row.edges} edges seen, {row.pulses} pulses sent"

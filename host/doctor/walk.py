@@ -67,7 +67,7 @@ CHECKS = (
     Check("card", check_card, ("config",), ("rig is free",), each_board=True),
     Check("network", check_network, ("config",), each_board=True),
     Check("buffer", check_buffer, ("card",), each_board=True),
-    Check("disk", check_disk, ("config",)),
+    Check("disk", check_disk, ("config",), ("rig is free",)),
     Check("scan time", check_time, ("config",)),
     Check("trigger line", check_trigger, ("rig is free", "stage")),
     Check("pulses", check_pulses, ("pi", "rig is free")),

@@ -162,7 +162,7 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float, pixels: int = PIXELS)
             "everything is measured relative to metal",
             f"a metal box has one of these words in its name: {', '.join(METALS)}",
         )
-    relative = calibrate(scan.h, scan.v, scan.mask(scan.metal))
+    relative = calibrate(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
     h, v = relative.h, relative.v
     out = []
     for name in scan.boxes:

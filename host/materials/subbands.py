@@ -115,10 +115,12 @@ def bands_of_row(
         )
     if any(p.get("ratio") is None or not p.get("inverse_ratio_std") for p in parts):
         return None
+    # The bands share what metal reference, edges and size are off by: K of them know no more of it than one.
+    shared = np.sqrt(count)
     inverse = np.array([1 / complex(p["ratio"]["real"], p["ratio"]["imag"]) for p in parts])
-    sigma = np.array([float(p["inverse_ratio_std"]) for p in parts])
+    sigma = shared * np.array([float(p["inverse_ratio_std"]) for p in parts])
     level = [p.get("amplitude_h") for p in parts]
     if not amplitude_error or any(a is None for a in level):
         return Bands(Spectrum.of(chirp, count), inverse, sigma)
     amplitude = np.array(level, np.float64)
-    return Bands(Spectrum.of(chirp, count), inverse, sigma, amplitude, amplitude_error * amplitude)
+    return Bands(Spectrum.of(chirp, count), inverse, sigma, amplitude, shared * amplitude_error * amplitude)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
+from host.plan.timing import scan_time
 from host.preview.words import Notice, of_fault, of_kept, of_rejection
 from host.store.manifest import Fact
 from shared.config import Instrument
@@ -203,6 +204,4 @@ class Story:
             return self.last_commit_s - self.run_started_s, "first row"
         if self.simulated:
             return None  # nobody knows how fast the simulated time goes
-        stage, grid = self.instrument.stage, self.instrument.grid
-        ramps = 2 * stage.speed_mm_s / stage.accel_mm_s2
-        return grid.columns * grid.step_x_mm / stage.speed_mm_s + ramps + grid.step_y_mm / stage.speed_mm_s, "plan"
+        return scan_time(self.instrument).total_s / self.instrument.grid.rows, "plan"

@@ -80,7 +80,12 @@ class Watch:
 
     def _run(self) -> None:
         while not self._ended.wait(_TURN_S):
-            self._turn()
+            try:
+                self._turn()
+            except Exception as e:  # noqa: BLE001  a page that stands still must not say that all is well
+                self._problem = f"the live view fails: {type(e).__name__}: {e}"
+                nothing = Content(self.folder, None, self._signs(Heard()), Heard(), Shown(), None, False, self._problem)
+                self.state = _publish(self.state, make_snapshot(nothing))
 
     def _turn(self) -> None:
         """One look at everything; publishes what has changed."""

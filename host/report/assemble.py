@@ -61,6 +61,8 @@ def classifier_sentence(classifier: Classifier) -> str:
     if judged:
         chosen = fit.get("model") == classifier.model
         out += f", {'chosen' if chosen else 'asked for; not the one chosen'} by leaving whole scans out"
+        if chosen and len(fit["judged"]) > 1:
+            out += f" (the best of {len(fit['judged'])} models on the same split, so its figures flatter slightly)"
     out += f"; library of {len(library.names)} materials from {len(library.scans)} {kind}scans, {angles} degrees."
     if judged:
         out += (

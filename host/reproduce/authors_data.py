@@ -162,7 +162,8 @@ def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> Labell
     except (OSError, ValueError, KeyError) as e:
         notices.append(f"{scan.scan}: no image made here: {e}")
         return None
-    h, v = (np.where(valid, x, 0) for x in (h, v))
+    seen = valid & np.isfinite(h) & np.isfinite(v)
+    h, v = (np.where(seen, x, 0) for x in (h, v))
     theirs = np.abs(scan.h)
     ways = [(k, flip) for k in range(4) for flip in (False, True)]
 
@@ -171,7 +172,7 @@ def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> Labell
 
     alike = {w: _correlation(np.abs(turn(h, w)), theirs) for w in ways if turn(h, w).shape == theirs.shape}
     best = max(alike, key=lambda w: alike[w], default=None)
-    if best is None or alike[best] < _ALIKE:
+    if best is None or not alike[best] >= _ALIKE:
         notices.append(f"{scan.scan}: the image made here does not show what sar_h.npy shows; left out")
         return None
     return replace(scan, h=turn(h, best), v=turn(v, best))

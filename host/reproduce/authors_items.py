@@ -128,7 +128,10 @@ class Judgements:
         if key not in self._scores:
             several = repeated(samples)
             mixed = score(_halved(samples), model, channels, by_pixel=True)
-            self._scores[key] = mixed, None if several is None else score(several, model, channels)
+            self._scores[key] = (
+                mixed,
+                (None if several is None else score(several, model, channels, folds=np.unique(several.groups).size)),
+            )
         return self._scores[key]
 
 

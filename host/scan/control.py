@@ -80,9 +80,10 @@ class ControlDesk:
         path.unlink()
         if wish in (Wish.PAUSE, Wish.CONTINUE):
             self._stop.paused = wish is Wish.PAUSE
-        else:
+        elif wish is Wish.ABORT:
             self._stop.request()
-        if wish is Wish.ABORT:
+            self._stop.request()
+        elif not self._stop.after_row:  # asked twice is still after the row: a double click must not cut it
             self._stop.request()
 
     def _clear(self) -> None:

@@ -190,13 +190,13 @@ def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
 def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
     """Sequence number of the row's first packet, which may itself be lost.
 
-    1 when the numbers fit a record that starts at 1 (the card's counters usually do). Else, where lost packets are in
-    the file, as many before the first that arrived as the file begins with packets of zeros; where they are not,
-    counted back from a short last packet if no position is missing; else the first that arrived.
+    1 (or 0) when the numbers fit a record that starts there (the card's counters usually start at 1). Else, where lost
+    packets are in the file, as many before the first that arrived as the file begins with packets of zeros; where they
+    are not, counted back from a short last packet if no position is missing; else the first that arrived.
     """
     expected, first = -(-shape.bytes // full), int(log.sequence[0])
     if log.sequence[-1] <= expected:
-        return 1
+        return min(1, first)  # a log may count from 0
     if zero_filled is not None:
         return first - int(np.argmin(np.append(_silent(zero_filled, full), False)))
     complete = _pauses(log.at_s, shape.positions - 1).size == shape.positions - 1

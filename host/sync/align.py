@@ -127,7 +127,8 @@ def _align(
     n = good.sum(axis=1)
     level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     others = n[:, None] - good
-    amplitude = np.abs(product) / np.maximum(others, 1) / level
+    # A chirp that has no other is the mean itself.
+    amplitude = np.where(others > 0, np.abs(product) / np.maximum(others, 1) / level, 1.0)
     # What a chirp differs by from the mean of the others, it differs by less from the mean of all.
     part = others / np.maximum(n, 1)[:, None]
     correction, shift = part * off, part * np.angle(product)

@@ -8,6 +8,8 @@ four samples of four RX fill one vector of sixteen. All of a chirp fits the firs
 from __future__ import annotations
 
 import math
+from contextlib import suppress
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -17,6 +19,19 @@ from host.sync.plain import FOLD
 RX = 4
 LANES = FOLD * RX  # samples that are averaged, of every RX
 
+
+def _forget_stale() -> None:
+    """Numba sees that the file of a cached function changed, but not the files of what was compiled into it."""
+    here = Path(__file__).parent
+    with suppress(OSError):  # an installation that cannot be written cannot be edited either
+        newest = max((here / f"{name}.py").stat().st_mtime for name in ("compiled", "kernels", "plain", "tone"))
+        for name in ("compiled", "kernels"):
+            for index in (here / "__pycache__").glob(f"{name}.*.nbi"):
+                if index.stat().st_mtime < newest:
+                    index.unlink(missing_ok=True)
+
+
+_forget_stale()
 compiled = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 
 

@@ -7,6 +7,7 @@ import pytest
 from host.calibration.files import BoardFilter, FilterFile, MetalFile, PlacesFile, SourceScan, head, read, write
 from host.calibration.in_force import keep_in_scan, load_calibration, of_rig, of_scan
 from host.calibration.metal import write_metal
+from host.imaging.grid import image_grid
 from host.polarimetry import plane_reference
 from host.store.scanfolder import ScanFolder
 from host.store.validate import validate
@@ -22,12 +23,12 @@ def filter_file(corner_khz=180.5):
     return FilterFile(**head("hpf", SOURCES), boards={"RH": board, "RV": board})
 
 
-def metal_reference(seed=0):
-    rng = np.random.default_rng(seed)
-    axis = np.arange(40) * 2e-3
-    gain = (1 + 0.2 * axis[:, None] / axis[-1]) * np.exp(1j * axis / axis[-1])
-    noise = 1 + 0.02 * (rng.standard_normal((2, 40, 40)) + 1j * rng.standard_normal((2, 40, 40)))
-    return plane_reference(gain * noise[0], 0.7 * noise[1], axis, axis, smooth_mm=4.0, name="plate")
+def metal_reference(rig, seed=0):
+    rng, grid = np.random.default_rng(seed), image_grid(rig)
+    y, x = np.meshgrid(np.linspace(0, 1, grid.y_m.size), np.linspace(0, 1, grid.x_m.size), indexing="ij")
+    gain = (1 + 0.2 * y) * np.exp(1j * x)
+    noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))
+    return plane_reference(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, smooth_mm=4.0, name="plate")
 
 
 def named(make_rig, **files) -> Instrument:
@@ -82,7 +83,7 @@ def test_without_files_nothing_changes(make_rig):
 
 def test_a_scan_keeps_what_it_was_taken_with(tmp_path, make_rig):
     path = write(filter_file(), tmp_path / "c")
-    metal = write_metal(metal_reference(), SOURCES, tmp_path / "c")
+    metal = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "c")
     rig = named(make_rig, hpf=path, metal=metal)
     scan = create(tmp_path / "scan", rig)
     assert sorted(scan.facts("scan_started")[0]["calibration"]) == ["hpf", "metal"]
@@ -94,6 +95,22 @@ def test_a_scan_keeps_what_it_was_taken_with(tmp_path, make_rig):
     assert again.filters == before.filters == filter_file_as(before)
     np.testing.assert_array_equal(again.reference().h, before.reference().h)
     assert set(again.facts()) == {"hpf", "metal"}
+
+
+def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig):
+    hpf, metal = write(filter_file(), tmp_path / "a"), write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "b")
+    metal = metal.rename(metal.with_name("latest.toml"))
+    calibration = of_scan(
+        create(tmp_path / "s", named(make_rig, hpf=hpf.rename(hpf.with_name("latest.toml")), metal=metal))
+    )
+    assert set(calibration.facts()) == {"hpf", "metal"}
+
+
+def test_metal_of_other_pixels_is_refused_before_the_scan_and_not_after(tmp_path, make_rig):
+    moved = make_rig(geometry={"object_distance_mm": make_rig().geometry.object_distance_mm + 5.0})
+    metal = write_metal(metal_reference(moved), SOURCES, tmp_path / "c")
+    with pytest.raises(DataError, match="different pixels"):
+        create(tmp_path / "s", named(make_rig, metal=metal))
 
 
 def filter_file_as(calibration):
@@ -126,8 +143,8 @@ def test_a_file_that_is_not_there_is_named_before_anything_is_made(tmp_path, mak
     assert not (tmp_path / "scan").exists()
 
 
-def test_a_metal_reference_survives_its_file(tmp_path):
-    reference = metal_reference()
+def test_a_metal_reference_survives_its_file(tmp_path, make_rig):
+    reference = metal_reference(make_rig())
     path = write_metal(reference, SOURCES, tmp_path)
     again = load_calibration({"metal": path}).reference()
     for name in ("h", "v", "valid", "x_m", "y_m"):
@@ -137,9 +154,9 @@ def test_a_metal_reference_survives_its_file(tmp_path):
     assert read(path, MetalFile, "metal").ratio_variation_deg > 1
 
 
-def test_images_that_were_exchanged_are_noticed(tmp_path):
-    path = write_metal(metal_reference(), SOURCES, tmp_path / "one")
-    other = write_metal(metal_reference(1), SOURCES, tmp_path / "two")
+def test_images_that_were_exchanged_are_noticed(tmp_path, make_rig):
+    path = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "one")
+    other = write_metal(metal_reference(make_rig(), 1), SOURCES, tmp_path / "two")
     path.with_suffix(".npz").write_bytes(other.with_suffix(".npz").read_bytes())
     with pytest.raises(DataError, match="not the images"):
         load_calibration({"metal": path}).reference()

@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from host.calibration.direct_signal import unwrapped
 from host.calibration.files import StartFile, read
 from host.calibration.start_frequency import by_geometry, start_of
 from host.cli import main
@@ -33,6 +34,18 @@ def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_midd
         seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
         found = start_of(rig, board, true_hz + rng.uniform(-0.4, 0.4) * rate, seen, 1.0, 10)
         assert true_hz + found.start_offset_hz - board.start_offset_hz == pytest.approx(middle, abs=1.0)
+
+
+@pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
+def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_mode):
+    """Law: wrapped into the band and unwrapped again, IFs are what they were, whole sample rates apart at most."""
+    rig = make_rig(chirp={"if_mode": if_mode})
+    rate, rng = rig.chirp.sample_rate_hz, np.random.default_rng(5)
+    for centre in np.linspace(-1, 1, 9) * rate:
+        true_hz = centre + 0.03 * rate * rng.standard_normal(64)
+        seen = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
+        apart = (unwrapped(seen, rig) - true_hz) / rate
+        np.testing.assert_allclose(apart, np.round(apart[0]), atol=1e-9)
 
 
 def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):

@@ -22,6 +22,15 @@ from host.scan.run import HARDWARE_BACKEND
 from shared.config import to_builtins
 from shared.messages import HelloReply
 
+# --- the command ---
+
+
+def test_to_move_is_to_pulse(capsys):
+    """Each point of the row that moves is a burst: asking for neither and one at once is refused."""
+    assert main(["doctor", "--config", str(RIG), "--move", "--no-pulse"]) != 0
+    assert "leave one of them out" in capsys.readouterr().err
+
+
 # --- the rig file ---
 
 

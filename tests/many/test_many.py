@@ -2,7 +2,6 @@
 
 import json
 import sys
-import time
 from argparse import Namespace
 from pathlib import Path
 
@@ -127,9 +126,7 @@ def test_ended_early_its_programs_end_too(tmp_path):
     results = many.run_here(todo, 2)
     first = next(results)  # slow2, which is not slow
     assert (first.name, first.status) == ("slow2", "done")
-    began = time.monotonic()
-    results.close()
-    assert time.monotonic() - began < 300  # and not the 600 s that it sleeps
+    results.close()  # else this takes the 600 s that it sleeps, more than a test may
     assert not finished(todo[0])
 
 

@@ -37,7 +37,9 @@ def test_wishes_are_heard_once(desk):
     assert not stop.after_row
     ask(folder, Wish.STOP)
     assert (stop.after_row, stop.now) == (True, False)
-    ask(folder, Wish.STOP)  # twice is now, as with Ctrl-C
+    ask(folder, Wish.STOP)  # a double click, or two phones
+    assert (stop.after_row, stop.now) == (True, False)
+    ask(folder, Wish.ABORT)
     assert stop.now
 
 

@@ -18,7 +18,7 @@ def options_of(args: argparse.Namespace) -> Options:
     """What the options of :func:`add_material_options` ask for."""
     from host.options import Options
 
-    return Options(metal_box_mm=args.metal, library=args.library, model=args.model)
+    return Options(metal_box_mm=args.metal, library=args.library, model=args.model, labels=args.labels)
 
 
 def rig_file(args: argparse.Namespace) -> Path | None:
@@ -62,5 +62,13 @@ def add_material_options(sub: argparse.ArgumentParser) -> None:
         type=box,
         metavar="X,Y,W,H",
         help="metal reference: place and size, mm from the image centre, e.g. --metal=-60,0,40,40 (default: found)",
+    )
+    sub.add_argument(
+        "--labels",
+        type=Path,
+        default=None,
+        metavar="FILE",
+        help="boxes drawn by hand, instead of patches that are found: labels.json of earlier products, edited, or the"
+        " authors' label file; a box named metal or copper is the reference",
     )
     add_model_option(sub, none=True)

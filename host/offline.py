@@ -21,7 +21,7 @@ from host.many import MARK
 from host.materials import Library, TrainingScan, TruthPlate, make_library, patches_from_labels, read_truth
 from host.options import LIBRARY, Options
 from host.pipeline import Pipeline
-from host.products import Products, write_images, write_quality
+from host.products import LABELS, Products, write_images, write_quality
 from host.report import write_json
 from host.report.focus import focus_figure
 from host.report.scan_facts import SCAN, write_scan_facts
@@ -33,7 +33,7 @@ from shared.config import load_instrument
 from shared.errors import ConfigError, DataError, ScanError
 
 TRUTH = "truth.json"
-PRODUCTS = ("image.npz", SCAN, "quality.json", "materials.json", "patches.npz", "report.html", "figures")
+PRODUCTS = ("image.npz", SCAN, "quality.json", "materials.json", "patches.npz", LABELS, "report.html", "figures")
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
 

@@ -106,6 +106,7 @@ class Pipeline:
         classifier: Classifier | None = None,
         plates: tuple[TruthPlate, ...] = (),
         segmentation: Segmentation | None = None,
+        metal_label: int | None = None,
         reference: PlaneReference | None = None,
         incidence: Incidence = "one",
     ) -> MaterialsResult:
@@ -123,6 +124,7 @@ class Pipeline:
                 theta_rad=angles.used_rad,
                 classifier=classifier,
                 metal_box_mm=metal_box_mm,
+                metal_label=metal_label,
                 leakage=leakage,
                 smooth_px=rig.polarimetry.smooth_px,
                 plates=plates,
@@ -153,7 +155,8 @@ class Pipeline:
         write_quality(out, self.quality.to_dict(**self.quality_notes))
         classifier = options.classifier(self.rig)
         reference = options.reference
-        if reference is None and options.metal_box_mm is None:
+        boxes, names, metal = options.drawn(images)
+        if reference is None and options.metal_box_mm is None and metal is None:
             reference = self.calibration.reference()
         if reference is not None:
             reference.check_axes(images.x_m, images.y_m)
@@ -163,8 +166,11 @@ class Pipeline:
             options.metal_box_mm,
             classifier,
             plates,
+            segmentation=boxes,
+            metal_label=metal,
             reference=reference,
             incidence=options.incidence,
         )
+        found = replace(found, boxes=names)
         quality = self.quality.to_dict(pixel_accuracy=pixel_accuracy(found), **self.quality_notes)
         return write_materials(out, self.source, images, found, classifier, quality, plates, self.rig)

@@ -1,4 +1,4 @@
-"""What a processed scan leaves behind: image.npz, quality.json, materials.json, report.html and figures/."""
+"""What a processed scan leaves behind: image.npz, quality.json, materials.json, labels.json, report.html, figures/."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 from host.imaging import ChannelImages
 from host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
+from host.materials.labels import labels_of, write_labels
 from host.materials.patches import PATCHES, pack_patches
 from host.polarimetry import ratio
 from host.report import write_image, write_json, write_report
@@ -20,6 +21,7 @@ from host.store.source import Scan
 from shared.config import Instrument
 from shared.geometry import incidence_deg
 
+LABELS = "labels.json"
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
 
 
@@ -63,6 +65,7 @@ def write_materials(
     c = found.calibrated
     write_image(out / "image.npz", c.h, c.v, c.p, images.x_m, images.y_m, images.valid)
     write_quality(out, quality)
+    write_labels(out / LABELS, labels_of(found), f"patches of scan {source.scan_id}, in pixels of image.npz")
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, source.simulated))
     rows = found.rows()
     named_by = classifier_sentence(classifier) if classifier else "Nothing was named."

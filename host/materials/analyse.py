@@ -54,6 +54,8 @@ class MaterialsResult:
         Incidence angle, a number or [ny, nx].
     bands
         Patch number to its ratios in sub-bands of the sweep (:mod:`host.materials.subbands`); empty when not asked for.
+    boxes
+        Patch number to the name of the box drawn by hand; empty when the patches were found.
     """
 
     calibrated: Calibrated
@@ -65,6 +67,7 @@ class MaterialsResult:
     patches: tuple[PatchResult, ...]
     theta_rad: npt.NDArray[np.float64]
     bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
+    boxes: dict[int, str] = field(default_factory=dict)
 
     def rows(self) -> list[dict[str, Any]]:
         """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""
@@ -82,6 +85,8 @@ class MaterialsResult:
         row["amplitude_h"] = round(float(np.median(level)), 6) if level.size else None
         if r.patch.label in self.bands:
             row["bands"] = self.bands[r.patch.label]
+        if r.patch.label in self.boxes:
+            row["box"] = self.boxes[r.patch.label]
         return row
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from host.materials.analyse import MaterialsResult
 from host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
 from shared.errors import DataError
 
@@ -47,6 +48,19 @@ def write_labels(path: Path, boxes: dict[str, Box], description: str = "") -> No
     """Write a label file that :func:`read_labels` reads back."""
     text = json.dumps({"description": description, "labels": {n: list(b) for n, b in boxes.items()}}, indent=1)
     path.write_text(text + "\n", encoding="utf-8")
+
+
+def labels_of(found: MaterialsResult) -> dict[str, Box]:
+    """Boxes around the insides of a result's patches, in pixels, called what each was drawn or named; all differ."""
+    out: dict[str, Box] = {}
+    for r in found.patches:
+        named = r.verdict.name if r.verdict is not None else None
+        name = found.boxes.get(r.patch.label) or ("metal" if r.patch.label == found.metal.label else named or "patch")
+        inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
+        rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+        key = name if name not in out else f"{name} ({r.patch.label})"
+        out[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
+    return out
 
 
 def patches_from_labels(

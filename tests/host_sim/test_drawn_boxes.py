@@ -1,0 +1,59 @@
+"""Boxes drawn by hand instead of patches that are found."""
+
+import json
+
+import numpy as np
+import pytest
+
+from host.materials import Classifier, Library
+from host.materials.labels import labels_of, read_labels, write_labels
+from host.options import LIBRARY, Options
+
+pytestmark = pytest.mark.xdist_group("host_sim")
+
+
+@pytest.fixture
+def found(imaged):
+    scan = imaged("nine-materials")
+    return scan.pipeline.find_materials(scan.images, None, Classifier(Library.load(LIBRARY)), scan.plates)
+
+
+def again(scan, path, plates=()):
+    boxes, names, metal = Options(labels=path).drawn(scan.images)
+    return scan.pipeline.find_materials(
+        scan.images, None, Classifier(Library.load(LIBRARY)), plates, segmentation=boxes, metal_label=metal
+    ), names
+
+
+def test_labels_of_products_given_back_find_the_same_materials(imaged, found, tmp_path):
+    scan = imaged("nine-materials")
+    write_labels(tmp_path / "labels.json", labels_of(found))
+    boxes = read_labels(tmp_path / "labels.json")
+    assert len(boxes) == len(found.patches) == 9
+    second, names = again(scan, tmp_path / "labels.json", scan.plates)
+    assert names[second.metal.label] == "metal"
+    assert [p.truth.name for p in second.patches] == [p.truth.name for p in found.patches]
+    for p in second.patches:
+        assert p.patch.label == second.metal.label or p.verdict.name == p.truth.name
+
+
+def test_a_box_is_only_what_was_drawn(imaged, tmp_path):
+    """Two boxes, neither more nor less; the one named copper is the reference, with its pixels' ratio of 1."""
+    scan = imaged("nine-materials")
+    copper = next(p for p in scan.plates if p.metal)
+    other = next(p for p in scan.plates if not p.metal)
+    x, y = scan.images.x_m * 1e3, scan.images.y_m * 1e3
+    x, y = x - (x[0] + x[-1]) / 2, y - (y[0] + y[-1]) / 2
+
+    def pixels(box_mm):
+        x0, y0, x1, y1 = box_mm
+        inside = [np.flatnonzero((a >= low + 8) & (a <= high - 8)) for a, low, high in ((x, x0, x1), (y, y0, y1))]
+        return [int(inside[0][0]), int(inside[1][0]), int(inside[0][-1]) + 1, int(inside[1][-1]) + 1]
+
+    path = tmp_path / "drawn.json"
+    path.write_text(json.dumps({"labels": {"mine": pixels(other.box_mm), "copper foil": pixels(copper.box_mm)}}))
+    result, names = again(scan, path)
+    assert names == {1: "mine", 2: "copper foil"}
+    assert result.metal.label == 2
+    assert np.nanmedian(np.abs(result.p[result.metal.mask])) == pytest.approx(1, abs=0.02)
+    assert result.patches[0].permittivity.value.real == pytest.approx(other.permittivity.real, rel=0.1)

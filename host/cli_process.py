@@ -99,7 +99,7 @@ def _positions(data: Path) -> int:
             s = json.loads((data / COLLECTION).read_text(encoding="utf-8"))
             return int(s["total_x"]) * int(s["total_y"])
         return ScanFolder.load(data).plan.positions
-    except Exception:  # noqa: BLE001 - whatever is wrong with it, its own program will say
+    except (PolysightError, OSError, ValueError, KeyError, TypeError):  # its own program will say what is wrong
         return 350 * 200
 
 

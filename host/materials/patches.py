@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -104,9 +105,9 @@ def read_patches(path: Path) -> SeenPatches:
         ) from None  # fmt: skip
 
 
-def _seen(row: Mapping[str, object], places: Real, features: Real) -> SeenPatch:
-    x, y = row["centre_mm"]  # type: ignore[misc]
-    return SeenPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)  # type: ignore[arg-type]
+def _seen(row: Mapping[str, Any], places: Real, features: Real) -> SeenPatch:
+    x, y = row["centre_mm"]
+    return SeenPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)
 
 
 def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
@@ -117,13 +118,12 @@ def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
     """
     out = []
     for patch in scans[0].patches:
-        partners = [_partner(patch, scans[0], other) for other in scans[1:]]
-        if any(p is None for p in partners):
+        partners = [p for other in scans[1:] if (p := _partner(patch, scans[0], other)) is not None]
+        if len(partners) < len(scans) - 1:
             continue
         places = patch.places_mm - patch.centre_mm
         columns, kept = [patch.features], np.ones(len(places), bool)
         for partner in partners:
-            assert partner is not None  # noqa: S101
             theirs = partner.places_mm - partner.centre_mm
             far, at = KDTree(theirs).query(places) if len(theirs) else (np.full(len(places), np.inf), 0)
             kept &= far <= NEAR_MM

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
@@ -189,5 +189,5 @@ def _mirrored_step(step: MountStep) -> MountStep:
     if step.shift_mm is not None:
         x, y, z = step.shift_mm
         return MountStep(shift_mm=(y, x, z))
-    axes = {"x": "y", "y": "x", "z": "z"}
-    return MountStep(turn_deg=-(step.turn_deg or 0.0), about=axes[step.about or "z"])  # type: ignore[arg-type]
+    axes: dict[str, Literal["x", "y", "z"]] = {"x": "y", "y": "x", "z": "z"}
+    return MountStep(turn_deg=-(step.turn_deg or 0.0), about=axes[step.about or "z"])

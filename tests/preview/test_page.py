@@ -112,7 +112,7 @@ def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, wa
         port = view.port
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
     assert "lost" in browser.text("headline")
-    time.sleep(0.5)
+    time.sleep(0.5)  # some of its attempts to come back fail
     with served(watch, port=port):
         browser.wait("!document.body.classList.contains('lost')", "the way back")
         browser.wait("document.getElementById('headline').innerText == 'The scan is finished'", "the state")

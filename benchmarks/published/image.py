@@ -39,7 +39,7 @@ def form_image(
         Points of the range FFT.
     tuned
         The same convolutions in complex64 instead of the complex128 that NumPy makes of a kernel, padded to sizes
-        whose transforms are fast.
+        whose transforms are fast, and summed before the inverse transform.
 
     Returns
     -------
@@ -55,7 +55,8 @@ def form_image(
     precision = np.complex64 if tuned else np.complex128
     full = rows + y.size - 1, columns + x.size - 1
     shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full) if tuned else full
-    image = np.zeros((ny, nx), precision)
+    seen = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
+    image, total = np.zeros((ny, nx), precision), np.zeros(shape, precision)
     for rx in range(n_rx):
         spectrum = np.asarray(scipy.fft.fft(cube[rx, :, :, a:b], points))
         bins = np.round(excess[rx] / SPEED_OF_LIGHT_M_S * chirp.hz_per_sample * points).astype(int)
@@ -63,9 +64,11 @@ def form_image(
         for n in range(int(bins.min()), int(bins.max()) + 1):
             kernel = np.asarray(scipy.fft.fft2(np.where(bins == n, matched, 0), shape))
             slab = np.asarray(scipy.fft.fft2(spectrum[:, :, n % points].astype(precision), shape))
-            whole = np.asarray(scipy.fft.ifft2(kernel * slab))
-            image += whole[rows - 1 : rows - 1 + ny, columns - 1 : columns - 1 + nx]
-    return image
+            if tuned:
+                total += kernel * slab
+            else:
+                image += np.asarray(scipy.fft.ifft2(kernel * slab))[seen]
+    return np.asarray(scipy.fft.ifft2(total))[seen] if tuned else image
 
 
 def _lattice(axis_m: NDArray[np.float64], positions: int) -> NDArray[np.float64]:

@@ -24,11 +24,12 @@ class Synchroniser:
     rig, board
         Rig file and one of its receiving boards: the linear samples, and where the direct path comes from.
     tuned
-        The same steps in complex64 instead of the complex128 that NumPy makes of int16 `I + 1j * Q`, and smaller zooms.
+        The same steps in complex64 instead of the complex128 that NumPy makes of int16 `I + 1j * Q`, smaller zooms, and
+        one transform of the RX's sum instead of the sum of their transforms.
     """
 
     def __init__(self, rig: Instrument, board: Board, tuned: bool = False) -> None:
-        chirp = rig.chirp
+        chirp, self._tuned = rig.chirp, tuned
         self._type, self._zoom = (np.complex64, TUNED_ZOOM) if tuned else (np.complex128, ZOOM)
         self._chirp, (self._a, self._b) = chirp, chirp.linear_samples
         sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
@@ -76,6 +77,8 @@ class Synchroniser:
         found = [(0.0, 0.0)]
         for chirp in chirps[1:]:
             quotient = chirp[:, self._a : self._b] / reference
+            if self._tuned:
+                quotient = quotient.sum(axis=0, keepdims=True)
             spectrum = np.asarray(scipy.fft.fft(quotient, FFT)).sum(axis=0)
             peak = int(np.argmax(np.abs(spectrum)))
             frequency = (peak if peak < FFT // 2 else peak - FFT) / FFT

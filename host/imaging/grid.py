@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from host.imaging.model import excess_path_m
 from shared.config import Board, Instrument
 from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.raster import Row, mean_burst_travel_mm
+from shared.raster import Row, mean_burst_travel_mm, plan_raster
 
 
 @dataclass(frozen=True)
@@ -84,5 +84,14 @@ def row_offsets_m(rig: Instrument, row: Row) -> NDArray[np.float64]:
     The stage does not stop: a burst is centred half its duration after the trigger point, so even and odd rows differ.
     """
     travel = row.direction * mean_burst_travel_mm(rig.burst, rig.stage)
-    x = np.array([row.x_mm(i) + travel for i in range(row.points)])
+    x = row.x_start_mm + np.arange(row.points) * row.step_mm + travel
     return np.stack([x, np.full(row.points, row.y_mm)], axis=1) / 1e3
+
+
+def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
+    """The same of all rows, metres [row, column, 3], columns from the smallest x."""
+    plan = plan_raster(rig.grid)
+    out = np.zeros((plan.rows, plan.columns, 3))
+    for row in plan:
+        out[row.index, :, :2] = row_offsets_m(rig, row)[:: row.direction]
+    return out

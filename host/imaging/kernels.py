@@ -33,12 +33,19 @@ def kept(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
 def _bytes(arrays: Any) -> int:
     if isinstance(arrays, tuple):
         return sum(_bytes(a) for a in arrays)
-    return math.prod(arrays.shape) * 8
+    return math.prod(getattr(arrays, "shape", (0,))) * 8  # a lattice is small
 
 
 def forget() -> None:
     """Drop every kept spectrum."""
     _kept.clear()
+
+
+def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
+    """All that a lattice depends on."""
+    a, grid = aperture.antennas, aperture.grid
+    numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, aperture.offsets_m, grid.x_m, grid.y_m)
+    return ("lattice", slack_m, float(grid.z_m), grid.pixel_m, *(n.tobytes() for n in numbers))
 
 
 def key_of(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:

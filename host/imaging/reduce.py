@@ -15,6 +15,7 @@ away: its amplitude is the generalised least-squares estimate with the gate as c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,7 @@ def scene_gate_m(
     return float(excess.min()), float(excess.max())
 
 
+@lru_cache(maxsize=8)
 def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann", extra: int = 6) -> Reduction:
     """Build the maps of a gate.
 

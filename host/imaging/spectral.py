@@ -16,7 +16,7 @@ import numpy as np
 
 from host.imaging.aperture import Aperture, row_starts_m
 from host.imaging.arrays import fft_of
-from host.imaging.kernels import kept, key_of, spectra_along_x
+from host.imaging.kernels import kept, key_of, lattice_key, spectra_along_x
 from host.imaging.lattice import Lattice, lattice
 
 
@@ -35,10 +35,10 @@ class RowSpectra:
 
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         self.aperture, self.xp, self.device = aperture, xp, device
-        self.lattice: Lattice = lattice(aperture, slack_m)
+        self.lattice: Lattice = kept(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
         self._fft = fft_of(xp)
-        self._period = self.lattice.size_x // self.lattice.stride_x
-        self._take = self.put(self.lattice.band % self._period)
+        self.period = self.lattice.size_x // self.lattice.stride_x
+        self._take = self.put(self.lattice.band % self.period)
         self._origin = float(row_starts_m(aperture.offsets_m).min())
         at = aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
         wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, at)) / self.lattice.size_x
@@ -63,7 +63,7 @@ class RowSpectra:
 
     def of_rows(self, rows: Any, ramps: Any) -> Any:
         """Spectra of rows [..., row, column] in the kernel's band, [..., row, k]; a row of step s repeats s times."""
-        whole = self._fft.fft(rows, n=self._period, axis=-1)
+        whole = self._fft.fft(rows, n=self.period, axis=-1)
         return self.xp.take(whole, self._take, axis=-1) * ramps
 
     def to_rows(self, spectra: Any, ramps: Any) -> Any:
@@ -71,8 +71,8 @@ class RowSpectra:
         xp, count, columns = self.xp, self.lattice.band.size, self.aperture.offsets_m.shape[1]
         rest = xp.zeros((*spectra.shape[:-1], self.lattice.size_x - count), dtype=xp.complex64, device=self.device)
         whole = xp.roll(xp.concat([spectra * xp.conj(ramps), rest], axis=-1), int(self.lattice.band[0]), axis=-1)
-        folded = xp.sum(xp.reshape(whole, (*spectra.shape[:-1], self.lattice.stride_x, self._period)), axis=-2)
-        return self._fft.ifft(folded, axis=-1)[..., :columns] * self._period
+        folded = xp.sum(xp.reshape(whole, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
+        return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
 
     def of_pixels(self, image: Any) -> Any:
         """Adjoint of :meth:`to_pixels`: [..., ny, nx] to [..., ny, k]."""
@@ -92,7 +92,9 @@ class SpectralImager(RowSpectra):
         self._echo: Any = None  # the last constant echo, and its kernel
         sizes, rows, lines = self.lattice, aperture.offsets_m.shape[0], aperture.grid.shape[0]
         self._last = sizes.row_stride * (rows - 1)  # where the first row of pixels comes out
-        self._repeat = self.put(np.arange(sizes.size_y) % (sizes.size_y // sizes.row_stride))
+        count = sizes.size_y // sizes.row_stride
+        self._tall = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)  # zeros below rows
+        self._repeat = self.put(np.arange(sizes.size_y) % count)
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
         self._pixel_rows = self.put(self._last + np.arange(lines) * sizes.pixel_stride)
         self._kernels = kept(
@@ -151,8 +153,8 @@ class SpectralImager(RowSpectra):
 
     def _along_y(self, lines: Any) -> Any:
         """2-D spectrum on the lattice [ky, k], of the rows' spectra [row, k]; a row distance of s repeats s times."""
-        count = self._repeat.shape[0] // self.lattice.row_stride
-        whole = self._fft.fft(lines, n=count, axis=0)
+        self._tall[: lines.shape[0], :] = lines
+        whole = self._fft.fft(self._tall, axis=0)
         return whole if self.lattice.row_stride == 1 else self.xp.take(whole, self._repeat, axis=0)
 
     def _inverse(self, total: Any) -> Any:

@@ -9,7 +9,7 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from host.imaging.aperture import Aperture
-from host.imaging.grid import Antennas, image_grid, row_offsets_m
+from host.imaging.grid import Antennas, image_grid, scan_offsets_m
 from host.imaging.images import TAPERS
 from host.imaging.reduce import Window, reduction, scene_gate_m
 from host.imaging.resolution import PointResponse, point_response
@@ -149,9 +149,7 @@ def aperture_of(rig: Instrument) -> tuple[Aperture, Real]:
     plan, grid = plan_raster(rig.grid), image_grid(rig)
     antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
     frequencies = reduction(rig.chirp, scene_gate_m(antennas, plan, grid), _FAST_TIME_WINDOW).frequencies_hz
-    rows = [row_offsets_m(rig, row)[:: row.direction] for row in plan]
-    offsets = np.pad(np.stack(rows), ((0, 0), (0, 0), (0, 1)))
-    return Aperture(antennas[0], offsets, frequencies, grid), np.outer(*_tapers(rig))
+    return Aperture(antennas[0], scan_offsets_m(rig), frequencies, grid), np.outer(*_tapers(rig))
 
 
 def _tapers(rig: Instrument) -> tuple[Real, Real]:

@@ -8,11 +8,10 @@ import pytest
 from host.imaging import backproject, project
 from host.imaging.aperture import Aperture
 from host.imaging.direct import DirectImager
-from host.imaging.grid import Antennas, image_grid, row_offsets_m
+from host.imaging.grid import Antennas, image_grid, scan_offsets_m
 from host.imaging.incremental import IncrementalImager
 from host.imaging.spectral import SpectralImager
 from shared.errors import ConfigError
-from shared.raster import plan_raster
 
 
 def _strict():
@@ -43,8 +42,7 @@ def library(request):
 def aperture(make_rig):
     rig = make_rig(15, 6, 4.0, 4.0, (12, 10))
     grid, antennas = image_grid(rig), Antennas.of(rig, rig.receivers[0])
-    offsets = [np.pad(row_offsets_m(rig, r)[:: r.direction], ((0, 0), (0, 1))) for r in plan_raster(rig.grid)]
-    return Aperture(antennas, np.stack(offsets), np.linspace(76.3e9, 79.7e9, 7), grid)
+    return Aperture(antennas, scan_offsets_m(rig), np.linspace(76.3e9, 79.7e9, 7), grid)
 
 
 def _back(array):

@@ -8,7 +8,7 @@ import pytest
 from host.imaging import image_grid
 from host.imaging.aperture import Aperture, irregular
 from host.imaging.direct import DirectImager
-from host.imaging.grid import Antennas, row_offsets_m
+from host.imaging.grid import Antennas, scan_offsets_m
 from host.imaging.imager import choose_imager
 from host.imaging.incremental import IncrementalImager
 from host.imaging.kernels import forget
@@ -38,7 +38,7 @@ def aperture(make_rig):
         rig = make_rig(columns, rows, step_x, step_y, pixels, pixel)
         plan, grid = plan_raster(rig.grid), image_grid(rig)
         antennas = Antennas.of(rig, rig.receivers[board])
-        offsets = np.stack([np.pad(row_offsets_m(rig, r)[:: r.direction], ((0, 0), (0, 1))) for r in plan])
+        offsets = scan_offsets_m(rig)
         if shifts_m is not None:
             offsets[..., 0] += np.asarray(shifts_m)[:, None]
         gate = reduction(rig.chirp, scene_gate_m((antennas,), plan, grid))
@@ -195,7 +195,7 @@ def test_a_curved_surface_is_imaged_where_it_is(aperture):
 
 def test_steps_without_a_common_measure_are_named(make_rig):
     rig = make_rig(5, 5, step_y=2.137)
-    plan, grid = plan_raster(rig.grid), image_grid(rig)
-    offsets = np.stack([np.pad(row_offsets_m(rig, r)[:: r.direction], ((0, 0), (0, 1))) for r in plan])
+    grid = image_grid(rig)
+    offsets = scan_offsets_m(rig)
     reason = irregular(Aperture(Antennas.of(rig, rig.receivers[0]), offsets, np.array([77e9]), grid))
     assert "no common measure" in reason

@@ -60,10 +60,16 @@ firmware: $(VENV)/installed  ## build the sketch for an UNO with avr-gcc
 flash: firmware  ## flash it: make flash PORT=/dev/ttyACM0
 	$(MAKE) -C arduino_stage flash PORT=$(PORT)
 
-pi-install:  ## install the Pi half on a Pi: make pi-install HOST=pi@polysight
+ON_PI := .cache/polysight-install
+pi-install: $(VENV)/installed  ## install or update the Pi half on a Pi: make pi-install HOST=pi@polysight
 	@test -n "$(HOST)" || { echo "make pi-install HOST=user@address"; exit 2; }
-	tar -c --exclude=__pycache__ --exclude='*.egg-info' shared pi_controller instrument.toml | ssh $(HOST) 'rm -rf polysight && mkdir polysight && tar -x -C polysight'
-	ssh -t $(HOST) sudo polysight/pi_controller/install.sh
+	rm -rf $(OUT)/pi && mkdir -p $(OUT)/pi/sources
+	tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=build shared pi_controller | tar -x -C $(OUT)/pi/sources
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/shared $(OUT)/pi/sources/pi_controller
+	cp pi_controller/install.sh pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
+	tar -c -C $(OUT)/pi/copied . | ssh $(HOST) 'rm -rf $(ON_PI) && mkdir -p $(ON_PI) && tar -x -C $(ON_PI)'
+	ssh -t $(HOST) sudo $(ON_PI)/install.sh
 
-clean:  ## remove what was built
-	rm -rf $(VENV) $(OUT) arduino_stage/build
+clean:  ## remove what was built; products (OUT=out) stay
+	rm -rf $(VENV) arduino_stage/build
+	@test ! -e $(OUT) || echo "$(OUT)/ stays: products are in it, perhaps the only ones of a scan; remove it yourself"

@@ -21,9 +21,10 @@ from benchmarks.measure import machine
 from benchmarks.table import add_arguments as add_common
 from benchmarks.table import write
 from host.scan.pi_client import PiClient
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
 from shared.messages import BeginRun, Capture, RowFinished
 from shared.raster import plan_raster
+from shared.tables import to_builtins
 from shared.wires import WireClient, WireEdge
 from simulators import gpio
 

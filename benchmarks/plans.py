@@ -41,7 +41,6 @@ from simulators.simulate import row_offsets_mm, truth
 
 ROOT = Path(__file__).parents[1]
 ITERATIONS = 40
-STRENGTH = 0.002  # at 0.01 plates that hardly reflect in V shrink, and are named wrong
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilde
             frames, valid = row_words(payload, [], len(x), rig.chirp.samples)
             synced = synchronise_row(frames, valid, setup)
             true.add_row(board.name, row.index, synced)
-            triggers = np.array([(row.x_mm(i) / 1e3, row.y_mm / 1e3) for i in range(row.points)])
+            triggers = np.stack([row.x_mm, np.full(row.points, row.y_mm)], axis=1) / 1e3
             nominal.add_row(board.name, row.index, synced, triggers)
         tell(f"  {board.name} done")
     return true, nominal
@@ -93,14 +92,14 @@ def thinned(builder: ImageBuilder, every: int, rebuilt: bool) -> ChannelImages:
         kept[::every] = True
         board.keep(kept)
         if rebuilt:
-            raw.append(predicted(board, reconstruct(board, ITERATIONS, STRENGTH).image, weights[name]))
+            raw.append(predicted(board, reconstruct(board, ITERATIONS).image, weights[name]))
     images = builder.finish()
     for name, board in builder.boards.items():
         board.valid[:] = valid[name]
     if not rebuilt:
         return images
     flat = [
-        np.divide(r, w, out=np.zeros_like(r), where=whole.valid)
+        np.divide(r, w, out=np.zeros_like(r), where=whole.valid).conj()
         for r, w in zip(raw, (whole.h_footprint, whole.v_footprint), strict=True)
     ]
     return replace(whole, h=flat[0], v=flat[1], h_raw=raw[0], v_raw=raw[1])

@@ -84,7 +84,7 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
             board.valid[:] = good
             board.keep(kept)
             matched = board.image()[0]
-            found = predicted(board, reconstruct(board, iterations, strength=0.01).image, weight)
+            found = predicted(board, reconstruct(board, iterations).image, weight)
             errors.append([np.linalg.norm(image - full) / np.linalg.norm(full) for image in (matched, found)])
         plain, rebuilt = np.mean(errors, axis=0)
         out.append((name, share * minutes, float(plain), float(rebuilt)))
@@ -93,7 +93,7 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
 
 def figure(results: dict[str, list[tuple[str, float, float, float]]], path: Path) -> None:
     """Errors against scan time, one panel a scene."""
-    fig = Figure(figsize=(11.0, 4.2), dpi=120, layout="constrained", facecolor="white")
+    fig = Figure(figsize=(11.0, 4.7), dpi=120, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
     for ax, (scene, rows) in zip(fig.subplots(1, len(results), squeeze=False)[0], results.items(), strict=True):
         for i, (name, minutes, plain, rebuilt) in enumerate(rows):
@@ -107,7 +107,9 @@ def figure(results: dict[str, list[tuple[str, float, float, float]]], path: Path
         ax.set_xlabel("scan time (minutes)")
         ax.set_ylabel("image error (%)")
         ax.set_title(f"SIMULATED: {scene}\nfilled: matched filter, open: reconstruction", fontsize=9, loc="left")
-    fig.axes[-1].legend(fontsize=7, frameon=False)
+    fig.legend(
+        *fig.axes[-1].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=False
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(path, metadata={"Software": None})
 

@@ -14,8 +14,9 @@ import msgspec
 
 from host.calibration.files import CalibrationFile, FilterFile, StartFile, head, write
 from host.calibration.rows import facts_of, open_raw
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
 from shared.errors import ConfigError, DataError
+from shared.tables import to_builtins
 
 
 def _tell(path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool) -> int:
@@ -110,14 +111,16 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
     return _tell(path, file, lines, _key("hpf", path), as_json)
 
 
-def metal(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
-    """Gains at every pixel from a scan of a metal plate over the plane. Raises PolysightError."""
+def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
+    """Gains at every pixel from a scan of a metal plate over the plane, in sub-bands too. Raises PolysightError."""
     from host.calibration.files import MetalFile, read
     from host.calibration.metal import write_metal
+    from host.imaging.subbands import sub_bands
     from host.metal_scans import load_reference
 
     source = open_raw(scan, None if config is None else load_instrument(config))
-    path = write_metal(load_reference(scan, config), [facts_of(source, scan)], out)
+    parts = sub_bands(source.instrument.chirp, bands) if bands > 1 else ()
+    path = write_metal(load_reference(scan, config, bands=bands), [facts_of(source, scan)], out, parts)
     file = read(path, MetalFile, "metal")
     lines = [
         f"metal on {100 * file.share_of_plane:.0f} % of the image; elsewhere pixels are masked",
@@ -126,6 +129,11 @@ def metal(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
         f"scatter of its own pixels: {file.spread:.4f}",
         f"images: {file.images}, beside the file",
     ]
+    if file.bands:
+        edges = ", ".join(f"{b.first_hz / 1e9:.2f}..{b.last_hz / 1e9:.2f}" for b in file.bands)
+        lines.append(f"{len(file.bands)} sub-bands kept: {edges} GHz; for process --bands {len(file.bands)} alone")
+    else:
+        lines.append("sub-bands are not kept: calibrate with --bands K for process --bands K")
     return _tell(path, file, lines, _key("metal", path), as_json)
 
 

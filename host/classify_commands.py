@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from host.materials import Classifier, Library, Verdict
 from host.materials.authors import read_materials
-from host.materials.patches import PATCHES, MatchedPatch, match_patches, read_patches
+from host.materials.patches import PATCHES, MatchedPatch, match_patches
 from host.options import LIBRARY
 from host.report.assemble import classifier_sentence
+from host.report.read import SavedProducts, find_products
 from shared.errors import ConfigError, DataError
 
 
@@ -26,8 +27,8 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     Parameters
     ----------
     data
-        Folders that `polysight process` wrote, one for each incidence angle; or a library (.npz), or a folder of the
-        published material files.
+        Folders that `polysight process` wrote, or scan folders, one for each incidence angle; or a library (.npz), or a
+        folder of the published material files.
     library, model
         Of the naming; without: the simulated library, and the model that was chosen for it.
     as_json
@@ -40,15 +41,22 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     DataError
         when something in them cannot be used.
     """
-    scans = [(d / PATCHES).exists() for d in data]
-    if all(scans):
-        return _name(data, library or LIBRARY, model, as_json)
+    scans = [find_products(folder, PATCHES) for folder in data]
+    found = [s for s in scans if s is not None]
+    if len(found) == len(scans):
+        return _name(found, library or LIBRARY, model, as_json)
     if len(data) > 1:
-        other = data[scans.index(False)]
+        other = data[scans.index(None)]
         raise ConfigError(
             f"{other}: not a folder of products", "several scans are named together from what polysight process wrote",
             f"polysight process SCAN --out {other}",
         )  # fmt: skip
+    if library is not None or model is not None:
+        raise ConfigError(
+            f"{data[0]}: no patches of a scan, so --library and --model would do nothing",
+            "they choose what names patches; on a library every model is judged",
+            "leave them out, or give a folder that polysight process wrote",
+        )
     return _judge(data[0], as_json)
 
 
@@ -80,17 +88,19 @@ def _judge(data: Path, as_json: bool) -> int:
         sys.stdout.write(
             f"{held.model:44s}{held.pixels:11.1%}{held.patches:11.1%}{mixed.pixels:12.1%}{mixed.patches:12.1%}\n"
         )
+    if missing := scores[0].not_judged:
+        sys.stdout.write(f"not judged with scans left out, because one scan alone holds them: {', '.join(missing)}\n")
     return 0
 
 
-def _name(folders: Sequence[Path], library_path: Path, model: str | None, as_json: bool) -> int:
+def _name(products: Sequence[SavedProducts], library_path: Path, model: str | None, as_json: bool) -> int:
     library = Library.load(library_path)
-    scans = [read_patches(folder / PATCHES) for folder in folders]
+    scans = [p.patches for p in products]
     classifier = Classifier(library, model=model, angles_deg=[s.angle_deg for s in scans])
     matched = match_patches(scans)
     if not matched:
         raise DataError(
-            f"{folders[-1]}: none of its patches lies where one of {folders[0]} does",
+            f"{products[-1].folder}: none of its patches lies where one of {products[0].folder} does",
             "the object was moved between the scans, or these are scans of other objects",
             "scan the same patches in the same places",
         )

@@ -14,14 +14,15 @@ from host.cli_card import add_card_arguments, card_status
 from host.cli_doctor import add_doctor_command
 from host.cli_export import add_export_command
 from host.cli_materials import add_material_commands
-from host.cli_options import RIG, add_config_option, add_material_options, options_of, positive, rig_file
+from host.cli_numbers import positive
+from host.cli_options import RIG, add_config_option, add_material_options, joined, options_of, rig_file
 from host.cli_plan import add_plan_command
 from host.cli_polarimetry import add_leakage_command, add_polarimetry_options, with_polarimetry
 from host.cli_preview import add_preview_command
 from host.cli_process import add_data_arguments, process_scans
 from host.cli_reproduce import add_reproduce_command
 from host.cli_scan import add_scan_commands
-from shared.errors import DeviceError, PolysightError
+from shared.errors import ConfigError, PolysightError, os_error
 
 Run = Callable[[argparse.Namespace], int]
 
@@ -73,6 +74,12 @@ def _sync_report(args: argparse.Namespace) -> int:
 
 
 def _train(args: argparse.Namespace) -> int:
+    if args.authors is not None and (args.data or args.simulate):
+        raise ConfigError(
+            f"{'DATA' if args.data else '--simulate'} and --authors together",
+            "a library is made of scans of this rig, or of the published files: not of both",
+            "give one of them",
+        )
     if args.authors is not None:
         from host.reproduce.authors_library import train_authors
 
@@ -207,7 +214,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="library to write (.npz)")
 
-    add_material_commands(add, RIG)
+    add_material_commands(add)
     add_reproduce_command(add, RIG)
     add_leakage_command(add, RIG)
     add_preview_command(add)
@@ -239,7 +246,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    args = build_parser().parse_args(argv)
+    args = build_parser().parse_args(joined(sys.argv[1:] if argv is None else argv))
     # Two BLAS threads on two busy cores wait for each other in a spin: ten times slower than one thread each.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM ends as cleanly as Ctrl-C
@@ -256,12 +263,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as e:
-        where = f"{e.filename}: " if e.filename else ""
-        error = DeviceError(
-            f"{where}{e.strerror or e}",
-            "the disk is full, a path is wrong, or you may not write there",
-            "check the path, its permissions and the free space (df -h)",
-        )
+        error = os_error(e)
         sys.stderr.write(f"polysight {args.command}: {error}\n")
         return error.exit_status
 

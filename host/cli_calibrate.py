@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from host.cli_materials import Add
+from host.cli_numbers import count, number
 
 _FORM = argparse.RawDescriptionHelpFormatter
 
@@ -26,7 +27,7 @@ def _hpf(args: argparse.Namespace) -> int:
 def _metal(args: argparse.Namespace) -> int:
     from host.calibration_commands import metal
 
-    return metal(args.scan, args.config, args.out, args.json)
+    return metal(args.scan, args.config, args.bands, args.out, args.json)
 
 
 def _start_frequency(args: argparse.Namespace) -> int:
@@ -35,11 +36,7 @@ def _start_frequency(args: argparse.Namespace) -> int:
     return start_frequency(args.scan, args.config, args.out, args.json)
 
 
-def _millimetres(text: str) -> float:
-    value = float(text)
-    if not 0 < value <= 50:
-        raise argparse.ArgumentTypeError(f"{text} is not a length above 0, at most 50 mm")
-    return value
+_millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 
 
 def add_calibrate_command(add: Add) -> None:
@@ -112,6 +109,13 @@ def add_calibrate_command(add: Add) -> None:
         "polysight calibrate metal scans/metal-plate",
     )
     part.add_argument("scan", type=Path, metavar="SCAN", help="scan of the plate")
+    part.add_argument(
+        "--bands",
+        type=count,
+        default=1,
+        metavar="K",
+        help="keep K sub-bands of the sweep too, for `polysight process --bands K` (default: none)",
+    )
     part = action(
         "start-frequency",
         _start_frequency,

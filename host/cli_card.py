@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from host.cli_numbers import number
+
 _FORM = argparse.RawDescriptionHelpFormatter
 
 
@@ -27,11 +29,7 @@ def _reset(args: argparse.Namespace) -> int:
     return reset_card(args.config, args.board, args.radar)
 
 
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0 <= value <= 3600:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of seconds from 0 to 3600")
-    return value
+_seconds = number(float, "a number of seconds from 0 to 3600", lambda value: 0 <= value <= 3600)
 
 
 def add_card_arguments(card: argparse.ArgumentParser) -> None:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from host.cli_materials import Add
+from host.cli_numbers import number
 from shared.errors import ConfigError
 
 
@@ -20,11 +21,7 @@ def _doctor(args: argparse.Namespace) -> int:
     return doctor(Wanted(args.config, args.out, args.move, args.pulse, args.bursts), args.json)
 
 
-def _bursts(text: str) -> int:
-    value = int(text)
-    if not 1 <= value <= 16:
-        raise argparse.ArgumentTypeError(f"{text} is not a number from 1 to 16")
-    return value
+_bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
 
 
 def add_doctor_command(add: Add, rig: Path) -> None:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from host.cli_polarimetry import count
+from host.cli_numbers import count, number
+from shared.errors import ConfigError
 
 if TYPE_CHECKING:
     from host.materials.layers import Layer
@@ -23,11 +24,32 @@ class Add(Protocol):
         ...
 
 
+def _materials(args: argparse.Namespace) -> int:
+    from host.found_commands import materials
+
+    return materials(args.data, args.json)
+
+
+def _report(args: argparse.Namespace) -> int:
+    from host.found_commands import report
+
+    return report(args.scan)
+
+
 def _permittivity(args: argparse.Namespace) -> int:
     from host.material_commands import permittivity
 
+    given = {"--bands": args.bands, "--amplitude": args.amplitude, "--config": args.config}
+    useless = [name for name, value in given.items() if value is not None]
+    if useless and not args.layer:
+        raise ConfigError(
+            f"{' and '.join(useless)} without --layer would do nothing",
+            "it says how layers are fitted; one interface needs none of it",
+            "add the layers (--layer), or leave it out",
+        )
+    amplitude = 10.0 if args.amplitude is None else args.amplitude
     return permittivity(
-        args.products, args.config, args.layer, args.segment, args.json, args.bands, args.amplitude / 100
+        args.products, args.config, args.layer, args.segment, args.json, args.bands or 1, amplitude / 100
     )
 
 
@@ -62,18 +84,10 @@ def _value(text: str) -> tuple[str, float]:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=PERCENT, e.g. water=0") from None
 
 
-def _percent(text: str) -> float:
-    value = float(text)
-    if not 0 <= value <= 100:
-        raise argparse.ArgumentTypeError(f"{text} is not a percentage from 0 to 100")
-    return value
+_percent = number(float, "a percentage from 0 to 100", lambda value: 0 <= value <= 100)
 
 
-def _share(text: str) -> float:
-    value = float(text)
-    if not 0.5 <= value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a share from 0.5 to below 1")
-    return value
+_share = number(float, "a share from 0.5 to below 1", lambda value: 0.5 <= value < 1)
 
 
 def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
@@ -83,15 +97,36 @@ def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
     sub.add_argument("--model", choices=names, help=told + ("; none names nothing" if none else ""))
 
 
-def add_material_commands(add: Add, rig: Path) -> None:
-    """`polysight permittivity`, `polysight concentration` and `polysight classify`."""
+def add_material_commands(add: Add) -> None:
+    """`materials`, `report`, `permittivity`, `concentration` and `classify`."""
+    sub = add(
+        "materials",
+        _materials,
+        "what the patches of processed scans were named, and their permittivity",
+        "polysight materials out/one",
+    )
+    sub.add_argument(
+        "data", type=Path, nargs="+", metavar="DATA", help="folders that polysight process wrote, or scan folders"
+    )
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+    sub = add(
+        "report",
+        _report,
+        "say where a scan's report is; make it from the raw rows where it is not there",
+        "polysight report scans/one",
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder, or a folder that polysight process wrote")
+
     sub = add(
         "permittivity",
         _permittivity,
         "permittivity of the patches of a processed scan, also of a thin sheet or of a liquid behind a wall",
         "polysight permittivity out/one --segment 3 --layer glass,5.5,0.05,3 --layer liquid,?",
     )
-    sub.add_argument("products", type=Path, metavar="PRODUCTS", help="folder that polysight process wrote")
+    sub.add_argument(
+        "products", type=Path, metavar="PRODUCTS", help="folder that polysight process wrote, or a scan folder"
+    )
     sub.add_argument("--segment", type=int, metavar="N", help="this patch only (default: all)")
     sub.add_argument(
         "--layer",
@@ -105,18 +140,21 @@ def add_material_commands(add: Add, rig: Path) -> None:
     sub.add_argument(
         "--bands",
         type=count,
-        default=1,
         metavar="K",
         help="with --layer: use K sub-bands of the sweep, as processed with --bands K (default: the whole sweep)",
     )
     sub.add_argument(
         "--amplitude",
         type=_percent,
-        default=10.0,
         metavar="PERCENT",
         help="with --layer: how far |H| may be trusted; 0 uses the ratio alone (default: 10)",
     )
-    sub.add_argument("--config", type=Path, default=rig, metavar="FILE", help="rig file of the scan")
+    sub.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="with --layer: take the chirp from this rig file (default: the one the products were made with)",
+    )
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")
 
     sub = add(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from host.cli_materials import add_model_option
+from shared.errors import ConfigError
 
 if TYPE_CHECKING:
     from host.options import Options
@@ -15,10 +18,30 @@ RIG = Path("instrument.toml")
 
 
 def options_of(args: argparse.Namespace) -> Options:
-    """What the options of :func:`add_material_options` ask for."""
+    """What the options of :func:`add_material_options` ask for; the label file is read here.
+
+    Raises
+    ------
+    ConfigError
+        when one of them would do nothing.
+    DataError
+        when the label file is none.
+    """
+    from host.materials.labels import read_labels
     from host.options import Options
 
-    return Options(metal_box_mm=args.metal, library=args.library, model=args.model, labels=args.labels)
+    given = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
+    asked = [name for name, value in given.items() if value is not None]
+    if asked and getattr(args, "no_process", False):
+        raise ConfigError(
+            f"{' and '.join(asked)} with --no-process would do nothing",
+            "it says how the scan is processed, and it will only be recorded",
+            "give it to `polysight process` later, or leave --no-process out",
+        )
+    if args.library is not None and args.model == "none":
+        raise ConfigError("--library with --model none would do nothing", "nothing is named", "leave one of them out")
+    labels = None if args.labels is None else read_labels(args.labels)
+    return Options(metal_box_mm=args.metal, library=args.library, model=args.model, labels=labels)
 
 
 def rig_file(args: argparse.Namespace) -> Path | None:
@@ -39,12 +62,15 @@ def box(text: str) -> tuple[float, float, float, float]:
     return x - w / 2, y - h / 2, x + w / 2, y + h / 2
 
 
-def positive(text: str) -> float:
-    """A number above zero."""
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
-    return value
+def joined(words: Sequence[str]) -> list[str]:
+    """A command line in which numbers that begin with a minus are their option's: `--metal -45,0,40,40` too."""
+    out: list[str] = []
+    for word in words:
+        if out and out[-1].startswith("--") and "=" not in out[-1] and re.fullmatch(r"-[\d.]+(,[-\d.]+)+", word):
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
 
 
 def add_config_option(sub: argparse.ArgumentParser) -> None:
@@ -61,7 +87,7 @@ def add_material_options(sub: argparse.ArgumentParser) -> None:
         "--metal",
         type=box,
         metavar="X,Y,W,H",
-        help="metal reference: place and size, mm from the image centre, e.g. --metal=-60,0,40,40 (default: found)",
+        help="metal reference: place and size, mm from the image centre, e.g. --metal -60,0,40,40 (default: found)",
     )
     sub.add_argument(
         "--labels",

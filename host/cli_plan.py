@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
 from host.cli_materials import Add
+from host.cli_numbers import count, positive
 
 _NUMBERS = (
-    ("--speed-mm-s", float, "stage speed in a row"),
-    ("--pulses", int, "chirps a position"),
-    ("--period-us", float, "time from one chirp of a burst to the next"),
-    ("--step-x-mm", float, "distance of positions in a row; the aperture keeps its size"),
-    ("--step-y-mm", float, "distance of rows; the aperture keeps its size"),
-    ("--columns", int, "positions in a row"),
-    ("--rows", int, "rows"),
-    ("--width-mm", float, "aperture in x"),
-    ("--height-mm", float, "aperture in y"),
-    ("--accel-mm-s2", float, "acceleration of the stage"),
-    ("--object-distance-mm", float, "z of the object plane"),
+    ("--speed-mm-s", positive, "stage speed in a row"),
+    ("--pulses", count, "chirps a position"),
+    ("--period-us", positive, "time from one chirp of a burst to the next"),
+    ("--step-x-mm", positive, "distance of positions in a row; the aperture keeps its size"),
+    ("--step-y-mm", positive, "distance of rows; the aperture keeps its size"),
+    ("--columns", count, "positions in a row"),
+    ("--rows", count, "rows"),
+    ("--width-mm", positive, "aperture in x"),
+    ("--height-mm", positive, "aperture in y"),
+    ("--accel-mm-s2", positive, "acceleration of the stage"),
+    ("--object-distance-mm", positive, "z of the object plane"),
 )
 
 
@@ -30,17 +30,6 @@ def _plan(args: argparse.Namespace) -> int:
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     wanted = Wanted(args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json)
     return plan(args.config, Changes(**{name: getattr(args, name) for name in names}), wanted)
-
-
-def _above_zero(kind: Callable[[str], float]) -> Callable[[str], float]:
-    def convert(text: str) -> float:
-        value = kind(text)
-        if not 0 < value < float("inf"):
-            raise argparse.ArgumentTypeError(f"{text} is not a number above 0")
-        return value
-
-    convert.__name__ = getattr(kind, "__name__", "number")  # argparse names it where a text is no number
-    return convert
 
 
 def _size(text: str) -> tuple[float, float]:
@@ -61,9 +50,9 @@ def add_plan_command(add: Add, rig: Path) -> None:
     )
     sub.add_argument("--config", type=Path, default=rig, metavar="FILE", help="rig file (default: instrument.toml)")
     for flag, kind, text in _NUMBERS:
-        sub.add_argument(flag, type=_above_zero(kind), metavar="N", help=f"{text} (default: the rig file's)")
-    sub.add_argument("--minutes", type=_above_zero(float), metavar="M", help="propose the best plans within this time")
-    sub.add_argument("--count", type=_above_zero(int), default=5, metavar="N", help="how many (default: 5)")
+        sub.add_argument(flag, type=kind, metavar="N", help=f"{text} (default: the rig file's)")
+    sub.add_argument("--minutes", type=positive, metavar="M", help="propose the best plans within this time")
+    sub.add_argument("--count", type=count, default=5, metavar="N", help="how many (default: 5)")
     sub.add_argument(
         "--scene-mm", type=_size, metavar="W,H", help="size of what lies on the plane (default: the image's)"
     )

@@ -7,6 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from host.cli_numbers import count
+from shared.errors import ConfigError
+
 if TYPE_CHECKING:
     from host.cli_materials import Add
     from host.options import Options
@@ -23,8 +26,8 @@ def add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--reference-by",
         choices=["position", "mean"],
-        default="position",
-        help="divide by the reference pixel by pixel, masked where it is weak (default), or by one number a channel",
+        help="with --reference: divide by it pixel by pixel, masked where it is weak (default), or by one number a"
+        " channel",
     )
     sub.add_argument(
         "--incidence",
@@ -44,11 +47,17 @@ def add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
 def with_polarimetry(options: Options, args: argparse.Namespace, config: Path | None) -> Options:
     """Options with what was asked for; the reference scan is processed here. Raises PolysightError."""
     options = replace(options, bands=args.bands, incidence=args.incidence)
+    if args.reference is None and args.reference_by is not None:
+        raise ConfigError(
+            f"--reference-by {args.reference_by} without --reference would do nothing",
+            "it says how the metal scan named by --reference is used",
+            "add --reference SCAN, or leave it out",
+        )
     if args.reference is None:
         return options
     from host.metal_scans import load_reference
 
-    by_position = args.reference_by == "position"
+    by_position = args.reference_by != "mean"
     return replace(options, reference=load_reference(args.reference, config, by_position, args.bands))
 
 
@@ -91,14 +100,3 @@ def _turned(text: str) -> tuple[float, Path]:
     if not -180 <= angle <= 180 or not folder:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form DEGREES=SCAN, e.g. 90=scans/horizontal")
     return angle, Path(folder)
-
-
-def count(text: str) -> int:
-    """A number of sub-bands, 1 or more."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of sub-bands, 1 or more")
-    return value

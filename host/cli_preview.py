@@ -17,6 +17,8 @@ def _preview(args: argparse.Namespace) -> int:
             "the live view is an extra of the host half",
             "pip install './host[preview]', from the repository",
         )
+    if args.folder.exists() and not args.folder.is_dir():
+        raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
     from host.preview.serve import preview
 
     return preview(args.folder, args.host, args.port, args.control)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from host.cli_numbers import count
 from shared.errors import ConfigError, PolysightError
 
 if TYPE_CHECKING:
@@ -41,19 +42,12 @@ def add_data_arguments(sub: argparse.ArgumentParser, several: bool) -> None:
         return
     many = sub.add_argument_group("several scans", "their products go to DIR/<scan>/, what each says to DIR/<scan>.log")
     many.add_argument(
-        "--jobs", type=_count, metavar="N", help="scans at a time (default: one a core, as far as memory goes)"
+        "--jobs", type=count, metavar="N", help="scans at a time (default: one a core, as far as memory goes)"
     )
     many.add_argument("--again", action="store_true", help="process scans again that are finished")
     many.add_argument(
         "--dask", metavar="ADDRESS", help="on a Dask cluster, e.g. tcp://host:8786, whose workers see the same folders"
     )
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
-    return value
 
 
 def process_scans(
@@ -127,13 +121,14 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
 
 def _found(products: Path) -> tuple[str, str]:
     """Share of positions that are masked, and number of patches, as the products say."""
+    from host.report.read import SavedProducts
+
+    saved = SavedProducts(products)
     try:
-        quality = json.loads((products / "quality.json").read_text(encoding="utf-8"))
-        boards = quality["boards"].values()
+        boards = saved.quality["boards"].values()
         share = sum(b["positions_masked"] for b in boards) / max(1, sum(b["positions"] for b in boards))
-        materials = json.loads((products / "materials.json").read_text(encoding="utf-8"))
-        return f"{100 * share:.2g} %", str(len(materials["segments"]))
-    except (OSError, ValueError, KeyError, TypeError):
+        return f"{100 * share:.2g} %", str(len(saved.materials["segments"]))
+    except (PolysightError, AttributeError, KeyError, TypeError):
         return "", ""
 
 

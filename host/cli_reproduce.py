@@ -6,10 +6,14 @@ import argparse
 from pathlib import Path
 
 from host.cli_materials import Add
+from host.cli_options import RIG
+from shared.config import load_instrument
 from shared.errors import ConfigError
 
 
 def _reproduce(args: argparse.Namespace) -> int:
+    if args.config != RIG:
+        load_instrument(args.config)  # a wrong one is told now, not with the first item that needs it
     if args.authors is not None:
         from host.reproduce.authors import reproduce_authors
 

@@ -18,7 +18,7 @@ def _scan(args: argparse.Namespace) -> int:
 def _resume(args: argparse.Namespace) -> int:
     from host.live import resume
 
-    return resume(args.folder, options_of(args), args.keep_incomplete, not args.no_process)
+    return resume(args.folder, options_of(args), args.keep_incomplete, not args.no_process, args.config)
 
 
 def _validate(args: argparse.Namespace) -> int:
@@ -66,6 +66,13 @@ def add_scan_commands(add: Add) -> None:
     )
     add_material_options(sub)
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; the rig file is in it")
+    sub.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="take [pi], [limits] and the boards' addresses from this rig file from now on; all else must be the scan's"
+        " (default: as before)",
+    )
     _add_recording_options(sub)
 
     sub = add(

@@ -12,12 +12,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from shared.config import load_instrument
-from shared.errors import ConfigError, DeviceError
+from shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
 _MARK = ".polysight-demo"
 _START_LIMIT_S = 60.0
@@ -32,6 +32,27 @@ def run_simulator(arguments: Sequence[str]) -> int:
     return subprocess.run([sys.executable, "-m", "simulators", *arguments], check=False).returncode
 
 
+def check_scenes(scenes: Iterable[Path], config: Path) -> None:
+    """Have the simulators read scene files, and see that they fit the rig, before anything is begun with them.
+
+    Raises
+    ------
+    ConfigError
+        naming the file, the key and the rule that is broken; or when the simulators are not installed.
+    """
+    _require_simulators()
+    command = [sys.executable, "-m", "simulators", "check", *map(str, scenes), "--config", str(config)]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    if checked.returncode != 0:
+        raise _error_of(checked.returncode, checked.stderr)
+
+
+def _error_of(status: int, said: str) -> PolysightError:
+    """The error that a simulator ended with: its words, which say what, why and what to do, and its exit status."""
+    kind = {e.exit_status: e for e in (ConfigError, DataError)}.get(status, DeviceError)
+    return kind(said.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a word")
+
+
 def _require_simulators() -> None:
     if importlib.util.find_spec("simulators") is None:
         raise ConfigError(
@@ -41,13 +62,17 @@ def _require_simulators() -> None:
         )
 
 
-def _fresh_folder(out: Path) -> None:
-    """Make an empty folder; an earlier demo's is replaced, anything else is left alone."""
+def _check_folder(out: Path) -> None:
+    """Refuse a folder that holds anything but an earlier demo. Raises ConfigError."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file", "a demo needs a folder", "give another --out")
+    if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
+        raise ConfigError(f"{out} is not empty", "it holds something else than a demo", "give another --out")
+
+
+def _fresh_folder(out: Path) -> None:
+    """Make an empty folder; an earlier demo's is replaced."""
     if out.exists() and any(out.iterdir()):
-        if not (out / _MARK).exists():
-            raise ConfigError(f"{out} is not empty", "it holds something else than a demo", "give another --out")
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
     (out / _MARK).touch()
@@ -61,8 +86,8 @@ def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) ->
 
     Raises
     ------
-    DeviceError
-        when it does not start; its logs are in `folder`/logs.
+    PolysightError
+        when it does not start, as it said itself; its logs are in `folder`/logs.
     """
     _require_simulators()
     command = [sys.executable, "-m", "simulators.rig", "--config", str(config), "--scene", str(scene)]
@@ -93,8 +118,8 @@ def _wait_ready(rig: subprocess.Popen[str], folder: Path) -> Path:
             if line.startswith("ready "):
                 return Path(line.removeprefix("ready ").strip())
             if not line:
-                message = rig.stderr.read().strip().removeprefix("error: ")  # says what, why and what to do
-                raise DeviceError(message or f"the simulated rig ended with status {rig.wait()}, without a word")
+                said = rig.stderr.read()
+                raise _error_of(rig.wait(), said)
     raise DeviceError(
         f"the simulated rig was not ready within {_START_LIMIT_S:.0f} s",
         "an overloaded machine",
@@ -114,6 +139,8 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
     """
     began = time.monotonic()
     load_instrument(config)
+    _check_folder(out)
+    check_scenes([scene], config)
     _fresh_folder(out)
     sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
     with simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from host.confirm import typed
-from host.report import read_image
+from host.products_folder import RAW_DROPPED
+from host.report import write_json
+from host.report.read import QUALITY, read_products
 from host.store.raw import Digests, drop, droppable
-from host.store.scanfolder import ScanFolder
+from host.store.scanfolder import ScanFolder, utc_now
 from shared.errors import ConfigError, DataError
 
 WORD = "drop"
@@ -27,7 +27,7 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
         when it is not confirmed; nothing was removed.
     """
     scan = ScanFolder.load(folder)
-    products = products or folder / "products"
+    products = read_products(products or folder).folder
     processed = processed_digests(products)
     what = droppable(scan, processed)
     for line in what.kept:
@@ -48,21 +48,28 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
     said = typed(text, WORD, yes)
     if said != WORD:
         raise ConfigError(f"nothing dropped: answered {said!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
+    _keep(products, scan)
     drop(scan, processed, products)
     sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
     return 0
 
 
-def processed_digests(products: Path) -> Digests:
+def _keep(products: Path, scan: ScanFolder) -> None:
+    """Have the products say that they are all that is left of the scan, so that no other's ever replace them."""
+    told = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
+    write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: told})
+
+
+def processed_digests(folder: Path) -> Digests:
     """What saved products were made from, as quality.json beside a readable image.npz says. Raises DataError."""
-    read_image(products / "image.npz")
-    path = products / "quality.json"
+    products = read_products(folder)
+    _ = products.image  # raises when it cannot be read
     try:
-        boards: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))["boards"]
+        boards = products.quality["boards"]
         return {name: {int(r): str(crc) for r, crc in b["raw_crc32"].items()} for name, b in boards.items()}
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as e:
+    except (ValueError, KeyError, AttributeError, TypeError) as e:
         raise DataError(
-            f"{path}: does not say what it was made from: {e}",
+            f"{products.folder / QUALITY}: does not say what it was made from: {e}",
             "made by an earlier release, damaged, or from another program's recordings",
             "`polysight process SCAN --out DIR` makes it again",
         ) from None

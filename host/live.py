@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import shutil
 import sys
+import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-from host.offline import TRUTH, check_library, clear_products, finish, truth_of
+from host.calibration.in_force import Calibration, of_rig, of_scan
+from host.imaging.grid import image_grid
+from host.materials import read_truth
+from host.offline import TRUTH, check_options, make_products, truth_of
 from host.options import Options
 from host.pipeline import Pipeline
+from host.products_folder import check_products_folder
 from host.progress import ScanBar
 from host.scan.control import ControlDesk
 from host.scan.result import OnProgress
 from host.scan.run import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
-from host.scan.stop import StopRequest
+from host.scan.stop import StopRequest, hangups_pass
 from host.store import manifest
+from host.store.connection import check_same_scan
 from host.store.raw import require_raw
 from host.store.scanfolder import MANIFEST, ScanFolder
-from shared.config import load_instrument
-from shared.errors import ConfigError, ScanError
+from shared.config import Instrument, load_instrument
+from shared.errors import ConfigError, PolysightError, ScanError, advice
+
+PRODUCTS = "products"
 
 
 class _Live:
@@ -42,31 +51,57 @@ class _Live:
 Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
+@hangups_pass()
 def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
-    if process:
-        check_library(options)
     live = _Live(folder)
     stop = StopRequest()
     with ScanBar() as bar, ControlDesk(folder, stop) as desk:
 
         def told(progress: ScanProgress) -> None:
-            bar.update(progress)
             if progress.phase != "connect":
                 desk.open()  # the scan folder is there, and locked by this program
+            bar.update(progress)
 
         result = take(live.add_row if process else None, told, stop)
+    if result.exit_status == "success":
+        _tell(f"{folder}: every row is committed\n")
     if result.processing_error is not None:
-        raise result.processing_error
+        raise _unprocessed(folder, result, result.processing_error)
     if result.exit_status != "success":
         raise ScanError(f"{folder}: {result.reason}", "", f"polysight resume {folder}")
-    sys.stdout.write(f"{folder}: every row is committed\n")
-    sys.stdout.flush()
     if live.pipeline is not None:
-        live.pipeline.quality_notes = {"rows_retaken": result.retakes, "rows_incomplete": result.incomplete_rows}
-        out = folder / "products"
-        clear_products(out)
-        sys.stdout.write(finish(live.pipeline, out, options, truth_of(folder)).summary())
+        sys.stdout.write(make_products(live.pipeline, folder / PRODUCTS, options, truth_of(folder)).summary())
     return 0
+
+
+def _tell(text: str) -> None:
+    """Say something on stdout; that nobody reads it is no reason not to make the products."""
+    with suppress(OSError):
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+
+def _unprocessed(folder: Path, result: ScanResult, e: BaseException) -> PolysightError:
+    """The error to raise when processing failed beside a scan that went on."""
+    again = f"the rows are safe: `polysight process {folder} --out DIR` processes them again"
+    if result.exit_status != "success":
+        again = f"{result.reason}: `polysight resume {folder}` goes on, and processes all of them again"
+    if isinstance(e, PolysightError):
+        e.remedy = advice(e.remedy, again)
+        return e
+    traceback.print_exception(e)
+    return ScanError(
+        f"processing failed, the scan did not: {type(e).__name__}: {e}",
+        "a fault of this program, or there was no memory or room on the disk; the lines above tell where",
+        again,
+    )
+
+
+def _check_options(options: Options, rig: Instrument, calibration: Calibration) -> None:
+    """Refuse what could not be used when the scan is over, before the rig is touched. Raises PolysightError."""
+    placed = calibration.rig(rig)
+    grid = image_grid(placed)
+    check_options(options, placed, (grid.x_m, grid.y_m))
 
 
 def _check_new(folder: Path) -> None:
@@ -89,23 +124,40 @@ def scan(config: Path, folder: Path, truth: Path | None, options: Options, keep_
     _check_new(folder)
     if truth is not None and not truth.is_file():
         raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
+    if process:
+        _check_options(options, rig, of_rig(rig))
+        if truth is not None:
+            read_truth(truth)
 
     def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
         def told(progress: ScanProgress) -> None:
-            tell(progress)
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
                 shutil.copyfile(truth, folder / TRUTH)
+            tell(progress)
 
         return run_scan(rig, folder, on_row=on_row, progress=told, keep_incomplete=keep_incomplete, stop=stop)
 
     return _run(folder, options, process, take)
 
 
-def resume(folder: Path, options: Options, keep_incomplete: bool, process: bool) -> int:
-    """Take a scan up at its first row that is not committed; returns the exit status. Raises PolysightError."""
-    require_raw(ScanFolder.load(folder))
+def resume(folder: Path, options: Options, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
+    """Take a scan up at its first row that is not committed; returns the exit status. Raises PolysightError.
+
+    `config` is a rig file that says how the rig is reached from now on; the scan's own, where it is None.
+    """
+    source = ScanFolder.load(folder)
+    require_raw(source)
+    rig_now = None if config is None else load_instrument(config)
+    if rig_now is not None:
+        check_same_scan(source.instrument, rig_now, str(config))
+    if process:
+        _check_options(options, source.instrument, of_scan(source))
+        check_products_folder(folder / PRODUCTS, source.scan_id)
+        truth_of(folder)
 
     def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
-        return resume_scan(folder, on_row=on_row, progress=tell, keep_incomplete=keep_incomplete, stop=stop)
+        return resume_scan(
+            folder, on_row=on_row, progress=tell, keep_incomplete=keep_incomplete, stop=stop, rig_now=rig_now
+        )
 
     return _run(folder, options, process, take)

@@ -107,7 +107,7 @@ def _absolute(value: Any) -> Any:
     return value.absolute() if isinstance(value, Path) else value
 
 
-NOT_DATA = ("products", "products-export", "control")  # folders of a scan
+NOT_DATA = ("products", ".products.new", "products-export", "control")  # folders of a scan
 
 
 def made_with(data: Path, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -11,15 +12,19 @@ from typing import Any
 
 import numpy as np
 
+from host.imaging.subbands import sub_bands
 from host.materials import Library
 from host.materials.authors import read_materials
 from host.materials.concentration import fit_concentration
 from host.materials.layers import Layer, LayerFit, fit_layer
 from host.materials.subbands import AMPLITUDE_ERROR, bands_of_row
-from shared.config import load_instrument
+from host.report.read import MATERIALS, SavedProducts, read_products
+from host.report.scan_facts import SCAN
+from shared.config import Chirp, load_instrument
 from shared.errors import ConfigError, DataError
 
 LAST = "?"
+_SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
 
 
 def parse_layer(text: str) -> Layer:
@@ -38,21 +43,35 @@ def parse_layer(text: str) -> Layer:
     return Layer(parts[0], None if unknown else complex(numbers[0], -numbers[1]), thickness)
 
 
-def _segments(products: Path) -> list[dict[str, Any]]:
-    path = products / "materials.json"
-    try:
-        return list(json.loads(path.read_text(encoding="utf-8"))["segments"])
-    except FileNotFoundError:
+def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
+    """The chirp the products were made with; that of `config` when it is given. Raises DataError, ConfigError."""
+    chirp = load_instrument(config).chirp if config is not None else products.chirp
+    if chirp is None:
         raise DataError(
-            f"{path}: no such file", "the scan was not processed, or no metal was found", "polysight process"
-        ) from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as e:
-        raise DataError(f"{path}: cannot be read: {e}", "written by polysight process", "process the scan again") from e
+            f"{products.folder}: no {SCAN}, which names the chirp",
+            "an earlier release processed the scan",
+            "process the scan again, or give its rig file: --config FILE",
+        )
+    return chirp
+
+
+def _check_bands(row: Mapping[str, Any], chirp: Chirp, source: str) -> None:
+    """Refuse a patch whose sub-bands are no parts of this chirp. Raises DataError."""
+    recorded = [(b["first_hz"], b["last_hz"]) for b in row.get("bands") or ()]
+    expected = [(b.first_hz, b.last_hz) for b in sub_bands(chirp, len(recorded))] if recorded else []
+    for told, own in zip(recorded, expected, strict=True):
+        if not all(math.isclose(a, b, rel_tol=_SAME_FREQUENCY) for a, b in zip(told, own, strict=True)):
+            raise DataError(
+                f"segment {row.get('label')} was imaged from {told[0] / 1e9:.4f} to {told[1] / 1e9:.4f} GHz; the chirp"
+                f" of {source} has that part from {own[0] / 1e9:.4f} to {own[1] / 1e9:.4f} GHz",
+                "that is another rig file than the scan's",
+                "leave --config out: the products bring their own",
+            )
 
 
 def permittivity(
-    products: Path,
-    config: Path,
+    folder: Path,
+    config: Path | None,
     stack: Sequence[Layer],
     segment: int | None,
     as_json: bool,
@@ -61,22 +80,28 @@ def permittivity(
 ) -> int:
     """Permittivity of patches, as one interface or as the unknown layer of a stack; returns the exit status.
 
-    With `bands` above 1 the stack is fitted to so many sub-bands of the sweep, which the products must hold.
-    `amplitude_error` is how far |H| may be trusted, relative; 0 leaves it out.
+    `folder` holds the products, or is the scan folder that holds them. The chirp is the one they were made with, as
+    their scan.json says; `config` replaces it. With `bands` above 1 the stack is fitted to so many sub-bands of the
+    sweep, which the products must hold. `amplitude_error` is how far |H| may be trusted, relative; 0 leaves it out.
 
     Raises
     ------
     DataError
-        when the folder holds no materials, not that segment, or not so many sub-bands.
+        when the folder holds no materials, not that segment, or not so many sub-bands; when nothing says with which
+        chirp it was made, or its sub-bands are of another one.
+    ConfigError
+        when `config` cannot be read.
     """
-    rows = [r for r in _segments(products) if segment is None or r["label"] == segment]
+    products = read_products(folder, MATERIALS)
+    rows = [r for r in products.segments if segment is None or r["label"] == segment]
     if not rows:
-        raise DataError(f"{products}: no segment {segment}", "its number is not in materials.json")
-    chirp = load_instrument(config).chirp if stack else None
+        raise DataError(f"{products.folder}: no segment {segment}", f"its number is not in {MATERIALS}")
+    chirp = _chirp(products, config) if stack else None
     out: list[dict[str, Any]] = []
     for row in rows:
         found = None
         if chirp is not None and not row.get("metal_reference"):
+            _check_bands(row, chirp, str(config or products.folder / SCAN))
             data = bands_of_row(row, chirp, bands, amplitude_error)
             found = fit_layer(data, stack, float(np.radians(row["incidence_deg"]))) if data else None
         out.append({"label": row["label"], "name": row["name"], "single_interface": row["permittivity"]})

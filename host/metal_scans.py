@@ -13,14 +13,17 @@ import numpy as np
 
 from host.imaging import ChannelImages
 from host.offline import imaged
+from host.pipeline import Pipeline
 from host.polarimetry import Leakage, PlaneReference, leakage_from_images, plane_reference, specular_incidence_rad
 from shared.errors import DataError
 
 LEAST_PIXELS = 100
 
 
-def _reference(images: ChannelImages, name: str) -> PlaneReference:
-    return plane_reference(images.h, images.v, images.x_m, images.y_m, images.valid, name=name)
+def _reference(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
+    name = pipeline.source.scan_id
+    found = plane_reference(images.h, images.v, images.x_m, images.y_m, images.valid, name=name)
+    return replace(found, made_with=pipeline.imaged_with)
 
 
 def load_reference(
@@ -45,8 +48,8 @@ def load_reference(
         when the scan cannot be read, or shows no metal plate.
     """
     pipeline, images = imaged(folder, config, bands)
-    name = pipeline.source.scan_id
-    found = replace(_reference(images, name), bands=tuple(_reference(b, name) for b in pipeline.band_images()))
+    parts = tuple(_reference(pipeline, band) for band in pipeline.band_images())
+    found = replace(_reference(pipeline, images), bands=parts)
     return found if by_position else found.mean()
 
 
@@ -73,15 +76,16 @@ def leakage_of_scans(
     Raises
     ------
     DataError
-        when the scans do not show metal at the same pixels, or their orientations are too alike.
+        when the scans are of different rigs, do not show metal at the same pixels, or are too alike in orientation.
     """
     pipeline, images = imaged(plate, config)
-    whole = _reference(images, pipeline.source.scan_id)
+    whole = _reference(pipeline, images)
     theta = specular_incidence_rad(pipeline.rig)
     mask, turned, names = whole.valid & images.valid, [], [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
         other, seen = imaged(folder, config)
+        whole.check_rig(other.imaged_with, str(plate))
         whole.check_axes(seen.x_m, seen.y_m)
         mask = mask & seen.valid
         turned.append((float(np.radians(degrees)), seen.h, seen.v))

@@ -3,37 +3,39 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
 from host.calibration.in_force import of_scan
-from host.demo import run_simulator
+from host.demo import check_scenes, run_simulator
 from host.imaging import ChannelImages
 from host.imaging.focus import focus_sweep
-from host.many import MARK
-from host.materials import Library, TrainingScan, TruthPlate, make_library, patches_from_labels, read_truth
-from host.options import LIBRARY, Options
+from host.materials import TrainingScan, TruthPlate, make_library, patches_from_plates, read_truth
+from host.options import Options
 from host.pipeline import Pipeline
-from host.products import LABELS, Products, write_images, write_quality
+from host.products import Products, write_images, write_quality
+from host.products_folder import check_products_folder, making_products
 from host.report import write_json
 from host.report.focus import focus_figure
-from host.report.scan_facts import SCAN, write_scan_facts
+from host.report.read import IMAGE
+from host.report.scan_facts import write_scan_facts
 from host.store.authors import AuthorsCube, open_scan
 from host.store.raw import require_raw
 from host.store.scanfolder import MANIFEST, ScanFolder, versions
 from host.store.source import ScanSource
-from shared.config import load_instrument
-from shared.errors import ConfigError, DataError, ScanError
+from shared.config import Instrument, load_instrument
+from shared.errors import ConfigError, DataError, ScanError, advice
 
 TRUTH = "truth.json"
-PRODUCTS = ("image.npz", SCAN, "quality.json", "materials.json", "patches.npz", LABELS, "report.html", "figures")
+Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
 
@@ -47,9 +49,18 @@ def _open(data: Path, config: Path | None) -> ScanSource | AuthorsCube:
     return source
 
 
-def _rows(source: ScanSource | AuthorsCube, data: Path, depth_m: float = 0.0, bands: int = 1) -> Pipeline:
-    """A pipeline with all rows of a source, with a progress bar."""
+def _rows(
+    source: ScanSource | AuthorsCube,
+    data: Path,
+    depth_m: float = 0.0,
+    bands: int = 1,
+    options: Options | None = None,
+) -> Pipeline:
+    """A pipeline with all rows of a source, with a progress bar. What `options` cannot use is refused first."""
     pipeline = Pipeline(source, depth_m=depth_m, bands=bands)
+    if options is not None:
+        metal = check_options(options, pipeline.rig, pipeline.axes_m)
+        pipeline.metal_reference(options, metal is not None)
     rows = list(source.rows())
     if not rows:
         raise DataError(
@@ -75,69 +86,73 @@ def truth_of(data: Path) -> tuple[TruthPlate, ...]:
     return read_truth(path) if path.exists() else ()
 
 
-def check_library(options: Options) -> None:
-    """Refuse a library that cannot be used now, not after hours. Raises DataError."""
-    Library.load(options.library or LIBRARY)
+def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None:
+    """Refuse now, not after hours, what could not be used at the end; say on stderr when nothing will be named.
 
+    Parameters
+    ----------
+    options
+        Whose library, model and drawn boxes are looked at.
+    rig
+        Of the images, as calibrated.
+    axes_m
+        x and y of the images.
 
-def clear_products(out: Path) -> None:
-    """Make a folder for products; those of an earlier run are removed, so that old and new ones never lie side by side.
+    Returns
+    -------
+    int or None
+        Which of the drawn boxes is the metal reference.
 
     Raises
     ------
-    ConfigError
-        when it holds anything else, or cannot be made.
+    DataError
+        when the library cannot be read or fitted, or a box holds no pixel.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        strangers = sorted(p.name for p in out.iterdir() if p.name not in PRODUCTS and not p.name.startswith("."))
-        if strangers:
-            raise ConfigError(
-                f"{out} is not empty: it holds {strangers[0]}",
-                "products go into a folder of their own",
-                "give another --out",
-            )
-        for name in (MARK, *PRODUCTS[:-1]):
-            (out / name).unlink(missing_ok=True)
-        shutil.rmtree(out / PRODUCTS[-1], ignore_errors=True)
-    except OSError as e:
-        raise ConfigError(
-            f"{out}: no folder for products: {e.strerror}",
-            "a file is in the way, or you may not write there",
-            "give another --out",
-        ) from None
+    _, _, metal = options.drawn(*axes_m)
+    if options.classifier(rig) is None and options.model != "none":
+        sys.stderr.write(f"note: {options.unnamed(rig).replace('was', 'will be', 1)}\n")
+    return metal
 
 
-def finish(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
-    """All products; when no material can be found, the error says where the images are. Raises DataError."""
-    try:
-        return pipeline.finish(out, options, plates)
-    except DataError as e:
-        images = out / "image.npz"
-        if not images.exists():
-            raise
-        raise DataError(e.what, e.why, f"{e.remedy}; the images are written: {images}") from None
+def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
+    """All products, which take the place of those in `out`.
+
+    When no material can be found, the images alone do, unless `out` holds a report; the error says where they are.
+    Raises PolysightError.
+    """
+    with making_products(out, pipeline.source.scan_id) as new:
+        try:
+            return replace(pipeline.finish(new, options, plates), folder=out)
+        except DataError as e:
+            if not (new / IMAGE).exists():
+                raise
+            if (out / "report.html").exists():
+                where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
+                raise DataError(e.what, e.why, advice(e.remedy, where)) from None
+            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"))
+    raise failed
 
 
 def process(data: Path, out: Path, config: Path | None, options: Options) -> int:
     """Images, materials and report; returns the exit status. Raises PolysightError."""
     source, plates = _open(data, config), truth_of(data)
-    check_library(options)
-    clear_products(out)
-    sys.stdout.write(finish(_rows(source, data, bands=options.bands), out, options, plates).summary())
+    check_products_folder(out, source.scan_id)
+    pipeline = _rows(source, data, bands=options.bands, options=options)
+    sys.stdout.write(make_products(pipeline, out, options, plates).summary())
     return 0
 
 
 def image(data: Path, out: Path, config: Path | None) -> int:
     """image.npz and quality.json only; returns the exit status. Raises PolysightError."""
     source = _open(data, config)
-    clear_products(out)
+    check_products_folder(out, source.scan_id)
     pipeline = _rows(source, data)
     images = pipeline.form_images()
-    write_images(out, images)
-    write_scan_facts(out, pipeline.source, pipeline.rig, images)
-    write_quality(out, pipeline.quality.to_dict(**pipeline.quality_notes))
-    sys.stdout.write(f"image: {out / 'image.npz'}\n")
+    with making_products(out, source.scan_id) as new:
+        write_images(new, images)
+        write_scan_facts(new, pipeline.source, pipeline.rig, images)
+        write_quality(new, pipeline.quality.to_dict(**pipeline.quality_notes))
+    sys.stdout.write(f"image: {out / IMAGE}\n")
     return 0
 
 
@@ -148,12 +163,14 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     pipeline = _rows(source, data, depth_mm / 1e3)
     builder = pipeline.images
     found = focus_sweep(builder, depth_mm / 1e3)
-    sweep = found.to_dict()
     grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
     moved = replace(grid, z_m=grid.z_m + found.depth_mm / 1e3)
     pictures = (board.image()[0], board.image(moved)[0])
+    if pipeline.by_columns:  # the builder's image is that of the mirrored rig
+        found, pictures = found.transposed(), (pictures[0].T, pictures[1].T)
+    sweep = found.to_dict()
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
-    (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, grid.x_m, grid.y_m, source.simulated))
+    (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pipeline.axes_m, source.simulated))
     at = pipeline.rig.geometry.object_distance_mm
     sys.stdout.write(
         f"{'simulated ' if source.simulated else ''}scan {source.scan_id}: the plane is sharpest"
@@ -162,8 +179,6 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
         f" sharpness {found.gain:.3f} times the rig file's plane\n"
         f"figure: {out / 'focus.png'}\n"
     )
-    if pipeline.by_columns:
-        sys.stdout.write("the scan was taken by columns: x and y are swapped in these results and in the figure\n")
     if not found.certain:
         sys.stdout.write(
             "do not rely on it: the sharpness hardly changes over the sweep (a narrow scan, or no points and edges in"
@@ -208,25 +223,34 @@ def _training_scan(data: Path, config: Path) -> TrainingScan:
     if metal is None:
         raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
     images = pipeline.form_images()
-    boxes = {t.name: t.box_mm for t in plates}
-    known, names = patches_from_labels(boxes, images.x_m, images.y_m, unit="mm", margin_mm=EDGE_MM)
+    known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     found = pipeline.find_materials(images, metal.box_mm, plates=plates, segmentation=known)
     return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names)
 
 
 def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path) -> int:
-    """Make a library from scans with known plates, or from scenes that are simulated first."""
-    scans = [_training_scan(folder, config) for folder in data]
-    if not scans and scenes is None:
+    """Make a library from scans with known plates, or from scenes that are simulated first.
+
+    Raises
+    ------
+    PolysightError
+        when a file is wrong, found out before anything is simulated; or a scan cannot be learnt from.
+    """
+    data, files = list(data), [] if scenes is None else sorted(scenes.glob("*.toml"))
+    if not data and scenes is None:
         raise ConfigError(
             "no scans to learn from",
             "neither DATA nor --simulate was given",
             "polysight train --simulate examples/library --out FILE",
         )
-    if scenes is not None:
-        files = sorted(scenes.glob("*.toml"))
-        if not files:
-            raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
+    if scenes is not None and not files:
+        raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
+    if not out.parent.is_dir():
+        raise ConfigError(f"{out}: no such folder {out.parent}", "the library would be lost", "make it first")
+    if files:
+        check_scenes(files, config)
+    scans = [_training_scan(folder, config) for folder in data]
+    if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
             for file in files:
                 folder = Path(temporary) / file.stem

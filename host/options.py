@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from host.imaging import ChannelImages
+import numpy.typing as npt
+
 from host.materials import Classifier, Library
 from host.materials.authors_labels import is_metal
-from host.materials.labels import patches_from_labels, read_labels
+from host.materials.labels import patches_from_labels
+from host.materials.library import SAME_ANGLE_DEG
 from host.materials.segment import Box, Segmentation
 from host.polarimetry import Incidence, PlaneReference
 from shared.config import Instrument
@@ -23,7 +26,7 @@ class Options:
 
     `model` None is the one chosen for the library, "none" no naming at all. `reference` is metal scanned on its own,
     instead of metal in the scene; `bands` above 1 images so many sub-bands, for thin layers; `incidence` is one angle
-    for the image or each pixel's own. `labels` holds boxes drawn by hand, instead of patches that are found.
+    for the image or each pixel's own. `labels` are boxes drawn by hand, in pixels, instead of patches that are found.
     """
 
     metal_box_mm: Box | None = None
@@ -32,25 +35,36 @@ class Options:
     reference: PlaneReference | None = None
     bands: int = 1
     incidence: Incidence = "one"
-    labels: Path | None = None
+    labels: Mapping[str, Box] | None = None
 
-    def drawn(self, images: ChannelImages) -> tuple[Segmentation | None, dict[int, str], int | None]:
+    def drawn(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[Segmentation | None, dict[int, str], int | None]:
         """Patches of the boxes drawn by hand, their names, and which is the metal reference; nothing without them.
 
-        Raises
-        ------
-        DataError
-            when the file is no label file, or a box holds no pixel.
+        `x_m`, `y_m` are the image's axes. Raises DataError when a box holds no pixel.
         """
         if self.labels is None:
             return None, {}, None
-        patches, names = patches_from_labels(read_labels(self.labels), images.x_m, images.y_m)
+        patches, names = patches_from_labels(dict(self.labels), x_m, y_m)
         metal = next((label for label, name in names.items() if is_metal(name)), None)
         return patches, names, metal if self.reference is None and self.metal_box_mm is None else None
 
-    def classifier(self, rig: Instrument) -> Classifier | None:
-        """For scans of a rig. Raises DataError, also when the library holds no patch at the rig's angle."""
+    def unnamed(self, rig: Instrument) -> str:
+        """Why nothing of a rig's scans will be named, in a sentence; "" when it will. Raises DataError."""
         if self.model == "none":
+            return "Nothing was named: naming was left out (--model none)."
+        path, angle = self.library or LIBRARY, incidence_deg(rig, rig.receivers[0])
+        known = Library.load(path).angles_deg
+        if not known or any(abs(a - angle) <= SAME_ANGLE_DEG for a in known):  # an empty one is an error of its own
+            return ""
+        return (
+            f"Nothing was named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} holds"
+            f" {' and '.join(f'{a:g}' for a in known)} degrees only (|P| changes by a tenth in a degree)."
+            " Train a library at this angle, and process the scan again with --library."
+        )
+
+    def classifier(self, rig: Instrument) -> Classifier | None:
+        """For scans of a rig; None where nothing is to be named, see :meth:`unnamed`. Raises DataError."""
+        if self.unnamed(rig):
             return None
         angle = incidence_deg(rig, rig.receivers[0])
         return Classifier(Library.load(self.library or LIBRARY), model=self.model, angles_deg=[angle])

@@ -6,10 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from host.calibration.in_force import of_scan
 from host.capture.decode import row_words
 from host.imaging import ChannelImages, ImageBuilder
 from host.imaging.facts import imaging_facts
+from host.imaging.imaged_with import ImagedWith
 from host.imaging.subbands import SubBandImages
 from host.materials import Classifier, MaterialsResult, TruthPlate, analyse, pixel_accuracy
 from host.materials.incidence import permittivity_change
@@ -22,6 +26,7 @@ from host.quality import Quality
 from host.report.scan_facts import write_scan_facts
 from host.store.authors import AuthorsCube
 from host.store.authors_settings import mirrored
+from host.store.scanfolder import ScanFolder
 from host.store.source import RowData, ScanSource
 from host.sync.chain import BoardSetup, SyncedRow, synchronise_row
 from host.sync.cubes import CubeReader
@@ -87,6 +92,35 @@ class Pipeline:
         rig = self.calibration.rig(self.source.instrument)
         return mirrored(rig) if self.by_columns else rig
 
+    @property
+    def axes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixel centres of the images, x and y, ascending."""
+        grid = self.images.grid
+        return (grid.y_m, grid.x_m) if self.by_columns else (grid.x_m, grid.y_m)
+
+    @property
+    def imaged_with(self) -> ImagedWith:
+        """What the gains of these images depend on: metal is their reference only where it was imaged with the same."""
+        return self.calibration.imaged_with(self.rig)
+
+    def metal_reference(self, options: Options, in_scene: bool = False) -> PlaneReference | None:
+        """Metal scanned on its own: what was asked for, or what the scan was calibrated with; None: the scene's own.
+
+        `in_scene` says that a box drawn by hand names metal, which then comes before the calibration.
+
+        Raises
+        ------
+        DataError
+            when it was imaged with another rig, or without the sub-bands that are asked for.
+        """
+        reference, name = options.reference, "the metal reference"
+        if reference is None and options.metal_box_mm is None and not in_scene:
+            reference, name = self.calibration.reference(), self.calibration.name_of("metal")
+        if reference is not None:
+            reference.check_rig(self.imaged_with, name)
+            reference.check_bands(options.bands, name)
+        return reference
+
     def form_images(self) -> ChannelImages:
         """Both channels, flattened by their footprint, not yet referenced to metal."""
         with self.quality.timed("image"):
@@ -97,6 +131,8 @@ class Pipeline:
             self.quality_notes["imaging"] = imaging_facts(self.images, images)
         if recording := getattr(self.source, "recording", None):
             self.quality_notes["recording"] = recording()
+        if isinstance(self.source, ScanFolder):
+            self.quality_notes |= self.source.retaken()
         return images.transposed() if self.by_columns else images
 
     def find_materials(
@@ -154,10 +190,8 @@ class Pipeline:
         write_scan_facts(out, self.source, self.rig, images)
         write_quality(out, self.quality.to_dict(**self.quality_notes))
         classifier = options.classifier(self.rig)
-        reference = options.reference
-        boxes, names, metal = options.drawn(images)
-        if reference is None and options.metal_box_mm is None and metal is None:
-            reference = self.calibration.reference()
+        boxes, names, metal = options.drawn(images.x_m, images.y_m)
+        reference = self.metal_reference(options, metal is not None)
         if reference is not None:
             reference.check_axes(images.x_m, images.y_m)
             images = replace(images, valid=images.valid & reference.valid)
@@ -173,4 +207,5 @@ class Pipeline:
         )
         found = replace(found, boxes=names)
         quality = self.quality.to_dict(pixel_accuracy=pixel_accuracy(found), **self.quality_notes)
-        return write_materials(out, self.source, images, found, classifier, quality, plates, self.rig)
+        unnamed = options.unnamed(self.rig)
+        return write_materials(out, self.source, images, found, classifier, quality, plates, self.rig, unnamed)

@@ -60,15 +60,19 @@ def write_materials(
     quality: dict[str, Any],
     truth: tuple[TruthPlate, ...],
     rig: Instrument | None = None,
+    unnamed: str = "",
 ) -> Products:
-    """The metal-referenced image.npz, quality.json, materials.json, figures and report; `rig` if not the scan's own."""
+    """The metal-referenced image.npz, quality.json, materials.json, figures and report.
+
+    `rig` if it is not the scan's own; `unnamed` says why there is no classifier.
+    """
     c = found.calibrated
     write_image(out / "image.npz", c.h, c.v, c.p, images.x_m, images.y_m, images.valid)
     write_quality(out, quality)
     write_labels(out / LABELS, labels_of(found), f"patches of scan {source.scan_id}, in pixels of image.npz")
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, source.simulated))
     rows = found.rows()
-    named_by = classifier_sentence(classifier) if classifier else "Nothing was named."
+    named_by = classifier_sentence(classifier) if classifier else unnamed or "Nothing was named."
     write_json(
         out / "materials.json",
         {
@@ -97,10 +101,10 @@ def write_materials(
             "processed": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
             **versions(),
         },
-        notes=[NOT_ON_HARDWARE],
+        notes=[NOT_ON_HARDWARE, *([unnamed] if unnamed else [])],
     )
     write_report(out, with_scan(context, source.plan, rig or source.instrument, images))
-    return Products(out, _lines(source, found, rows))
+    return Products(out, _lines(source, found, rows) + ((unnamed,) if unnamed else ()))
 
 
 def _config_summary(rig: Instrument) -> dict[str, Any]:

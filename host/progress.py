@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from types import TracebackType
 
 from rich.console import Console
@@ -19,11 +20,21 @@ def _clock(seconds: float | None) -> str:
     return f"{hours}:{minutes:02d}:{whole % 60:02d} left" if hours else f"{minutes}:{whole % 60:02d} left"
 
 
+class _PlainConsole(Console):
+    """A console whose closed pipe is an error like any other; rich's own ends the program and silences stdout."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError("nobody reads the messages any more")
+
+
 class ScanBar:
-    """Shows :class:`ScanProgress`; on anything but a terminal, a line at every tenth of the scan instead of bars."""
+    """Shows :class:`ScanProgress`; on anything but a terminal, a line at every tenth of the scan instead of bars.
+
+    What cannot be written is an OSError of `update`, and of nothing else.
+    """
 
     def __init__(self, console: Console | None = None) -> None:
-        self._console = console or Console(stderr=True)
+        self._console = console or _PlainConsole(stderr=True)
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -36,11 +47,13 @@ class ScanBar:
         self._told = -1
 
     def __enter__(self) -> ScanBar:
-        self._bars.start()
+        with suppress(OSError):
+            self._bars.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, e: BaseException | None, trace: TracebackType | None) -> None:
-        self._bars.stop()
+        with suppress(OSError):
+            self._bars.stop()
 
     def update(self, p: ScanProgress) -> None:
         """Show where the scan is."""
@@ -49,6 +62,8 @@ class ScanBar:
             text = f"row {p.row}" + (f" take {p.take}" if p.take > 1 else "")
             self._bars.update(self._points, description=text, total=p.row_points, completed=p.points, visible=True)
         if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
+            self._console.print(f"{p.phase}: {p.message}", highlight=False)
+        if p.phase == "end" and p.committed < p.rows:  # processing may still take a while; the error comes behind it
             self._console.print(f"{p.phase}: {p.message}", highlight=False)
         if not self._console.is_terminal and p.phase == "committed":
             tenth = 10 * p.committed // max(1, p.rows)

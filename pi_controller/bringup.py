@@ -15,9 +15,9 @@ from pi_controller.trigger_lines import TriggerLines
 from shared.config import Stage
 from shared.errors import DeviceError
 from shared.faults import explain
-from shared.stage_line import Immediate
+from shared.stage_line import HOMING_LIMIT_S, Immediate
 
-MOTION_LIMIT_S = 300.0
+MOTION_LIMIT_S = HOMING_LIMIT_S  # no motion takes longer than homing
 
 
 class Position(NamedTuple):

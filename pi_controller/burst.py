@@ -14,10 +14,9 @@ from pi_controller.trigger_lines import TriggerLines
 from shared.config import Burst
 from shared.faults import PiFault
 from shared.raster import FIRST_PULSE_DELAY_S
+from shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS
 from shared.units import us_to_ns
 
-MIN_PERIOD_NS = 300_000
-MAX_WIDTH_NS = 4_000
 # From edge to first pulse. A fixed delay longer than the usual wake-up keeps the pulses of all positions at the same
 # place behind their edges; 200 us are 4 um of travel at 20 mm/s.
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)

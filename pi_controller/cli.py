@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from pi_controller.finding import AS_THE_SERVICE
 from shared import __version__
 from shared.config import Instrument, load_instrument
-from shared.errors import PolysightError
+from shared.errors import PolysightError, os_error
+from shared.faults import explain
+from shared.sync_in import WIDTH_TEXT
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -35,9 +39,11 @@ def _run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> int:
     from pi_controller.checks import check_all
+    from pi_controller.client import refuse_beside_service
 
     instrument = load_instrument(args.config)
     journal = args.journal or Path(instrument.pi.journal_dir)
+    refuse_beside_service(instrument)
     failed, findings = 0, []
     for f in check_all(instrument, args.wires, _port(args, instrument), journal):
         failed += f.verdict == "fail"
@@ -53,9 +59,11 @@ def _pulse(args: argparse.Namespace) -> int:
     from pi_controller import realtime
     from pi_controller.bringup import pulse
     from pi_controller.burst import BurstSpec
+    from pi_controller.client import refuse_beside_service
     from pi_controller.service import open_lines
 
     instrument = load_instrument(args.config)
+    refuse_beside_service(instrument)
     lines = open_lines(instrument, args.wires)
     try:
         if args.wires is None:
@@ -70,18 +78,25 @@ def _pulse(args: argparse.Namespace) -> int:
         _write(json.dumps([r._asdict() for r in records]))
     else:
         _write(f"{sum(r.pulses for r in records)} pulses in {len(records)} bursts on SYNC_IN {instrument.pi.sync_out}")
-        _write(f"longest pulse at most {width / 1e3:.2f} us (the radar takes 0.025..4 us)")
+        _write(f"longest pulse at most {width / 1e3:.2f} us (the radar takes {WIDTH_TEXT})")
         _write(f"latest rising edge {jitter / 1e3:.2f} us behind its deadline")
     faults = [r.fault for r in records if r.fault]
+    for number in sorted(set(faults)):
+        e = explain(number)
+        sys.stderr.write(f"error: fault {number} in {faults.count(number)} of {len(records)} bursts: {e.what}\n")
+        sys.stderr.write(f"  why: {e.why}\n  do: {e.remedy}\n")
     return 1 if faults else 0
 
 
 def _jog(args: argparse.Namespace) -> int:
     from pi_controller.bringup import bench_stage
+    from pi_controller.client import refuse_beside_service
 
     instrument = load_instrument(args.config)
+    refuse_beside_service(instrument)
     with bench_stage(instrument.stage, _port(args, instrument)) as stage:
-        here = stage.jog(args.dx, args.dy, args.speed or instrument.stage.travel_speed_mm_s)
+        speed_mm_s = instrument.stage.travel_speed_mm_s if args.speed is None else args.speed
+        here = stage.jog(args.dx, args.dy, speed_mm_s)
     _tell_position(args, here.x_mm, here.y_mm)
     return 0
 
@@ -121,12 +136,12 @@ def _events(args: argparse.Namespace) -> int:
 
 
 def _keys(args: argparse.Namespace) -> int:
-    from pi_controller.keys import make_keys
+    from pi_controller.keys import COPY, make_keys
 
     folder = args.dir or Path(load_instrument(args.config).pi.key_dir)
     for path in make_keys(folder, args.replace):
         _write(str(path))
-    _write(f"copy {folder} to the host and set pi.key_dir there; the .key_secret files are secrets")
+    _write(COPY)
     return 0
 
 
@@ -189,7 +204,7 @@ def _parser() -> argparse.ArgumentParser:
     stage_port(p)
     p.add_argument("--dx", type=float, default=0.0, metavar="MM", help="along x, millimetres (0)")
     p.add_argument("--dy", type=float, default=0.0, metavar="MM", help="along y, millimetres (0)")
-    p.add_argument("--speed", type=float, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)")
+    p.add_argument("--speed", type=_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)")
     as_json(p)
 
     p = add("home", _home, "home the stage, through the running service if there is one", "--config instrument.toml")
@@ -217,6 +232,13 @@ def _positive(text: str) -> int:
     return value
 
 
+def _speed(text: str) -> float:
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError("must be above 0")
+    return value
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Exit status 0 only when it worked; an error is one message on stderr, without a trace."""
     args = _parser().parse_args(argv)
@@ -231,6 +253,10 @@ def main(argv: list[str] | None = None) -> int:
         # Whoever read our output has enough; nothing must be flushed to it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as e:
+        error = os_error(e, "a path is wrong, the disk is full, or it belongs to another user", AS_THE_SERVICE)
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_status
 
 
 if __name__ == "__main__":

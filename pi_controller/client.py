@@ -13,7 +13,7 @@ import zmq
 from pi_controller.bringup import MOTION_LIMIT_S
 from shared import messages as m
 from shared.config import Instrument
-from shared.errors import DeviceError
+from shared.errors import DeviceError, PolysightError
 from shared.sockets import Socket, requester, subscriber
 
 HELLO_LIMIT_MS = 500
@@ -26,6 +26,25 @@ def _ask(socket: Socket, command: m.AnyCommand, limit_ms: float) -> m.AnyReply |
 
 def _silent(address: str) -> DeviceError:
     return DeviceError(f"nobody answers at {address}", "polysight-pi run is not running here", "start it")
+
+
+def refuse_beside_service(instrument: Instrument) -> None:
+    """Refuse what needs lines, stage and ports for itself. Raises DeviceError when the service of this rig runs."""
+    context: zmq.Context[Socket] = zmq.Context()
+    try:
+        socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
+        hello = _ask(socket, m.Hello(), HELLO_LIMIT_MS)
+    except PolysightError:
+        return  # no keys, or no such address: whatever runs, it does not serve there
+    finally:
+        context.destroy(linger=0)
+    if hello is not None:
+        raise DeviceError(
+            f"polysight-pi run serves at {instrument.pi.command_address}",
+            "it holds the lines, the stage and the ports",
+            "`polysight doctor` on the host tries them through it; or `sudo systemctl stop polysight-pi`, this, and"
+            " `sudo systemctl start polysight-pi`",
+        )
 
 
 def home_by_service(instrument: Instrument) -> m.StatusReply | None:
@@ -91,6 +110,6 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
                 return
             for event in reply.events:
                 yield msgspec.to_builtins(event)
-            from_seq += len(reply.events)
+            from_seq = reply.events[-1].seq + 1  # not one by one: a lost journal leaves a jump
     finally:
         context.destroy(linger=0)

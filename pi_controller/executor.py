@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,6 +15,7 @@ from pi_controller.burst import BurstSpec
 from pi_controller.journal import JournalFullError
 from pi_controller.ledger import Ledger
 from pi_controller.machine import Machine
+from pi_controller.row_ending import Parts
 from pi_controller.rows import RefusedError, check_pulses, check_run, row_of
 from pi_controller.running_row import RunningRow
 from pi_controller.stage_driver import StageDriver
@@ -29,6 +29,8 @@ from shared.stage_line import Reply
 from shared.units import us_to_ns
 
 EVENTS_PER_TURN = 256
+REPLAYED_IN_A_ROW = 20  # events a reply while a row runs: many are long calls that keep the trigger thread waiting
+OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # only the run's host sends these; anybody may send the others
 
 
 class Request(NamedTuple):
@@ -42,8 +44,9 @@ class Snapshot(NamedTuple):
     """What Hello, Status and heartbeats tell; replaced as a whole, so that other threads may read it."""
 
     status: m.StatusReply
-    firmware: str = ""
-    in_run: bool = False
+    firmware: str
+    in_run: bool
+    placing: dict[str, float]
 
 
 class Executor:
@@ -60,12 +63,12 @@ class Executor:
     def __init__(self, stage: StageDriver, loop: TriggerLoop, ledger: Ledger, check_width: bool = True) -> None:
         self._loop, self._ledger, self._check_width = loop, ledger, check_width
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._machine = Machine(stage, loop, ledger, self._inbox.put, self._row_ended)
+        self._machine = Machine(Parts(stage, loop, ledger, self._inbox.put, self._row_ended))
         self._run: m.BeginRun | None = None
         self._last_row: tuple[int, int] | None = None
         self._after_row: Callable[[], None] | None = None
-        self._replies: list[tuple[Callable[[m.AnyReply], None], m.AnyReply]] = []
-        self._pulsing: list[Callable[[m.AnyReply], None]] = []
+        self._replies: list[tuple[Request, m.AnyReply]] = []
+        self._pulsing: list[Request] = []
         self._ending = self._ended = False
         self.crash: BaseException | None = None
         self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
@@ -85,7 +88,7 @@ class Executor:
             return m.Refused(
                 number=int(PiFault.NOT_READY), what=f"run {scan_id} is not begun", why=e.why, remedy="BeginRun"
             )
-        self._machine.host.heard(time.monotonic())
+        self._machine.hear_host()
         return m.Accepted(state=self.snapshot.status.state)
 
     def start(self) -> None:
@@ -125,10 +128,14 @@ class Executor:
             self._ledger.commit()
         self._refresh()
         replies, self._replies = self._replies, []
-        if replies:  # while a command waited for its reply, no other could come
-            self._machine.host.heard(time.monotonic())
-        for answer, reply in replies:
-            answer(reply)
+        for request, reply in replies:
+            self._hear(request.command)
+            request.answer(reply)
+
+    def _hear(self, command: m.AnyCommand) -> None:
+        """A command of this run's host is being answered: until its reply is out, no `Alive` can come."""
+        if isinstance(command, OF_THE_RUN) and self._run is not None and command.scan_id == self._run.scan_id:
+            self._machine.hear_host()
 
     def _take(self, item: Any) -> None:
         if isinstance(item, BurstSent):
@@ -136,21 +143,22 @@ class Executor:
         elif isinstance(item, BenchBurst):
             r = item.record
             told = m.Pulsed(pulses=r.pulses, width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns, fault=r.fault)
-            self._replies += [(answer, told) for answer in self._pulsing]
+            self._replies += [(request, told) for request in self._pulsing]
             self._pulsing.clear()
         elif isinstance(item, LoopFault):
             self._machine.take_loop_fault(item)
             lost = explain(item.number)
             refused = m.Refused(number=item.number, what=item.detail, why=lost.why, remedy=lost.remedy)
-            self._replies += [(answer, refused) for answer in self._pulsing]  # REP owes every request a reply
+            self._replies += [(request, refused) for request in self._pulsing]  # REP owes every request a reply
             self._pulsing.clear()
         elif isinstance(item, Request):
             try:
                 reply = self._on_command(item)
             except RefusedError as e:
                 reply = m.Refused(number=e.number, what=e.what, why=e.why, remedy=e.remedy)
+            self._hear(item.command)  # before the limits are looked at: it may have taken long
             if reply is not None:
-                self._replies.append((item.answer, reply))
+                self._replies.append((item, reply))
         elif isinstance(item, Reply):
             self._machine.take_stage(item)
         elif isinstance(item, StageLost):
@@ -163,10 +171,7 @@ class Executor:
     def _on_command(self, request: Request) -> m.AnyReply | None:
         command = request.command
         if isinstance(command, m.Replay):
-            try:
-                return self._ledger.replay(command.scan_id, command.from_seq, command.limit)
-            except (DataError, ProtocolError) as e:
-                raise RefusedError(PiFault.BAD_REQUEST, e.what, e.why, e.remedy) from None
+            return self._replay(command)
         if self._ending:
             raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
         if isinstance(command, m.BeginRun):
@@ -188,6 +193,22 @@ class Executor:
             return self._accept()
         raise RefusedError(PiFault.BAD_REQUEST, f"{type(command).__name__} is not answered here")
 
+    def _replay(self, command: m.Replay) -> m.ReplayReply:
+        limit = command.limit
+        if self._machine.row is not None:
+            if command.scan_id != self._ledger.scan_id:  # its whole file is read, however few events are wanted
+                raise RefusedError(
+                    PiFault.NOT_READY,
+                    f"a row of scan {self._ledger.scan_id} runs",
+                    "reading another scan's journal would hold up its pulses",
+                    "ask again when the row has ended",
+                )
+            limit = min(limit, REPLAYED_IN_A_ROW)
+        try:
+            return self._ledger.replay(command.scan_id, command.from_seq, limit)
+        except (DataError, ProtocolError) as e:
+            raise RefusedError(PiFault.BAD_REQUEST, e.what, e.why, e.remedy) from None
+
     def _accept(self) -> m.Accepted:
         return m.Accepted(state=self._machine.state)
 
@@ -207,11 +228,18 @@ class Executor:
                 "nothing else is answered meanwhile",
                 "ask for fewer pulses",
             )
-        self._pulsing.append(request.answer)
+        self._pulsing.append(request)
         self._loop.send(spec)
 
     def _begin(self, request: Request, run: m.BeginRun) -> m.AnyReply | None:
         check_run(run, self._machine.stage.config)
+        if self._run is not None and run.scan_id != self._run.scan_id and self._machine.host_lives:
+            raise RefusedError(
+                PiFault.NOT_READY,
+                f"run {self._run.scan_id} is begun, and its host lives",
+                "another program, perhaps on another machine, scans with this Pi",
+                "wait for that scan's end, or stop it there",
+            )
         if self._machine.row is None:
             return self._begin_now(run)
 
@@ -230,9 +258,11 @@ class Executor:
             raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
         except (DataError, ProtocolError) as e:
             raise RefusedError(PiFault.BAD_REQUEST, e.what, e.why, e.remedy) from None
-        self._run, self._last_row = run, None
+        self._run, self._last_row = None, None  # whichever was begun: the ledger is this scan's now
+        self._machine.end_run()
+        self._keep(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
+        self._run = run
         self._machine.begin_run(run.heartbeat_ms)
-        self._machine.emit(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
         return self._accept()
 
     def _end_run(self, command: m.EndRun) -> m.Accepted:
@@ -241,10 +271,20 @@ class Executor:
         self._need_run(command.scan_id)
         if self._machine.row is not None:
             raise RefusedError(PiFault.NOT_READY, "a row is running", "", "abort it, or wait for its end")
-        self._machine.emit(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
+        self._keep(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
         self._run = None
         self._machine.end_run()
         return self._accept()
+
+    def _keep(self, kind: type[m.RunStarted | m.RunStopped], **fields: Any) -> None:
+        """Emit an event whose command is accepted only when it is on the disk. Raises RefusedError."""
+        self._ledger.broken = False  # there may be room again
+        self._machine.emit(kind, **fields)
+        try:
+            self._ledger.commit()
+        except JournalFullError as e:
+            self._machine.fail(PiFault.JOURNAL_FULL, str(e), wait=True)
+            raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
 
     def _need_run(self, scan_id: str) -> m.BeginRun:
         if self._run is None or self._run.scan_id != scan_id:
@@ -302,4 +342,5 @@ class Executor:
             ),
             machine.stage.firmware,
             self._run is not None,
+            machine.stage.config.placing,
         )

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from shared.errors import PolysightError
+from shared.errors import PolysightError, os_error
 
+PROGRAM = "/opt/polysight/venv/bin/polysight-pi"  # where install.sh puts it
+AS_THE_SERVICE = f"as the service's user: `sudo -u polysight {PROGRAM} ...`"
 Verdict = Literal["ok", "warn", "fail"]
 
 
@@ -25,4 +27,6 @@ def attempt(name: str, check: Callable[[], str | Finding]) -> Finding:
         found = check()
     except PolysightError as e:
         return Finding(name, "fail", e.what + (f" ({e.why})" if e.why else ""), e.remedy)
+    except OSError as e:
+        return Finding(name, "fail", os_error(e).what, AS_THE_SERVICE)
     return found if isinstance(found, Finding) else Finding(name, "ok", found)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import shutil
 import struct
 import zlib
 from array import array
@@ -24,6 +25,10 @@ from shared.errors import ConfigError, DataError, DeviceError
 
 MAGIC = b"PSJRNL1\n"
 MAX_RECORD_BYTES = 1 << 20
+CAPTURE_BYTES = 320  # a position's record takes less
+SPARE_BYTES = 4 << 20  # faults, rows taken again
+SEARCHED_BYTES = 1 << 20  # behind damage, for a good record
+DAMAGED = ".damaged"  # suffix of the copy that is kept of a damaged journal
 _HEAD = struct.Struct("<III")
 
 
@@ -69,6 +74,16 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
         offset, last = offset + _HEAD.size + length, seq
 
 
+def _holds_records(tail: bytes) -> bool:
+    """Whether a good record lies behind the damage: a power cut leaves a torn one, or zeros, and nothing behind it."""
+    for offset in range(1, min(len(tail) - _HEAD.size, SEARCHED_BYTES)):
+        length, seq, crc = _HEAD.unpack_from(tail, offset)
+        payload = tail[offset + _HEAD.size : offset + _HEAD.size + length] if 0 < length <= MAX_RECORD_BYTES else b""
+        if payload and len(payload) == length and _crc(seq, payload) == crc:
+            return True
+    return False
+
+
 class Journal:
     """The journal of one scan, open for appending.
 
@@ -76,6 +91,11 @@ class Journal:
     ----------
     path
         The file; made when absent, cut at its last good record otherwise.
+
+    Attributes
+    ----------
+    damage
+        What was cut off, when that was more than the torn record of a power cut: a copy is kept. Empty otherwise.
 
     Raises
     ------
@@ -107,12 +127,20 @@ class Journal:
     def _recover(self) -> None:
         self._end = len(MAGIC)
         with path_reader(self.path) as file:
-            size = os.fstat(self._fd).st_size
             for offset, seq, payload in records(file):
                 self._offsets.append(offset)
                 self._seqs.append(seq)
                 self._end = offset + _HEAD.size + len(payload)
-        self.cut_bytes = max(0, size - self._end)
+            file.seek(self._end)
+            tail = file.read()
+        self.cut_bytes = len(tail)
+        self.damage = ""
+        if _holds_records(tail):
+            copy = self._keep_copy()
+            self.damage = (
+                f"{self.path}: damaged behind event {self.last_seq}, {self.cut_bytes} bytes that followed are cut off;"
+                f" the file as it was is {copy}; the disk or card fails: replace it"
+            )
         if not self._seqs:
             os.pwrite(self._fd, MAGIC, 0)
         os.ftruncate(self._fd, self._end)
@@ -123,6 +151,13 @@ class Journal:
         finally:
             os.close(folder)
         self._batched_end = self._end
+
+    def _keep_copy(self) -> Path:
+        """A copy of the file beside it, under a name that is free."""
+        names = [self.path.with_name(self.path.name + DAMAGED + number) for number in ("", *map(str, range(2, 1000)))]
+        copy = next(name for name in names if not name.exists())
+        shutil.copyfile(self.path, copy)
+        return copy
 
     @property
     def last_seq(self) -> int:
@@ -236,6 +271,20 @@ class JournalFolder:
     def open(self, scan_id: str) -> Journal:
         """The journal of a scan, made when absent."""
         return Journal(self.path_of(scan_id))
+
+    def check_room(self, positions: int) -> None:
+        """Refuse a scan for whose journal the disk has no room. Raises JournalFullError."""
+        needed = positions * CAPTURE_BYTES + SPARE_BYTES
+        try:
+            free = shutil.disk_usage(self.path).free
+        except OSError as e:
+            raise _full(self.path, e) from None
+        if free < needed:
+            raise JournalFullError(
+                f"{self.path}: {free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions",
+                "the Pi's disk is full",
+                "remove old journals there",
+            )
 
     def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
         """Payloads from `from_seq` on and the newest sequence number of a scan that is not open; ([], 0) if absent."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pi_controller.finding import PROGRAM
 from shared.errors import ConfigError
+from shared.sockets import HOST_KEYS
 
 PARTIES = ("pi", "host")
+COPY = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key_secret stays on the Pi"
 
 
 def make_keys(folder: Path, replace: bool = False) -> list[Path]:
@@ -31,15 +34,15 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
     """
     from zmq.auth import create_certificates
 
-    there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
-    if there and not replace:
-        raise ConfigError(
-            f"{there[0]} exists",
-            "keys were made before; new ones lock out every host that has the old ones",
-            "keep them, or give --replace and copy the folder to the host again",
-        )
     made = []
     try:
+        there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
+        if there and not replace:
+            raise ConfigError(
+                f"{there[0]} exists",
+                "keys were made before; new ones lock out every host that has the old ones",
+                f"keep them, or give --replace, then {COPY}",
+            )
         folder.mkdir(parents=True, exist_ok=True)
         for name in PARTIES:
             public, secret = map(Path, create_certificates(folder, name))
@@ -47,6 +50,8 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
             made += [public, secret]
     except OSError as e:
         raise ConfigError(
-            f"keys cannot be written to {folder}: {e.strerror}", "no permission, or the disk is full", "choose --dir"
+            f"keys cannot be written to {folder}: {e.strerror}",
+            "another user's folder, or the disk is full",
+            f"as the service's user: `sudo -u polysight {PROGRAM} keys`; or choose --dir",
         ) from None
     return made

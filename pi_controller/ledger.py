@@ -32,10 +32,17 @@ class Ledger:
         Where journals are.
     publish
         Takes packed events, once they are in the journal.
+    warn
+        Takes sentences for the log.
     """
 
-    def __init__(self, folder: JournalFolder, publish: Callable[[list[bytes]], None]) -> None:
-        self._folder, self._publish = folder, publish
+    def __init__(
+        self,
+        folder: JournalFolder,
+        publish: Callable[[list[bytes]], None],
+        warn: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._folder, self._publish, self._warn = folder, publish, warn
         self._journal: Journal | None = None
         self._outbox: list[tuple[AnyEvent, bytes]] = []
         self._sync = False
@@ -55,15 +62,18 @@ class Ledger:
         Raises
         ------
         JournalFullError
-            when the journal cannot be had.
+            when the journal cannot be had, or there is no room for this plan's.
         DataError
             when it is no journal, or the scan was begun with another plan. In both cases nothing has changed.
         """
         self.broken = False
         self.commit()
+        self._folder.check_room(plan.positions)
         journal = self._journal
         if journal is None or self.scan_id != scan_id:
             journal = self._folder.open(scan_id)
+            if journal.damage:
+                self._warn(journal.damage)
         try:
             begun = _plan_of(journal)
             if begun is not None and begun != plan:

@@ -14,6 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from pi_controller.trigger_lines import Clock, Edge
+from shared.backends import GPIOD
 from shared.config import Pi
 from shared.errors import ConfigError, DeviceError
 from shared.faults import PiFault
@@ -173,8 +174,9 @@ class GpiodLines:
         when the chip or a line cannot be had.
     """
 
+    name: str = GPIOD
+
     def __init__(self, pi: Pi, gpiod: Any, chip_path: str | None = None, clock: Clock | None = None) -> None:
-        self.name = "gpiod"
         clock = clock or MonotonicClock()
         self.now_ns, self._clock = clock.now_ns, clock
         path = chip_path or find_chip(pi.gpio_chip, gpiod)
@@ -233,5 +235,5 @@ class GpiodLines:
 
 def _gone(e: OSError) -> DeviceError:
     return DeviceError(
-        f"GPIO lines are gone: {e.strerror}", "the chip vanished or its driver was unloaded", "polysight-pi check"
+        f"GPIO lines are gone: {e.strerror}", "the chip vanished or its driver was unloaded", "`polysight-pi check`"
     )

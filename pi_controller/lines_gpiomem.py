@@ -12,6 +12,7 @@ from typing import Any
 
 from pi_controller.lines_gpiod import GpiodLines
 from pi_controller.trigger_lines import Clock
+from shared.backends import GPIOMEM
 from shared.config import Pi
 from shared.errors import DeviceError
 
@@ -78,6 +79,8 @@ class GpiomemLines(GpiodLines):
         when a line cannot be had, or the registers do not show it as an output: they are not this chip's.
     """
 
+    name: str = GPIOMEM
+
     def __init__(self, pi: Pi, gpiod: Any, chip_path: str | None = None, clock: Clock | None = None) -> None:
         self._registers = GpioRegisters(pi.gpiomem)
         self._mask = sum(1 << n for n in pi.sync_out)
@@ -86,7 +89,6 @@ class GpiomemLines(GpiodLines):
         except DeviceError:
             self._registers.close()
             raise
-        self.name = "gpiomem"
         wrong = [n for n in pi.sync_out if self._registers.function(n) != FUNCTION_OUTPUT]
         if wrong:
             self.close()

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from pi_controller.trigger_lines import Edge
+from shared.backends import WIRES
 from shared.config import Pi
 from shared.wires import WireClient, WireEdge
 
@@ -30,8 +31,9 @@ class WireLines:
         when no hub listens at `path`.
     """
 
+    name: str = WIRES
+
     def __init__(self, path: Path, pi: Pi, timeout_s: float = 10.0) -> None:
-        self.name = "wires"
         self._trigger, self._outputs = pi.trigger_in, pi.sync_out
         self._client = WireClient(path, listen=(pi.trigger_in,), timeout_s=timeout_s)
         self._now_ns = 0

@@ -6,26 +6,20 @@ the next row). Everything that waits has a limit. Used by the executor's thread 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 from pi_controller.burst import BurstSpec
-from pi_controller.ledger import Ledger
-from pi_controller.row_ending import RowEnding
+from pi_controller.row_ending import Parts, RowEnding
 from pi_controller.rows import RefusedError, row_duration_s, stage_row
 from pi_controller.running_row import RunningRow
-from pi_controller.stage_driver import StageDriver
 from pi_controller.stage_link import StageLostError, StageRefusedError
 from pi_controller.states import MOVING
 from pi_controller.supervision import RestWatch, TriggerWatch
-from pi_controller.trigger_loop import BurstSent, LoopFault, RowJob, TriggerLoop
+from pi_controller.trigger_loop import BurstSent, LoopFault, RowJob
 from shared import messages as m
 from shared.errors import ProtocolError
 from shared.faults import PiFault, StageError, explain
 from shared.raster import Row
-from shared.stage_line import Immediate, Reply
+from shared.stage_line import HOMING_LIMIT_S, Immediate, Reply
 
-HOMING_LIMIT_S = 300.0
 END_LIMIT_S = 0.5  # from STOP to standstill when this program is told to end
 LAST_EDGE_LIMIT_S = 1.0  # from the stage's `done` to the last burst
 STATUS_EVENT_S = 0.24
@@ -39,18 +33,10 @@ NOT_ANY_MORE_HOMED = (
 
 
 class Machine(RowEnding):
-    """What may happen in which state. Parameters as :class:`pi_controller.row_ending.RowEnding`."""
+    """What may happen in which state."""
 
-    def __init__(
-        self,
-        stage: StageDriver,
-        loop: TriggerLoop,
-        ledger: Ledger,
-        post: Callable[[Callable[[], None]], None],
-        row_ended: Callable[[RunningRow], None],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        super().__init__(stage, loop, ledger, post, row_ended, clock)
+    def __init__(self, parts: Parts) -> None:
+        super().__init__(parts)
         self._homing_underway = False
         self._resting, self._trigger = RestWatch(), TriggerWatch()
         self._dead_lines = False

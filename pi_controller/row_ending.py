@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from pi_controller.ledger import Ledger
 from pi_controller.running_row import RunningRow
@@ -21,10 +21,10 @@ from shared.faults import PiFault, explain
 from shared.stage_line import Immediate
 
 
-class RowEnding:
-    """Stage, trigger loop and the row that runs.
+class Parts(NamedTuple):
+    """What the state machine works with.
 
-    Parameters
+    Attributes
     ----------
     stage, loop, ledger
         The stage, the trigger loop and the events.
@@ -36,17 +36,19 @@ class RowEnding:
         Seconds, monotonic.
     """
 
-    def __init__(
-        self,
-        stage: StageDriver,
-        loop: TriggerLoop,
-        ledger: Ledger,
-        post: Callable[[Callable[[], None]], None],
-        row_ended: Callable[[RunningRow], None],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.stage = stage
-        self._loop, self._ledger, self._post, self._row_ended, self._clock = loop, ledger, post, row_ended, clock
+    stage: StageDriver
+    loop: TriggerLoop
+    ledger: Ledger
+    post: Callable[[Callable[[], None]], None]
+    row_ended: Callable[[RunningRow], None]
+    clock: Callable[[], float] = time.monotonic
+
+
+class RowEnding:
+    """Stage, trigger loop and the row that runs."""
+
+    def __init__(self, parts: Parts) -> None:
+        self.stage, self._loop, self._ledger, self._post, self._row_ended, self._clock = parts
         self._states = States()
         self.host = HostWatch()
         self.homed = self.in_run = False
@@ -68,6 +70,15 @@ class RowEnding:
     def reason(self) -> str:
         """Reason of the first fault."""
         return self._states.reason
+
+    def hear_host(self) -> None:
+        """The host of the run lives. From any thread."""
+        self.host.heard(self._clock())
+
+    @property
+    def host_lives(self) -> bool:
+        """Whether the host of the run has kept its promise to be heard until now."""
+        return self.host.lives(self._clock())
 
     # --- ends -------------------------------------------------------------------------------------------------------
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from pi_controller.burst import MAX_WIDTH_NS, MIN_PERIOD_NS, BurstSpec
+from pi_controller.burst import BurstSpec
 from shared.config import Stage
 from shared.errors import PolysightError
 from shared.faults import PiFault, explain
 from shared.messages import BeginRun
 from shared.raster import RasterPlan, Row
+from shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT
 from shared.units import us_to_ns
-
-MIN_WIDTH_NS = 25
 
 
 class RefusedError(PolysightError):
@@ -79,19 +78,17 @@ def check_run(run: BeginRun, stage: Stage) -> None:
         f"burst of {run.pulses} x {run.period_us} us lasts {burst_s * 1e3:.2f} ms, a point passes every "
         f"{between_s * 1e3:.2f} ms at {run.speed_mm_s} mm/s",
     )
-    # The stage's ROW: one step at constant speed before the first and after the last point, beyond it the ramp.
-    run_up_mm = run.speed_mm_s**2 / (2 * stage.accel_mm_s2) + max(plan.step_x_mm, stage.backlash_mm)
-    _fits("x", plan.columns, plan.step_x_mm, run_up_mm, stage.centre_x_mm, stage.travel_x_mm)
-    _fits("y", plan.rows, plan.step_y_mm, stage.backlash_mm, stage.centre_y_mm, stage.travel_y_mm)
+    misfit = stage.misfit(plan, run.speed_mm_s)
+    _require(not misfit, misfit)
 
 
 def check_pulses(pulses: int, period_us: float, width_us: float, check_width: bool = True) -> BurstSpec:
     """The burst, where the radars take it. Raises RefusedError PERIOD_TOO_SHORT or PULSE_TOO_LONG."""
     period_ns, width_ns = us_to_ns(period_us), us_to_ns(width_us)
     if period_ns < MIN_PERIOD_NS:
-        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {period_us} us is below {MIN_PERIOD_NS / 1e3} us")
+        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {period_us} us is below {MIN_PERIOD_US} us")
     if not MIN_WIDTH_NS <= width_ns <= MAX_WIDTH_NS:
-        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {width_us} us is outside 0.025..4 us")
+        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {width_us} us is outside {WIDTH_TEXT}")
     return BurstSpec(pulses, period_ns, width_ns, check_width)
 
 
@@ -100,15 +97,6 @@ def row_of(plan: RasterPlan, index: int) -> Row:
     if index >= plan.rows:
         raise RefusedError(PiFault.BAD_REQUEST, f"row {index} is outside the plan's {plan.rows} rows")
     return plan.row(index)
-
-
-def _fits(axis: str, n: int, step_mm: float, margin_mm: float, centre_mm: float, travel_mm: float) -> None:
-    half = (n - 1) / 2 * step_mm + margin_mm
-    _require(
-        half <= centre_mm and centre_mm + half <= travel_mm,
-        f"grid of {n} x {step_mm} mm in {axis} with {margin_mm:g} mm of run-up does not fit the travel "
-        f"0..{travel_mm} mm around {centre_mm} mm",
-    )
 
 
 def _require(ok: bool, what: str) -> None:

@@ -160,6 +160,7 @@ class Server:
             last_seq=status.last_seq,
             t_unix_ns=time.time_ns(),
             in_run=snapshot.in_run,
+            stage=snapshot.placing,
         )
 
     def _beat(self, snapshot: Snapshot) -> None:

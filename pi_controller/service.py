@@ -44,6 +44,11 @@ def log(text: str) -> None:
     sys.stderr.flush()
 
 
+def gpio_lines(instrument: Instrument) -> type[GpiodLines]:
+    """Which lines drive the pins of this rig."""
+    return GpiomemLines if instrument.pi.wiring == "gpiomem" else GpiodLines
+
+
 def open_lines(instrument: Instrument, wires: Path | None, model: str | None = None) -> TriggerLines:
     """GPIO lines, or simulated wires. What this wiring costs on this computer is told in the log.
 
@@ -57,8 +62,7 @@ def open_lines(instrument: Instrument, wires: Path | None, model: str | None = N
     warning = check_wiring(instrument, read_model() if model is None else model)
     if warning:
         log(warning)
-    kind = GpiomemLines if instrument.pi.wiring == "gpiomem" else GpiodLines
-    return kind(instrument.pi, load_gpiod())
+    return gpio_lines(instrument)(instrument.pi, load_gpiod())
 
 
 def _prepare_trigger_thread() -> None:
@@ -92,10 +96,10 @@ class Service:
                 options.event_address or pi.event_address,
                 Path(pi.key_dir),
                 pi.heartbeat_ms,
-                "wires" if self._simulated else "gpiod",
+                (lines or (WireLines if self._simulated else gpio_lines(instrument))).name,
             )
             opened.callback(self.server.close)
-            self._ledger = Ledger(folder, self.server.publish)
+            self._ledger = Ledger(folder, self.server.publish, log)
             opened.callback(self._close_ledger)
             stage = StageDriver(instrument.stage, options.stage_port or instrument.stage.port, self._post)
             opened.callback(stage.close)

@@ -57,6 +57,10 @@ class HostWatch:
         """The host lives."""
         self._heard_s = max(self._heard_s, now_s)
 
+    def lives(self, now_s: float) -> bool:
+        """Whether it has kept its promise until now; False for one that promised nothing."""
+        return self._limit_s < math.inf and now_s < self.lost_at_s
+
     @property
     def lost_at_s(self) -> float:
         """When it counts as lost, unless it is heard before."""

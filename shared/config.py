@@ -5,36 +5,25 @@ Unknown keys, wrong types and broken rules are refused with the file, the key, t
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal
 
 import msgspec
 
-from shared.errors import ConfigError
+from shared.section import Count, NonNegative, Positive, Section, require
+from shared.stage import Grid, Stage
+from shared.sync_in import MIN_PERIOD_US, WIDTH_TEXT, WIDTH_US
+from shared.tables import decode, read_toml, to_builtins
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Count = Annotated[int, msgspec.Meta(ge=1)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
 Vector = tuple[float, float, float]
-T = TypeVar("T")
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
 DEBOUNCE_TICKS_US = 5_000
 HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 
 
-class _Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of the rig file: frozen, unknown keys refused."""
-
-
-def _require(ok: bool, rule: str) -> None:
-    if not ok:
-        raise ValueError(rule)
-
-
-class Chirp(_Section, frozen=True):
+class Chirp(Section, frozen=True):
     """FMCW chirp and ADC window (AWR2243 profile)."""
 
     start_hz: Positive
@@ -50,17 +39,17 @@ class Chirp(_Section, frozen=True):
 
     def __post_init__(self) -> None:
         window_us = self.samples / self.sample_rate_hz * 1e6
-        _require(
+        require(
             self.adc_start_us + window_us <= self.ramp_end_us,
             f"ADC window {self.adc_start_us} + {window_us:.2f} us must end inside the ramp of {self.ramp_end_us} us",
         )
         top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
-        _require(self.start_hz >= 76e9 and top <= 81.1e9, f"sweep {self.start_hz:.4g}..{top:.5g} Hz must be 76..81 GHz")
+        require(self.start_hz >= 76e9 and top <= 81.1e9, f"sweep {self.start_hz:.4g}..{top:.5g} Hz must be 76..81 GHz")
         none = " or 0: no filter, which only simulated rigs can have"
-        _require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
-        _require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
+        require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
+        require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
         a, b = self.linear_samples
-        _require(
+        require(
             a >= 0 and a + 12 <= b <= self.samples,
             f"linear_samples must be a range of 12 samples or more inside 0..{self.samples}",
         )
@@ -81,7 +70,7 @@ class Chirp(_Section, frozen=True):
         return self.hz_per_sample * self.samples
 
 
-class Burst(_Section, frozen=True):
+class Burst(Section, frozen=True):
     """SYNC_IN pulses of one position; each starts one frame of one chirp."""
 
     pulses: Count
@@ -89,42 +78,15 @@ class Burst(_Section, frozen=True):
     width_us: Positive = 1.0
 
     def __post_init__(self) -> None:
-        _require(self.period_us >= 300.0, "period_us must be at least 300 us (shortest frame period of the AWR2243)")
-        _require(0.025 <= self.width_us <= 4.0, "width_us must be 0.025..4 us (SYNC_IN pulse of the AWR2243)")
+        require(
+            self.period_us >= MIN_PERIOD_US,
+            f"period_us must be at least {MIN_PERIOD_US:g} us (shortest frame period of the AWR2243)",
+        )
+        shortest, longest = WIDTH_US
+        require(shortest <= self.width_us <= longest, f"width_us must be {WIDTH_TEXT} (SYNC_IN pulse of the AWR2243)")
 
 
-class Grid(_Section, frozen=True):
-    """Serpentine raster of stage positions."""
-
-    columns: Count
-    rows: Count
-    step_x_mm: Positive
-    step_y_mm: Positive
-
-
-class Stage(_Section, frozen=True):
-    """Motion stage and its serial link."""
-
-    port: str
-    baud: Count = 115200
-    steps_per_mm: Positive = 200.0
-    speed_mm_s: Positive = 20.0
-    travel_speed_mm_s: Positive = 40.0
-    accel_mm_s2: Positive = 200.0
-    heartbeat_ms: Count = 500
-    trigger_width_us: Count = 20
-    travel_x_mm: Positive = 800.0
-    travel_y_mm: Positive = 500.0
-    centre_x_mm: NonNegative = 400.0
-    centre_y_mm: NonNegative = 250.0
-    backlash_mm: NonNegative = 0.0
-
-    def __post_init__(self) -> None:
-        _require(self.centre_x_mm <= self.travel_x_mm, "centre_x_mm must lie within travel_x_mm")
-        _require(self.centre_y_mm <= self.travel_y_mm, "centre_y_mm must lie within travel_y_mm")
-
-
-class Pi(_Section, frozen=True):
+class Pi(Section, frozen=True):
     """Raspberry Pi: lines, sockets, journal."""
 
     gpio_chip: str = "pinctrl-bcm2711"
@@ -135,7 +97,7 @@ class Pi(_Section, frozen=True):
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
     journal_dir: str = "journal"
-    key_dir: str = "keys"
+    key_dir: str = "keys"  # a relative path counts from the rig file's folder
     heartbeat_ms: Count = 500
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
@@ -143,17 +105,17 @@ class Pi(_Section, frozen=True):
     host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # how often the host says that it lives; 0: never
 
     def __post_init__(self) -> None:
-        _require(len(self.sync_out) > 0, "sync_out needs at least one line")
-        _require(self.trigger_in not in self.sync_out, "trigger_in must not be one of sync_out")
-        _require(
+        require(len(self.sync_out) > 0, "sync_out needs at least one line")
+        require(self.trigger_in not in self.sync_out, "trigger_in must not be one of sync_out")
+        require(
             self.wiring != "fanout" or len(self.sync_out) == 1, 'wiring = "fanout" drives exactly one line in sync_out'
         )
-        _require(
+        require(
             self.wiring != "gpiomem" or max(self.sync_out) < 32, 'wiring = "gpiomem" drives lines 0..31 of one register'
         )
 
 
-class MountStep(_Section, frozen=True):
+class MountStep(Section, frozen=True):
     """One step of a mount: a shift, or a turn about an axis of the rig."""
 
     shift_mm: Vector | None = None
@@ -161,20 +123,20 @@ class MountStep(_Section, frozen=True):
     about: Literal["x", "y", "z"] | None = None
 
     def __post_init__(self) -> None:
-        _require(
+        require(
             (self.shift_mm is not None) != (self.turn_deg is not None and self.about is not None),
             "a mount step is either { shift_mm = [x, y, z] } or { turn_deg = a, about = axis }",
         )
 
 
-class Antennas(_Section, frozen=True):
+class Antennas(Section, frozen=True):
     """Antenna positions on one board, board frame, millimetres from RX1."""
 
     rx_mm: tuple[Vector, ...]
     tx_mm: tuple[Vector, ...]
 
 
-class Board(_Section, frozen=True):
+class Board(Section, frozen=True):
     """One radar board and its capture card."""
 
     name: str
@@ -189,7 +151,7 @@ class Board(_Section, frozen=True):
     start_offset_hz: float = 0.0
 
 
-class Card(_Section, frozen=True):
+class Card(Section, frozen=True):
     """DCA1000 settings common to all boards."""
 
     packet_bytes: Annotated[int, msgspec.Meta(ge=24, le=1470)] = 1470
@@ -197,7 +159,7 @@ class Card(_Section, frozen=True):
     receive_buffer_bytes: Count = 8 << 20
 
 
-class NativeRadar(_Section, frozen=True):
+class NativeRadar(Section, frozen=True):
     """One board under `radar.control = "native"`.
 
     `ldo_bypass` can destroy a board with 1.3 V on its RF supplies: it needs the board's own USB serial number, again,
@@ -209,7 +171,7 @@ class NativeRadar(_Section, frozen=True):
     ldo_bypass_acknowledged: str = ""
 
 
-class Radar(_Section, frozen=True):
+class Radar(Section, frozen=True):
     """How the radars are made to wait for the pulses of a row.
 
     `endless`: started once, with frames without end; nothing is needed. `line_server`: each board's control server is
@@ -218,8 +180,10 @@ class Radar(_Section, frozen=True):
     """
 
     control: Literal["endless", "line_server", "native"] = "endless"
-    servers: dict[str, Annotated[str, msgspec.Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")]] = {}
-    native: dict[str, NativeRadar] = {}
+    servers: dict[str, Annotated[str, msgspec.Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")]] = msgspec.field(
+        default_factory=dict
+    )
+    native: dict[str, NativeRadar] = msgspec.field(default_factory=dict)
     idle_us: Positive = 100.0  # before each chirp
     rx_gain_db: int = 30
     rf_gain_target_db: Literal[30, 33, 36] = 30
@@ -228,18 +192,18 @@ class Radar(_Section, frozen=True):
     def __post_init__(self) -> None:
         for board, address in self.servers.items():
             port = int(address.rpartition(":")[2])
-            _require(0 < port <= 65535, f"port {port} of radar.servers.{board} is outside 1..65535")
+            require(0 < port <= 65535, f"port {port} of radar.servers.{board} is outside 1..65535")
         serials = [b.usb_serial for b in self.native.values()]
-        _require(len(set(serials)) == len(serials), f"each of radar.native needs its own usb_serial, not {serials}")
+        require(len(set(serials)) == len(serials), f"each of radar.native needs its own usb_serial, not {serials}")
 
 
-class Geometry(_Section, frozen=True):
+class Geometry(Section, frozen=True):
     """Where the object plane is."""
 
     object_distance_mm: Positive
 
 
-class Image(_Section, frozen=True):
+class Image(Section, frozen=True):
     """Image grid, centred on the specular midpoint of TX and H."""
 
     columns: Count = 150
@@ -248,7 +212,7 @@ class Image(_Section, frozen=True):
     apodisation: Literal["none", "kaiser", "taylor"] = "kaiser"
 
 
-class Polarimetry(_Section, frozen=True):
+class Polarimetry(Section, frozen=True):
     """Cross-polar leakage of the receivers as [real, imaginary] amplitude, and the Gaussian filter against speckle."""
 
     leakage_h: tuple[float, float] = (0.0, 0.0)
@@ -256,7 +220,7 @@ class Polarimetry(_Section, frozen=True):
     smooth_px: NonNegative = 1.5
 
 
-class CalibrationFiles(_Section, frozen=True):
+class CalibrationFiles(Section, frozen=True):
     """Dated files that `polysight calibrate` wrote; "" for none. Relative paths count from the rig file's folder."""
 
     direct_path: str = ""
@@ -264,7 +228,7 @@ class CalibrationFiles(_Section, frozen=True):
     metal: str = ""
 
 
-class Limits(_Section, frozen=True):
+class Limits(Section, frozen=True):
     """How much a scan puts up with."""
 
     row_retakes: Annotated[int, msgspec.Meta(ge=0)] = 2
@@ -274,7 +238,7 @@ class Limits(_Section, frozen=True):
     rows_waiting: Count = 8  # rows that may wait to be processed before the next one is not begun
 
 
-class Instrument(_Section, frozen=True):
+class Instrument(Section, frozen=True):
     """The whole rig file."""
 
     name: str
@@ -296,39 +260,32 @@ class Instrument(_Section, frozen=True):
     def __post_init__(self) -> None:
         for role in ("transmit", "receive_h", "receive_v"):
             n = sum(b.role == role for b in self.boards)
-            _require(n == 1, f'boards must hold exactly one with role = "{role}", found {n}')
+            require(n == 1, f'boards must hold exactly one with role = "{role}", found {n}')
         # Where the chip does not debounce (no Pi's does), the kernel looks at the level some ticks after the edge.
-        _require(
+        require(
             self.pi.trigger_debounce_us == 0
             or self.stage.trigger_width_us >= self.pi.trigger_debounce_us + DEBOUNCE_TICKS_US,
             f"pi.trigger_debounce_us needs stage.trigger_width_us of at least {DEBOUNCE_TICKS_US} us more, or it"
             " swallows every trigger; 0 switches it off",
         )
         names = [b.name for b in self.boards]
-        _require(len(set(names)) == len(names), f"board names must differ: {names}")
+        require(len(set(names)) == len(names), f"board names must differ: {names}")
         hosts = [(b.host_address, b.data_port) for b in self.boards]
-        _require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")
+        require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")
         unknown = sorted(set(self.radar.servers) - set(names))
-        _require(not unknown, f"radar.servers names no board: {unknown}; the boards are {names}")
+        require(not unknown, f"radar.servers names no board: {unknown}; the boards are {names}")
         without = [n for n in names if n not in self.radar.servers]
-        _require(
+        require(
             self.radar.control != "line_server" or not without,
             f'radar.control = "line_server" needs one of radar.servers for every board, none for {without}',
         )
-        _require(
+        require(
             self.radar.control != "native" or set(self.radar.native) == set(names),
             f'radar.control = "native" needs radar.native for each of the boards {names}, not {[*self.radar.native]}',
         )
-        _require(self.transmitter.tx_antenna < len(self.antennas.tx_mm), "tx_antenna is not one of antennas.tx_mm")
-        for axis, n, step, centre, travel in (
-            ("x", self.grid.columns, self.grid.step_x_mm, self.stage.centre_x_mm, self.stage.travel_x_mm),
-            ("y", self.grid.rows, self.grid.step_y_mm, self.stage.centre_y_mm, self.stage.travel_y_mm),
-        ):
-            half = (n - 1) / 2 * step
-            _require(
-                half <= centre and centre + half <= travel,
-                f"grid of {n} x {step} mm in {axis} does not fit the travel 0..{travel} mm around centre {centre} mm",
-            )
+        require(self.transmitter.tx_antenna < len(self.antennas.tx_mm), "tx_antenna is not one of antennas.tx_mm")
+        misfit = self.stage.misfit(self.grid)
+        require(not misfit, misfit)
 
     @property
     def transmitter(self) -> Board:
@@ -366,52 +323,15 @@ class Instrument(_Section, frozen=True):
         """Bytes one board sends in one complete row."""
         return self.grid.columns * self.burst.pulses * self.frame_bytes
 
+    @property
+    def recorded_row_bytes(self) -> int:
+        """Bytes that are recorded of one complete row, of all boards."""
+        return len(self.recorded) * self.row_bytes
 
-def _lookup(data: Any, path: str) -> str:
-    """The value a msgspec error path such as `$.boards[0].name` points at, for the message; '' when absent."""
-    node = data
-    for part in path.removeprefix("$").replace("[", ".[").split("."):
-        if not part:
-            continue
-        try:
-            node = node[int(part[1:-1])] if part.startswith("[") else node[part]
-        except (KeyError, IndexError, TypeError, ValueError):
-            return ""
-    return "" if isinstance(node, dict | list) else repr(node)
-
-
-def decode(raw: dict[str, Any], kind: type[T], source: str) -> T:
-    """Check a parsed TOML or JSON table against a typed declaration.
-
-    Raises
-    ------
-    ConfigError
-        naming `source`, the key, its value and the rule that is broken.
-    """
-    try:
-        return msgspec.convert(raw, kind)
-    except msgspec.ValidationError as e:
-        rule, _, path = str(e).partition(" - at `")
-        path = path.rstrip("`") or "$"
-        value = _lookup(raw, path)
-        key = path.removeprefix("$").lstrip(".") or "(top level)"
-        raise ConfigError(
-            f"{source}: {key}{' = ' + value if value else ''}: {rule}",
-            "the file does not follow its declaration",
-            f"correct {key} in {source}; instrument.toml in the repository shows every key with its meaning",
-        ) from None
-
-
-def read_toml(path: Path) -> dict[str, Any]:
-    """Parse a TOML file. Raises ConfigError when it is absent, unreadable or not TOML."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file", "the path is wrong", "give the path of a TOML file") from None
-    except (OSError, UnicodeDecodeError) as e:
-        raise ConfigError(f"{path}: cannot be read: {e}", "not a readable text file", "check the path") from None
-    except tomllib.TOMLDecodeError as e:
-        raise ConfigError(f"{path}: not valid TOML: {e}", "a typing error", "correct that line") from None
+    @property
+    def scan_bytes(self) -> int:
+        """Bytes that are recorded of a whole scan: its raw rows."""
+        return self.grid.rows * self.recorded_row_bytes
 
 
 def load_instrument(path: Path) -> Instrument:
@@ -423,18 +343,7 @@ def load_instrument(path: Path) -> Instrument:
         naming file, key, value and rule.
     """
     rig = decode(read_toml(path), Instrument, str(path))
-    files = {kind: name and str(path.parent.resolve() / name) for kind, name in to_builtins(rig.calibration).items()}
-    return msgspec.structs.replace(rig, calibration=CalibrationFiles(**files))
-
-
-def to_builtins(config: Any) -> dict[str, Any]:
-    """A configuration as plain dicts and lists, None left out, for JSON, TOML or msgpack."""
-    return _without_none(msgspec.to_builtins(config))
-
-
-def _without_none(node: Any) -> Any:
-    if isinstance(node, dict):
-        return {k: _without_none(v) for k, v in node.items() if v is not None}
-    if isinstance(node, list | tuple):
-        return [_without_none(v) for v in node]
-    return node
+    folder = path.parent.resolve()  # from now on the working folder does not matter, nor where a manifest is read
+    files = {kind: name and str(folder / name) for kind, name in to_builtins(rig.calibration).items()}
+    pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
+    return msgspec.structs.replace(rig, pi=pi, calibration=CalibrationFiles(**files))

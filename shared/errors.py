@@ -31,6 +31,11 @@ class PolysightError(Exception):
         return "\n  ".join(parts)
 
 
+def advice(*parts: str) -> str:
+    """What to do, as one sentence: the parts that say something."""
+    return "; ".join(part for part in parts if part)
+
+
 class ConfigError(PolysightError):
     """A configuration file has a wrong, missing or unknown key."""
 
@@ -57,6 +62,16 @@ class DeviceError(PolysightError):
     """A device, peer or network hop does not do what it should."""
 
     exit_status = 5
+
+
+def os_error(
+    e: OSError,
+    why: str = "the disk is full, a path is wrong, or you may not write there",
+    remedy: str = "check the path, its permissions and the free space (df -h)",
+) -> DeviceError:
+    """What the operating system refused and nobody caught, for a person: commands end with it instead of a trace."""
+    where = f"{e.filename}: " if e.filename else ""
+    return DeviceError(f"{where}{e.strerror or e}", why, advice(remedy, *getattr(e, "__notes__", ())))
 
 
 class ScanError(PolysightError):

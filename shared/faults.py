@@ -142,7 +142,7 @@ EXPLANATIONS: dict[int, Explanation] = {
     PiFault.EDGE_DURING_BURST: Explanation(
         "the next trigger came before the burst had ended",
         "stage too fast for burst x period",
-        "lower stage.speed_mm_s or burst.pulses",
+        "lower stage.speed_mm_s or burst.pulses, and make a new scan",
     ),
     PiFault.PULSE_TOO_LONG: Explanation(
         "a SYNC_IN pulse may have been longer than 4 us",
@@ -155,7 +155,9 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the row is taken again; check the load of the Pi",
     ),
     PiFault.TRIGGER_LINE_LOST: Explanation(
-        "the trigger line is gone", "another program took the line, or the chip vanished", "polysight-pi check"
+        "the trigger line is gone",
+        "another program took the line, or the chip vanished",
+        "stop polysight-pi on the Pi, `polysight-pi check` there, start it again",
     ),
     PiFault.HOST_LOST: Explanation(
         "the host is silent", "host program or network down", "polysight resume SCAN on the host"

@@ -224,7 +224,7 @@ AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume |
 
 
 class HelloReply(_Message, frozen=True, kw_only=True):
-    """Who answers, and in which state. `t_unix_ns` is the Pi's wall clock when it answered (0: it does not tell)."""
+    """Who answers, and in which state. Not told: 0 of the wall clock, {} of `stage` (`shared.stage.Stage.placing`)."""
 
     pi_release: str
     firmware: str
@@ -234,6 +234,7 @@ class HelloReply(_Message, frozen=True, kw_only=True):
     last_seq: Natural
     t_unix_ns: Natural = 0
     in_run: bool = False
+    stage: dict[str, float] = {}
 
 
 class Accepted(_Message, frozen=True, kw_only=True):

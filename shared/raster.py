@@ -37,9 +37,10 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Grid column (0 = smallest x) of the i-th point met in this row."""
         return i if self.direction > 0 else self.points - 1 - i
 
-    def x_mm(self, i: int) -> float:
-        """Nominal x offset of the i-th point met in this row."""
-        return self.x_start_mm + i * self.step_mm
+    @property
+    def x_mm(self) -> tuple[float, ...]:
+        """Nominal x offset of every point, in the order they are met (plain numbers: the Pi has no NumPy)."""
+        return tuple(self.x_start_mm + i * self.step_mm for i in range(self.points))
 
 
 class RasterPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

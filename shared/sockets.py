@@ -11,6 +11,9 @@ import zmq
 from shared.errors import ConfigError, DeviceError
 
 Socket = zmq.Socket[bytes]
+HOST_KEYS = ("pi.key", "host.key_secret")
+"""What the host needs of the keys that were made on the Pi. `pi.key_secret` never leaves the Pi."""
+PI_KEYS = ("pi.key_secret",)
 EVENT_TOPIC = b"event"
 
 
@@ -39,13 +42,13 @@ def is_loopback(address: str) -> bool:
 def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """CURVE on a socket whose address is not loopback.
 
-    `key_dir` holds `pi.key_secret`, `pi.key`, `host.key_secret` and `host.key` as zmq.auth writes them. The server
-    accepts any client that knows its public key; an address that is not loopback is refused without keys.
+    `key_dir` holds PI_KEYS or HOST_KEYS as zmq.auth writes them. The server accepts any client that knows its public
+    key; an address that is not loopback is refused without keys.
     """
     if is_loopback(address):
         return
-    own, peer = ("pi", "host") if server else ("host", "pi")
-    secret_file, peer_file = key_dir / f"{own}.key_secret", key_dir / f"{peer}.key"
+    needed = PI_KEYS if server else HOST_KEYS
+    secret_file = key_dir / needed[-1]
     try:
         from zmq.auth import load_certificate
 
@@ -56,12 +59,14 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
         if server:
             socket.curve_server = True
         else:
-            socket.curve_serverkey = load_certificate(peer_file)[0]
+            socket.curve_serverkey = load_certificate(key_dir / HOST_KEYS[0])[0]
     except (OSError, ValueError) as e:
         raise ConfigError(
             f"{address} is not loopback and there are no usable CURVE keys: {e}",
-            f"{key_dir} lacks {secret_file.name} or {peer_file.name}",
-            "make keys with `polysight-pi keys`, or use a loopback address",
+            f"{key_dir} lacks {' or '.join(needed)}, or they belong to another user",
+            "make keys with `polysight-pi keys`, or use a loopback address"
+            if server
+            else f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {key_dir}",
         ) from None
 
 

@@ -16,6 +16,7 @@ from shared.errors import ProtocolError
 PROTOCOL_VERSION = 1
 MAX_LINE_BYTES = 96
 MAX_SEQUENCE = 65535
+HOMING_LIMIT_S = 300.0  # then the Pi gives up and says why; whoever waits for the Pi waits longer
 _VALUE = re.compile(r"-?[0-9]{1,10}")
 _COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")
 _FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import msgspec
 
-from shared.config import decode, read_toml
 from shared.errors import ConfigError
+from shared.tables import decode, read_toml
 
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Natural = Annotated[int, msgspec.Meta(ge=0)]
@@ -84,8 +84,16 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return bool(some) or self.corrupts or self.stop_after_packets is not None
 
 
+# Faults that happen under one radar control only.
+OF_CONTROL = {"line_server": ("retrigger_fails", "retrigger_resets"), "native": ("radar_fault_pulses",)}
+
+
 def read_faults(
-    path: Path | None, settings: list[str], boards: tuple[str, ...], base: dict[str, Any] | None = None
+    path: Path | None,
+    settings: list[str],
+    boards: tuple[str, ...],
+    base: dict[str, Any] | None = None,
+    control: str | None = None,
 ) -> dict[str, Faults]:
     """Faults per board: `base`, then the file, then the command line's settings.
 
@@ -99,11 +107,13 @@ def read_faults(
         TOML file: keys in `[faults]` count for every board, in `[faults.NAME]` for that board.
     settings
         `KEY=VALUE` for every board or `NAME.KEY=VALUE` for one; the value is written as in TOML.
+    control
+        The rig's `radar.control`; None where there are no radars.
 
     Raises
     ------
     ConfigError
-        for unknown keys, boards or values.
+        for unknown keys, boards or values, and for faults of a radar control that the rig does not have.
     """
     table: dict[str, Any] = dict(base or {})
     if path is not None:
@@ -122,7 +132,16 @@ def read_faults(
     own = {k: v for k, v in table.items() if isinstance(v, dict)}
     if unknown := sorted(set(own) - set(boards)):
         raise ConfigError(f"faults for unknown boards {unknown}", f"the boards are {list(boards)}", "correct the name")
-    return {name: decode({**common, **own.get(name, {})}, Faults, f"faults of {name}") for name in boards}
+    faults = {name: decode({**common, **own.get(name, {})}, Faults, f"faults of {name}") for name in boards}
+    for name, f in faults.items():
+        for needed, keys in OF_CONTROL.items():
+            if control not in (None, needed) and (idle := [key for key in keys if getattr(f, key)]):
+                raise ConfigError(
+                    f"faults {idle} of {name}: the rig has radar.control = {control!r}",
+                    f"they happen with {needed!r} only",
+                    "leave them out, or change radar.control (--native makes it native)",
+                )
+    return faults
 
 
 def _merge(table: dict[str, Any], more: dict[str, Any]) -> None:

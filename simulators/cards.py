@@ -29,7 +29,7 @@ from simulators.line_server import LineServer
 from simulators.pattern import PatternSource, SignalSource
 from simulators.radar import SimulatedRig
 from simulators.radar_socket import RadarSocket
-from simulators.scene import Scene, load_scene
+from simulators.scene import Disturbances, Scene, load_scene
 from simulators.simulated_card import SimulatedCard
 from simulators.sync_in import StageTrack
 
@@ -48,7 +48,7 @@ class CardServer:
         wires: WireClient,
         time_scale: float,
         clock_s: Clock,
-        burst_motion: bool = True,
+        track: StageTrack,
         power_cycle: Event | None = None,
         control: Sequence[LineServer] = (),
         chips: Sequence[RadarSocket] = (),
@@ -60,7 +60,7 @@ class CardServer:
         self._trigger = rig.pi.trigger_in
         self._time_scale = time_scale
         self._clock_s = clock_s
-        self._track = StageTrack(rig, burst_motion)
+        self._track = track
         self._trigger_ns = self._pulse_ns = 0
         self._selector = selectors.DefaultSelector()
         self._bound: dict[SimulatedCard, tuple[int, int]] = {}  # number of the card's binding, its descriptor then
@@ -223,7 +223,7 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     names = _check_arguments(args, known)
     scene = None if args.scene is None else load_scene(args.scene)
     base = {} if scene is None else {"loss": scene.disturbances.packet_loss}
-    faults = read_faults(args.faults, args.fault, known, base)
+    faults = read_faults(args.faults, args.fault, known, base, rig.radar.control)
     seed = args.seed if args.seed is not None else 0 if scene is None else scene.seed
     source = _source(args, rig, scene, names)
     power_cycle = Event()
@@ -236,7 +236,8 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
         cards.append(SimulatedCard(rig, board, source, faults[name], seed, args.time_scale, time.monotonic, pace))
     lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))
     wires = open_things.enter_context(closing(WireClient(args.wires, lines, motion=True)))
-    burst_motion = scene is None or scene.disturbances.burst_motion
+    disturbed = Disturbances() if scene is None else scene.disturbances
+    track = StageTrack(rig, disturbed.burst_motion, disturbed.backlash_mm)
     control: list[LineServer] = []
     chips: list[RadarSocket] = []
     for card in cards:
@@ -248,7 +249,7 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
             name = card.board.name
             control.append(LineServer(rig.radar.servers[name], card.rearm, faults[name]))
             open_things.callback(control[-1].close)
-    server = CardServer(rig, cards, wires, args.time_scale, time.monotonic, burst_motion, power_cycle, control, chips)
+    server = CardServer(rig, cards, wires, args.time_scale, time.monotonic, track, power_cycle, control, chips)
     open_things.callback(server.close)
     announce_ready(", ".join(f"{c.board.name} at {c.board.card_address}" for c in cards))
     server.serve(stop)

@@ -23,8 +23,9 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy.special import i0
 
-from shared.config import Board, Instrument, to_builtins
+from shared.config import Board, Instrument
 from shared.errors import DataError
+from shared.tables import to_builtins
 from shared.units import SPEED_OF_LIGHT_M_S
 from simulators.optics import (
     Real,
@@ -34,9 +35,12 @@ from simulators.optics import (
     direct_factor,
     plate_scale,
     point_scale,
+    sampled,
 )
 from simulators.scene import Scene
 from simulators.spectral_axis import OVERSAMPLING, TAPS, Axis, spectral_axes
+
+_PHYSICS = 2  # counts changes of what a cached field holds
 
 _KAISER_BETA = 8.0
 _ANGLE_TOLERANCE = 1e-4  # of the Chebyshev series in the local angle
@@ -153,8 +157,8 @@ def build_field(
     if cache_dir is None:
         return _compute(rig, scene, board, samples_hz)
     d = scene.disturbances
-    key = to_builtins([rig, scene.plates, scene.points, scene.object_gain, d.leakage_h, d.leakage_v])
-    text = json.dumps([1, key, board.name, list(samples_hz[[0, -1]])], sort_keys=True)
+    key = to_builtins([rig, scene.plates, scene.points, scene.object_gain, d.leakage_h, d.leakage_v, d.backlash_mm])
+    text = json.dumps([_PHYSICS, key, board.name, list(samples_hz[[0, -1]])], sort_keys=True)
     path = cache_dir / f"field-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npz"
     if path.exists():
         try:
@@ -237,9 +241,8 @@ def _compute(rig: Instrument, scene: Scene, board: Board, samples_hz: Real) -> O
     none = np.zeros(len(points))
     point_x = _spectra(ax, ant.centre_m[0] + points[:, 0], none)
     point_y = _spectra(ay, ant.centre_m[1] + points[:, 1], none)
-    amplitudes = (
-        np.array([complex(*p.amplitude) for p in scene.points]) * point_scale(ant) * direct_factor(board, scene)
-    )
+    amplitudes = sampled(np.array([complex(*p.amplitude) for p in scene.points])) * point_scale(ant)
+    amplitudes = amplitudes * direct_factor(board, scene)
 
     fade = np.outer(ay.fade, ax.fade)
     angle = chebyshev.chebvander(

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared import __version__
-from shared.config import Instrument, to_builtins
+from shared.config import Instrument
 from shared.errors import DataError
 from shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_kept
 from shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s
+from shared.tables import to_builtins
 from shared.units import NS_PER_S, us_to_ns
 
 Gaps = list[tuple[int, int]]

@@ -11,8 +11,9 @@ import socket
 from contextlib import ExitStack
 from typing import Any
 
-from shared.config import Instrument, decode, to_builtins
+from shared.config import Instrument
 from shared.errors import DeviceError
+from shared.tables import decode, to_builtins
 from simulators.card_sender import bound_udp
 from simulators.dca1000 import SOURCE_PORT
 

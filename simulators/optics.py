@@ -1,5 +1,9 @@
 """The integrand of the object's echo, and its exact, slow sum: physical optics on a plane parallel to the stage.
 
+A wave that comes later has an IF of phase +2 pi f tau: a receiver's samples are the conjugate of the wave (time
+dependence exp(+j omega t), so a delay is exp(-j 2 pi f tau)), and all that lies on its way is conjugated with it: what
+the wave met is multiplied by here as its conjugate, :func:`sampled`.
+
 Amplitudes are relative to the direct path: a free path of length R has amplitude d / R, d the board's direct path to
 RX1. Antenna patterns are not modelled beyond one constant, the scene's `object_gain`.
 """
@@ -8,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +63,13 @@ def antennas(rig: Instrument, board: Board) -> Antennas:
     return Antennas(tx, rx, rig.geometry.object_distance_mm / 1e3, centre)
 
 
+def sampled(factor: Any) -> Any:
+    """What samples show of a wave's complex factor (reflection, leakage): its conjugate."""
+    return np.conj(factor)
+
+
 def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
-    """What a board sees of a plate: its own polarisation plus its cross-polar leakage of the other.
+    """What a board's samples show of a plate: its own polarisation plus its cross-polar leakage of the other.
 
     H: r_s + leak_h r_p. V: r_p + leak_v r_s. TX is turned 45 degrees: both polarisations leave with the same strength.
     """
@@ -67,25 +77,25 @@ def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
 
     def h(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
         s, p = plate_reflection(plate, frequency_hz, theta)
-        return s + leak_h * p
+        return sampled(s + leak_h * p)
 
     def v(plate: Plate, frequency_hz: float, theta: Real) -> Complex:
         s, p = plate_reflection(plate, frequency_hz, theta)
-        return p + leak_v * s
+        return sampled(p + leak_v * s)
 
     return h if board.role == "receive_h" else v
 
 
 def direct_factor(board: Board, scene: Scene) -> complex:
-    """The direct path seen by a board: s and p parts are equal, so it is 1 + leakage."""
+    """The direct path in a board's samples: s and p parts are equal, so the wave is 1 + leakage."""
     d = scene.disturbances
-    return 1.0 + complex(*(d.leakage_h if board.role == "receive_h" else d.leakage_v))
+    return sampled(1.0 + complex(*(d.leakage_h if board.role == "receive_h" else d.leakage_v)))
 
 
 def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
     """Constant before the plates' integral: object_gain d / (j lambda), so that an endless mirror gives -gain d / R.
 
-    Kirchhoff's integral (Goodman, Introduction to Fourier Optics, section 3.5) for phase +2 pi f tau:
+    Kirchhoff's integral (Goodman, Introduction to Fourier Optics, section 3.5), which has phase +2 pi f tau as well:
     field = (1 / j lambda) integral r(theta) obliquity exp(+j 2 pi f (r1 + r2) / c) / (r1 r2) dA.
     """
     return complex(scene.object_gain * ant.direct_m[0] * frequency_hz / SPEED_OF_LIGHT_M_S / 1j)
@@ -138,7 +148,7 @@ def field_exact(
     for point in scene.points:
         px, py = ant.centre_m[:2] + np.array(point.position_mm) / 1e3
         r1, r2, _, _ = ant.legs(px - offsets_m[:, 0], py - offsets_m[:, 1], rx)
-        spread = complex(*point.amplitude) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
+        spread = sampled(complex(*point.amplitude)) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
         phase = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(r1 + r2, frequencies_hz))
         out += spread[:, None] * phase
     return out

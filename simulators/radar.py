@@ -281,7 +281,7 @@ def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) ->
         expand = base * np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away, f))[:, None]
         cube = np.empty((len(direct_m), plan.rows, plan.columns, len(f)), dtype=np.complex64)
         for row in plan:
-            x = np.array([row.x_mm(i) + row.direction * travel for i in range(row.points)])
+            x = np.array(row.x_mm) + row.direction * travel
             nodes = field.at(x / 1e3, np.full(len(x), row.y_mm / 1e3))
             order = [row.column(i) for i in range(row.points)]
             cube[:, row.index, order] = np.einsum("prq,rqk->rpk", nodes, expand.astype(np.complex64), optimize=True)

@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 from shared.errors import ConfigError, DataError, PolysightError
 from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
 from simulators.card_endpoint import CardEndpoint, Clock
-from simulators.card_faults import read_faults
+from simulators.card_faults import OF_CONTROL, read_faults
 from simulators.card_sender import Pace
 from simulators.dca1000 import Network
 from simulators.fault_draws import EventKind
 from simulators.simulated_card import MAC
 
 _OF_PULSES = ("overflow", "ddr_full", "missed_pulse", "miss_pulses", *(kind.value for kind in EventKind))
+_OF_RADARS = tuple(key for keys in OF_CONTROL.values() for key in keys)
 BOARD = "card"  # its name where no scan gives one
 IDLE_S = 0.1
 PLAYING_S = 0.002
@@ -220,8 +221,9 @@ def _run(args: argparse.Namespace, stop: Event) -> None:
     for path in files:
         Recording(path)  # refuse now what could not be played later
     faults = read_faults(args.faults, args.fault, (name,))[name]
-    if needless := [key for key in _OF_PULSES if getattr(faults, key)]:
-        raise ConfigError(f"faults {needless}", "a replay has no SYNC_IN pulses and knows no frames", "leave them out")
+    if needless := [key for key in (*_OF_PULSES, *_OF_RADARS) if getattr(faults, key)]:
+        why = "a replay has no SYNC_IN pulses and no radar, and knows no frames"
+        raise ConfigError(f"faults {needless}", why, "leave them out")
     network = Network(args.host_address, args.card_address, MAC, args.command_port, args.data_port)
     pace = Pace(not (args.no_wait or args.real_pacing), args.real_pacing)
     endpoint = CardEndpoint(name, network, faults, args.seed, args.time_scale, time.monotonic, pace, lanes=None)

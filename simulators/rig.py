@@ -21,9 +21,11 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
-from shared.config import Instrument, decode, load_instrument, to_builtins
-from shared.errors import ConfigError, DeviceError, PolysightError
+from shared.config import Instrument, load_instrument
+from shared.errors import ConfigError, DeviceError, PolysightError, os_error
+from shared.tables import decode, to_builtins
 from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
+from simulators.card_faults import read_faults
 from simulators.loopback import on_free_subnet
 from simulators.scene import Scene, apply_scene, load_scene
 from simulators.simulate import truth
@@ -36,8 +38,7 @@ UNO_TIME_SCALE = 2.0
 _LOOK_S = 0.02
 _NATIVE_OFFSET_HZ = 790e3  # puts the published rig's direct path in the middle of its IF window
 _LOG_LINES = 15
-# Several processes share few cores: one thread each for linear algebra. Two that spin against each other are ten times
-# slower than one.
+# One thread each for linear algebra: two that spin against each other on few cores are ten times slower than one.
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 
@@ -280,9 +281,13 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
             f"give at most {UNO_TIME_SCALE:g}, or leave out --uno",
         )
     scene = None if scene_path is None else load_scene(scene_path)
+    if options.time_scale <= 0:
+        raise ConfigError(f"--time-scale {options.time_scale:g}", "time runs forwards", "give a number above 0")
     if scene is None and not options.pattern:
         raise ConfigError("neither --scene nor --pattern", "the radars need something to see", "give one of them")
     rig = derive(load_instrument(config), scene, folder, options.native)
+    boards = tuple(b.name for b in rig.boards)
+    read_faults(options.faults, list(options.single_faults), boards, control=rig.radar.control)  # else nothing starts
     folder.mkdir(parents=True, exist_ok=True)
     _write_files(rig, scene, folder, options)
     power_cycle = Event()
@@ -328,20 +333,13 @@ def main(argv: list[str] | None = None) -> int:
     stop = stop_requested()
     die_with_parent()
     options = RigOptions(
-        args.time_scale,
-        args.with_pi,
-        args.seed,
-        args.pattern,
-        args.faults,
-        tuple(args.fault),
-        args.cache,
-        args.real_pacing,
-        args.uno,
-        args.native,
-    )
+        args.time_scale, args.with_pi, args.seed, args.pattern, args.faults, tuple(args.fault), args.cache,
+        args.real_pacing, args.uno, args.native,
+    )  # fmt: skip
     try:
         run(args.config, args.scene, args.dir, options, stop)
-    except PolysightError as e:
+    except (PolysightError, OSError) as e:
+        e = os_error(e) if isinstance(e, OSError) else e
         sys.stderr.write(f"error: {e}\n")
         return e.exit_status
     return 0

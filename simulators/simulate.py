@@ -16,9 +16,11 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from shared.config import Grid, Instrument, load_instrument, to_builtins
+from shared.config import Grid, Instrument, load_instrument
+from shared.errors import ConfigError
 from shared.geometry import incidence_deg, specular_midpoint_m
 from shared.raster import Row, check_burst_fits, mean_burst_travel_mm, plan_raster
+from shared.tables import to_builtins
 from simulators.authors_layout import AuthorsLayout, Skipped
 from simulators.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
 from simulators.radar import SimulatedRig
@@ -73,8 +75,7 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
 
 def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """True stage offsets of every chirp of a row in the order they happen: x_mm, y_mm, [points * pulses]."""
-    starts = np.array([row.x_mm(i) for i in range(row.points)])
-    x = (starts[:, None] + radar.burst_mm(row.direction)).ravel()
+    x = (np.array(row.x_mm)[:, None] + radar.burst_mm(row.direction)).ravel()
     return x, np.full(len(x), row.y_mm)
 
 
@@ -202,6 +203,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry out `simulate`. Raises PolysightError."""
+    if args.layout == "own" and (args.columns or args.absent):
+        given = "--columns" if args.columns else "--absent"
+        raise ConfigError(f"{given} with --layout own", "the published data has such scans", "add --layout authors")
     rig, scene = load_instrument(args.config), load_scene(args.scene)
     began = time.perf_counter()
 
@@ -218,7 +222,7 @@ def run(args: argparse.Namespace) -> int:
         args.seed,
         zero_filling=not args.absent,
         progress=None if quiet else show,
-        by_columns=args.columns and args.layout == "authors",
+        by_columns=args.columns,
     )
     seconds = time.perf_counter() - began
     if args.json:

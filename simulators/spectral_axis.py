@@ -60,7 +60,7 @@ class Axis:
 
 def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -> tuple[Axis, Axis]:
     """Extent and pitch in x and y from the scene's reach and the kernel's steepest phase."""
-    travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage)
+    travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
     edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]
     edges += [(*p.position_mm, 0.0, 0.0) for p in scene.points]
     table = np.array(edges or [(0.0, 0.0, 0.0, 0.0)])

@@ -106,9 +106,12 @@ class StageTrack:
     ----------
     burst_motion
         False takes every pulse of a burst where the burst's middle is, as if the stage stood still meanwhile.
+    backlash_mm
+        While it moves towards -x the stage is so much further along +x than it says.
     """
 
-    def __init__(self, rig: Instrument, burst_motion: bool = True) -> None:
+    def __init__(self, rig: Instrument, burst_motion: bool = True, backlash_mm: float = 0.0) -> None:
+        self._backlash_mm = backlash_mm
         self._middle_ns = None if burst_motion else round(burst_middle_s(rig.burst) * 1e9)
         self._plan, self._burst = plan_raster(rig.grid), rig.burst
         self._triggers: list[int] = []
@@ -156,7 +159,7 @@ class StageTrack:
 
     def _first_of(self, edge_ns: int) -> int | None:
         """Number of the first pulse of the point whose trigger rose then; None outside the plan."""
-        plan, (x, y) = self._plan, self.offsets_mm([edge_ns])
+        plan, (x, y, _) = self._plan, self._told_mm([edge_ns])
         column = round(x[0] / plan.step_x_mm + (plan.columns - 1) / 2)
         row = round(y[0] / plan.step_y_mm + (plan.rows - 1) / 2)
         if not (0 <= column < plan.columns and 0 <= row < plan.rows):
@@ -166,9 +169,14 @@ class StageTrack:
 
     def offsets_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Stage offsets from the grid's middle, x_mm [n] and y_mm [n], at wire times; the middle while unknown."""
-        x, y = np.zeros(len(t_ns)), np.zeros(len(t_ns))
+        x, y, backwards = self._told_mm(t_ns)
+        return x + self._backlash_mm * backwards, y
+
+    def _told_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """The same as the stage says it, and whether it moves towards -x then."""
+        x, y, backwards = np.zeros(len(t_ns)), np.zeros(len(t_ns)), np.zeros(len(t_ns), np.bool_)
         if not self._lines:
-            return x, y
+            return x, y, backwards
         for i, pulse_ns in enumerate(t_ns):
             t = pulse_ns
             if self._middle_ns is not None and (at := bisect_right(self._triggers, t)):
@@ -177,4 +185,5 @@ class StageTrack:
             moved_um = line.vx_um_s * max(0, t - line.t_ns) * 1e-9
             x[i] = (line.x_um + moved_um) * 1e-3 - self._centre_mm[0]
             y[i] = line.y_um * 1e-3 - self._centre_mm[1]
-        return x, y
+            backwards[i] = line.vx_um_s < 0
+        return x, y, backwards

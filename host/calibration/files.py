@@ -10,9 +10,11 @@ from typing import Any, TypeVar
 import msgspec
 import tomli_w
 
+from host.imaging.imaged_with import ImagedWith
 from host.store.scanfolder import versions
-from shared.config import Instrument, decode, read_toml, to_builtins
+from shared.config import Instrument
 from shared.errors import ConfigError, DeviceError
+from shared.tables import decode, read_toml, to_builtins
 
 FORMAT = 1
 Vector = tuple[float, float, float]
@@ -92,8 +94,20 @@ class FilterFile(CalibrationFile, frozen=True, kw_only=True):
     boards: dict[str, BoardFilter]
 
 
+class MetalBand(msgspec.Struct, frozen=True):
+    """One sub-band of the plate: its frequencies, and the scatter of its own pixels."""
+
+    first_hz: float
+    last_hz: float
+    spread: float
+    how: str
+
+
 class MetalFile(CalibrationFile, frozen=True, kw_only=True):
-    """`metal`: gains over the plane, in the file `images` beside this one."""
+    """`metal`: gains over the plane, in the file `images` beside this one, and the rig they belong to.
+
+    `imaged_with` is None in files of older releases, which are refused. `bands` are sub-bands, lowest frequency first.
+    """
 
     images: str
     images_crc32: str
@@ -104,6 +118,8 @@ class MetalFile(CalibrationFile, frozen=True, kw_only=True):
     ratio_variation_deg: float
     spread: float
     how: str
+    imaged_with: ImagedWith | None = None
+    bands: list[MetalBand] = []
 
 
 class BoardStart(msgspec.Struct, frozen=True):

@@ -13,14 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
 
 from host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
 from host.imaging.grid import image_grid
+from host.imaging.imaged_with import ImagedWith
 from host.store import manifest
 from host.store.scanfolder import MANIFEST, ScanFolder
-from shared.config import Board, Instrument, MountStep, to_builtins
+from shared.config import Board, Instrument, MountStep
 from shared.errors import ConfigError, DataError
+from shared.tables import to_builtins
 
 if TYPE_CHECKING:
     from host.polarimetry import PlaneReference
@@ -45,8 +46,10 @@ class Calibration:
         Raises
         ------
         ConfigError
-            when the rig file's own places are not those that the calibration counts from.
+            when the rig file's own places are not those that the calibration counts from, or its filters not those
+            that were measured.
         """
+        self._check_filters(rig)
         if self.places is None:
             return rig
         if places_crc32(rig) != self.places.rig_crc32:
@@ -58,6 +61,19 @@ class Calibration:
         boards = tuple(self._shifted(b, self.places) for b in rig.boards)
         geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=self.places.object_distance_mm)
         return msgspec.structs.replace(rig, boards=boards, geometry=geometry)
+
+    def _check_filters(self, rig: Instrument) -> None:
+        """Refuse filters that were measured with other corners programmed, or not on every receiver."""
+        programmed = [khz for khz in (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) if khz]
+        for board in rig.receivers if self.filters is not None else ():
+            found = self.filters.boards.get(board.name) if self.filters else None
+            if found is None or [float(khz) for khz in found.programmed_khz] != programmed:
+                what = "is not in it" if found is None else f"was measured with {found.programmed_khz} kHz programmed"
+                raise ConfigError(
+                    f"{self._path('hpf')}: {board.name} {what}, the rig file says {programmed}",
+                    "the boards or chirp.hpf1_khz, hpf2_khz were changed after the calibration",
+                    "calibrate again with this rig file, or empty calibration.hpf",
+                )
 
     @staticmethod
     def _shifted(board: Board, places: PlacesFile) -> Board:
@@ -77,18 +93,13 @@ class Calibration:
         """Metal over the plane, pixel by pixel. Raises DataError when its images are not what the file names."""
         if self.metal is None:
             return None
-        from host.polarimetry import PlaneReference
+        from host.calibration.metal import read_metal
 
-        path = self._path("metal").parent / self.metal.images
-        if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != self.metal.images_crc32:
-            raise DataError(
-                f"{path}: absent, or not the images that {self._path('metal').name} names",
-                "the two files were parted",
-                "copy both, or calibrate again",
-            )
-        with np.load(path, allow_pickle=False) as f:
-            images = (f["h"], f["v"], f["valid"], f["x_m"], f["y_m"])
-        return PlaneReference(*images, self.metal.spread, self.metal.how)
+        return read_metal(self.metal, self._path("metal").parent / self.metal.images)
+
+    def imaged_with(self, placed: Instrument) -> ImagedWith:
+        """What the gains of images depend on; `placed` is a rig that :meth:`rig` made."""
+        return ImagedWith.of(placed, {b.name: self.high_pass(b.name) for b in placed.receivers})
 
     def facts(self) -> dict[str, Any]:
         """For quality.json: which files were in force."""
@@ -98,6 +109,10 @@ class Calibration:
             for kind, file in kinds.items()
             if file is not None
         }
+
+    def name_of(self, kind: str) -> str:
+        """The file of a kind, for messages."""
+        return str(self._path(kind))
 
     def _path(self, kind: str) -> Path:
         return (self.paths or {}).get(kind, Path(kind))
@@ -145,11 +160,12 @@ def checked(rig: Instrument, simulated: bool) -> Calibration:
     Raises
     ------
     ConfigError, DataError
-        when a file is not what it should be, or comes from simulated data and the scan does not.
+        when a file is not what it should be, is of another rig, or comes from simulated data and the scan does not.
     """
     calibration = of_rig(rig)
     placed, reference = calibration.rig(rig), calibration.reference()
     if reference is not None:
+        reference.check_rig(calibration.imaged_with(placed), calibration.name_of("metal"))
         grid = image_grid(placed)
         reference.check_axes(grid.x_m, grid.y_m)
     for kind, fact in calibration.facts().items():

@@ -6,20 +6,27 @@ What the gains are is :mod:`host.polarimetry.reference`; here they only get a fi
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from host.calibration.files import MetalFile, SourceScan, head, write
+from host.calibration.files import MetalBand, MetalFile, SourceScan, head, write
+from host.imaging.subbands import SubBand
 from host.polarimetry import PlaneReference
 from shared.errors import DataError, DeviceError
 
+IMAGES = ("h", "v", "valid")
 LEAST_LEVEL = 0.02  # of a mirror's answer beside the direct path's; antenna patterns may take some 20 dB
 
 
-def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path) -> Path:
+def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path, bands: Sequence[SubBand] = ()) -> Path:
     """Write gains and their file. Returns the file's path; the images lie beside it under the same name.
+
+    `bands` are the parts of the sweep that `reference.bands` are of.
 
     Raises
     ------
@@ -48,14 +55,19 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path)
         ratio_variation_deg=facts["ratio_variation_deg"],
         spread=reference.spread,
         how=reference.how,
-        note="sub-bands are not kept: `polysight process --reference SCAN --bands K` makes them",
+        imaged_with=reference.made_with,
+        bands=[
+            MetalBand(band.first_hz, band.last_hz, part.spread, part.how)
+            for band, part in zip(bands, reference.bands, strict=True)
+        ],
     )
     path = write(file, out)  # takes the name
     images = path.with_suffix(".npz")
     try:
-        np.savez_compressed(
-            images, h=reference.h, v=reference.v, valid=reference.valid, x_m=reference.x_m, y_m=reference.y_m
-        )
+        arrays = {name: getattr(reference, name) for name in IMAGES}
+        if reference.bands:
+            arrays |= {f"band_{n}": np.stack([getattr(part, n) for part in reference.bands]) for n in IMAGES}
+        np.savez_compressed(images, x_m=reference.x_m, y_m=reference.y_m, **arrays)
         digest = f"{zlib.crc32(images.read_bytes()):08x}"
         path.unlink()
     except OSError as e:
@@ -63,3 +75,34 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path)
         images.unlink(missing_ok=True)
         raise DeviceError(f"{images}: {e.strerror}", "the disk is full, or a permission", "free space") from None
     return write(msgspec.structs.replace(file, images=images.name, images_crc32=digest), out)
+
+
+def read_metal(file: MetalFile, images: Path) -> PlaneReference:
+    """The reference that a file and its images hold, sub-bands included.
+
+    Raises
+    ------
+    DataError
+        when the images are not what the file names.
+    """
+    if not images.is_file() or f"{zlib.crc32(images.read_bytes()):08x}" != file.images_crc32:
+        raise DataError(
+            f"{images}: absent, or not the images that its calibration file names",
+            "the two files were parted",
+            "copy both, or calibrate again",
+        )
+    with np.load(images, allow_pickle=False) as f:
+        arrays: dict[str, npt.NDArray] = dict(f)
+    whole = PlaneReference(
+        *(arrays[name] for name in IMAGES),
+        x_m=arrays["x_m"],
+        y_m=arrays["y_m"],
+        spread=file.spread,
+        how=file.how,
+        made_with=file.imaged_with,
+    )
+    parts = (
+        replace(whole, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGES})
+        for k, band in enumerate(file.bands)
+    )
+    return replace(whole, bands=tuple(parts))

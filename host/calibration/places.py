@@ -32,10 +32,11 @@ from host.imaging.reduce import reduction, scene_gate_m
 from host.store.source import ScanSource
 from host.sync import BoardSetup, synchronise_row
 from host.sync.hpf import HighPass
-from shared.config import Instrument, decode, read_toml
+from shared.config import Instrument
 from shared.errors import DataError
 from shared.geometry import specular_midpoint_m
 from shared.raster import plan_raster
+from shared.tables import decode, read_toml
 from shared.units import SPEED_OF_LIGHT_M_S
 
 Real = NDArray[np.float64]

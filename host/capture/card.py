@@ -96,9 +96,11 @@ class CardClient:
         DeviceError
             when the card refuses or is silent.
         """
-        self._status = Status(0)
         for attempt in range(ATTEMPTS):
+            self.take_status()
+            self._status = Status(0)  # what still waited is of the record before
             reply = self._try(Code.RECORD_START, b"", self._timeout_s / ATTEMPTS)
+            self._status &= ~Status.RECORD_COMPLETED  # so is this, before the reply
             if reply is not None:
                 self._check(reply, Code.RECORD_START)
                 return
@@ -109,6 +111,16 @@ class CardClient:
     def record_stop(self) -> None:
         """Stop the record. A card that does not record may refuse; that is no error. Raises DeviceError when silent."""
         self._exchange(Code.RECORD_STOP, b"", ATTEMPTS)
+
+    def wait_completed(self, limit_s: float) -> None:
+        """After a stop: until the card has reported the record as completed, at most so long.
+
+        It sends the rest of the record as a short packet before that, both after the reply to the stop. What is not
+        waited for would be taken for the next record's.
+        """
+        deadline = time.monotonic() + limit_s
+        while Status.RECORD_COMPLETED not in self.take_status() and (left := deadline - time.monotonic()) > 0:
+            select.select([self._socket], [], [], left)
 
     def take_status(self) -> Status:
         """Status bits the card reported by itself since the last record start, without waiting."""

@@ -7,6 +7,8 @@ from enum import Enum
 from host.capture.dca1000 import Status
 from host.capture.receiver_words import Progress
 
+TAIL_S = 2.0
+"""Silence after which a card sends what does not fill a packet (seen)."""
 GRACE_NS = 200_000_000
 """Silence after which nothing comes any more, once the card said so: status and data come on different ports."""
 

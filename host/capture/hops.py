@@ -114,7 +114,8 @@ def silent_card(board: Board, what: str, root: Path = _ROOT) -> DeviceError:
             what,
             f"the link is up, but no device has the address {board.card_address}: another card is on this cable, or its"
             " EEPROM holds another address",
-            "check card_address in instrument.toml; with the card's EEPROM switch off it has its default address",
+            "check card_address in instrument.toml (a scan that was begun takes it with `polysight resume SCAN --config"
+            " instrument.toml`); with the card's EEPROM switch off it has its default address",
         )
     return DeviceError(
         what,
@@ -147,7 +148,8 @@ def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
         return DeviceError(
             what,
             f"{row.strangers} packets came from another address than {board.card_address}",
-            "two boards may have each other's ports; check card_address and data_port in instrument.toml",
+            "two boards may have each other's ports; check card_address and data_port in instrument.toml, then"
+            " `polysight resume SCAN --config instrument.toml`",
         )
     status = Status(row.card_status) if row is not None else Status(0)
     if Status.NO_LVDS_DATA in status:
@@ -162,5 +164,6 @@ def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
     return DeviceError(
         what,
         why,
-        "arm the radar, check the SYNC_IN wire with `polysight-pi pulse`, and the data port in the card's EEPROM",
+        "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), and the data port in the card's"
+        " EEPROM",
     )

@@ -89,6 +89,10 @@ class Placement:
         sequences = head[:, 0:4].copy().view("<u4")[:, 0]
         byte_counts = head[:, 4:8].copy().view("<u4")[:, 0].astype(np.uint64)
         byte_counts |= head[:, 8:10].copy().view("<u2")[:, 0].astype(np.uint64) << np.uint64(32)
+        if self._base is None and len(sizes) > 1:
+            self.place(packets[:1], lengths[good][:1])  # by itself, for what follows it tells what it was
+            return self.place(packets[1:], lengths[good][1:])
+        self._drop_last_of_before(int(sequences[0]), int(byte_counts[0]), int(sizes[0]))
         base = self._base
         if base is None:
             base = self._find_base(int(sequences[0]), int(byte_counts[0]), int(sizes[0]))
@@ -109,6 +113,22 @@ class Placement:
                 self.counts.disagreeing += j - i
                 continue
             shift += self._run(packets[i:j], sequences[i:j], offsets[i:j] + shift, sizes[i:j])
+
+    def _drop_last_of_before(self, sequence: int, byte_count: int, size: int) -> None:
+        """Forget the only packet so far when a larger one follows right behind: it was the record's before.
+
+        Only the last packet of a record is not full, and the card may send it long after the record was stopped.
+        """
+        if self._base is None or self.counts.placed != 1 or not 0 < self.extent == self._last_size < size:
+            return
+        behind = Counters(
+            (self._base + self.extent) % (1 << BYTE_COUNT_BITS), (self._last_sequence + 1) % (1 << SEQUENCE_BITS)
+        )
+        if behind == Counters(byte_count, sequence):
+            self.out[: self.extent] = 0
+            self.counts.placed, self.counts.leftover = 0, self.counts.leftover + 1
+            self.start, self._base, self._certain, self._full = behind, None, False, 0
+            self.received = self.extent = self._last_size = 0
 
     def _find_base(self, sequence: int, byte_count: int, size: int) -> int:
         """The base from the first packet seen, which need not be the first of the record."""

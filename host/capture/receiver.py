@@ -141,7 +141,7 @@ class ReceiverProcess:
             raise DeviceError(
                 f"{self.board.name}: the receiving process ended with status {self._process.poll()}",
                 "it was killed, or it failed; its message is above",
-                "`polysight resume SCAN` goes on from the last committed row",
+                "`dmesg` tells whether the kernel ended it, for want of memory",
             ) from None
 
     def _ask(self, request: words.Request, kind: type[A], limit_s: float) -> A:

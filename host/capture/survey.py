@@ -22,7 +22,7 @@ from shared.errors import DeviceError
 Verdict = Literal["ok", "warning", "error", "not checked"]
 HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
 """From near to far: the host's address and ports, the interface, its cable, the card; then what receives its data."""
-LISTEN = "`polysight card --listen 10`, and `polysight-pi pulse` meanwhile"
+PULSES = "`polysight doctor`: it sends pulses at rest, and tells what comes of each"
 _SILENT_AT = {Hop.ROUTE: "route", Hop.LINK: "link"}
 _TURN_S = 0.05
 
@@ -138,7 +138,7 @@ def _receive(card: CardClient, instrument: Instrument, core: int | None, listen_
         if listen_s > 0:
             yield _listen(card, receiver, instrument, listen_s)
         else:
-            yield HopFinding("radar", "not checked", "it sends data only when it is triggered", remedy=LISTEN)
+            yield HopFinding("radar", "not checked", "it sends data only when it is triggered", remedy=PULSES)
 
 
 def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument, listen_s: float) -> HopFinding:

@@ -78,7 +78,8 @@ def bind_udp(address: str, port: int, what: str) -> socket.socket:
             raise DeviceError(
                 f"{what}: {address} is not an address of this machine",
                 "the network interface to the cards is down or has another address",
-                f"`ip address add {address}/24 dev <interface>`, or correct host_address in instrument.toml",
+                f"`ip address add {address}/24 dev <interface>`, or correct host_address in instrument.toml"
+                " (a scan that was begun: `polysight resume SCAN --config instrument.toml`)",
             ) from None
         raise DeviceError(f"{what}: cannot bind {address}:{port} (UDP): {e.strerror}", "", "check host_address") from e
     return sock

@@ -5,12 +5,12 @@ from __future__ import annotations
 from host.calibration.in_force import checked
 from host.doctor.bench import Bench
 from host.doctor.finding import Finding, ok
-from host.scan.run import HARDWARE_BACKEND
+from shared.backends import is_simulated
 
 
 def check_calibration(bench: Bench) -> Finding:
     """What a scan would copy into its folder."""
-    simulated = bench.hello is not None and bench.hello.backend != HARDWARE_BACKEND
+    simulated = bench.hello is not None and is_simulated(bench.hello.backend)
     facts = checked(bench.rig, simulated).facts()
     if not facts:
         return ok("none named: geometry, filters and metal as the rig file and the scene have them")

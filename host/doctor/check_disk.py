@@ -19,15 +19,10 @@ def row_s(rig: Instrument) -> float:
     return scan_time(rig).total_s / rig.grid.rows
 
 
-def scan_bytes(rig: Instrument) -> int:
-    """Raw data of a whole scan."""
-    return rig.grid.rows * len(rig.recorded) * rig.row_bytes
-
-
 def check_disk(bench: Bench) -> Finding:
     """Room for a whole scan and the reserve, and twice the speed at which data comes."""
     rig, folder = bench.rig, _existing(bench.wanted.out)
-    need, reserve, free = scan_bytes(rig), rig.limits.free_disk_bytes, shutil.disk_usage(folder).free
+    need, reserve, free = rig.scan_bytes, rig.limits.free_disk_bytes, shutil.disk_usage(folder).free
     told = f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
     if free < need + reserve:
         return error(
@@ -69,7 +64,7 @@ def check_time(bench: Bench) -> Finding:
     hours, minutes = divmod(round(seconds / 60), 60)
     told = f"{hours} h {minutes:02d} min" if hours else f"{seconds / 60:.1f} min"
     return ok(
-        f"a scan of {rig.grid.rows} rows takes about {told}: {row_s(rig):.1f} s a row, {scan_bytes(rig) / 1e9:.2f} GB",
+        f"a scan of {rig.grid.rows} rows takes about {told}: {row_s(rig):.1f} s a row, {rig.scan_bytes / 1e9:.2f} GB",
         seconds=seconds,
-        bytes=scan_bytes(rig),
+        bytes=rig.scan_bytes,
     )

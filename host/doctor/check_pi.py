@@ -8,10 +8,11 @@ from pathlib import Path
 import shared
 from host.doctor.bench import Bench
 from host.doctor.finding import Finding, error, ok, warning
-from shared.sockets import is_loopback
+from host.scan.pi_stage import differences
+from shared.backends import is_simulated
+from shared.sockets import HOST_KEYS, is_loopback
 
 SIMULATED = "simulated wires: no hardware is driven"
-_FILES = ("host.key_secret", "host.key", "pi.key")
 
 
 def check_keys(bench: Bench) -> Finding:
@@ -20,18 +21,19 @@ def check_keys(bench: Bench) -> Finding:
     if is_loopback(pi.command_address) and is_loopback(pi.event_address):
         return ok("not needed: both addresses are loopback")
     folder = Path(pi.key_dir)
-    if missing := [name for name in _FILES if not os.access(folder / name, os.R_OK)]:
+    if missing := [name for name in HOST_KEYS if not os.access(folder / name, os.R_OK)]:
         return error(
             f"{folder}: {', '.join(missing)} cannot be read",
             "the Pi's keys were not copied here, or belong to another user",
-            "on the Pi `polysight-pi keys`; copy its folder to pi.key_dir",
+            f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {folder}",
         )
-    mode = (folder / _FILES[0]).stat().st_mode
+    secret = folder / HOST_KEYS[-1]
+    mode = secret.stat().st_mode
     if mode & 0o077:
         return warning(
-            f"{folder / _FILES[0]} can be read by others ({mode & 0o777:o})",
+            f"{secret} can be read by others ({mode & 0o777:o})",
             "whoever reads it may drive the stage",
-            f"`chmod 600 {folder / _FILES[0]}`",
+            f"`chmod 600 {secret}`",
         )
     return ok(f"{folder} holds them")
 
@@ -42,7 +44,7 @@ def check_pi(bench: Bench) -> Finding:
     hello = bench.pi.hello()
     after = bench.system.wall_ns()
     bench.hello, bench.hello_at_ns, bench.hello_took_ns = hello, (before + after) // 2, after - before
-    lines = SIMULATED if hello.backend == "wires" else f"lines by {hello.backend}"
+    lines = SIMULATED if is_simulated(hello.backend) else f"lines by {hello.backend}"
     told = f"{bench.rig.pi.command_address} answers: release {hello.pi_release}, {lines}, state {hello.state}"
     facts = {"release": hello.pi_release, "backend": hello.backend, "state": hello.state}
     if hello.pi_release != shared.__version__:
@@ -50,6 +52,13 @@ def check_pi(bench: Bench) -> Finding:
             told,
             f"this host is of release {shared.__version__}",
             "install the same release on both: `make pi-install HOST=...`",
+            **facts,
+        )
+    if differing := differences(bench.rig.stage, hello):
+        return error(
+            f"{told}; {'; '.join(differing)}",
+            "host and Pi have different rig files: a scan is refused",
+            "copy the right [stage] to the other machine, `sudo systemctl restart polysight-pi`",
             **facts,
         )
     return ok(told, **facts)

@@ -16,7 +16,7 @@ def check_stage(bench: Bench) -> Finding:
         return error(
             f"fault {status.fault}: {e.what}; {status.reason}",
             e.why,
-            f"{e.remedy}; `polysight-pi check` on the Pi looks at port and board",
+            f"{e.remedy}; on the Pi, with its service stopped, `polysight-pi check` looks at port and board",
             fault=status.fault,
         )
     firmware = bench.hello.firmware if bench.hello is not None else ""

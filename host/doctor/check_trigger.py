@@ -20,7 +20,6 @@ from shared.raster import RasterPlan
 
 POINTS = 8
 _LIMIT_S = 120.0
-_REST_LIMIT_S = 10.0
 _LOOK_MS = 100
 
 
@@ -43,7 +42,8 @@ def check_trigger(bench: Bench) -> Finding:
             told,
             "the trigger line is stuck: no edge reaches the Pi",
             f"check the wire and its ground from the stage's trigger pin to GPIO {bench.rig.pi.trigger_in}, the level"
-            " shifter, and pi.trigger_in; `polysight-pi check` tells who else holds the line",
+            " shifter, and pi.trigger_in; with the Pi's service stopped, `polysight-pi check` there tells who holds the"
+            " line",
             **facts,
         )
     if row.status != "done" or row.edges != POINTS or row.pulses != wanted:
@@ -77,16 +77,8 @@ def _run(bench: Bench) -> RowFinished:
         pi.run_row(scan_id, 0, 1)
         return _row_end(bench)
     finally:
-        pi.abort("the doctor is done")
-        _until_rest(bench)
+        pi.come_to_rest("the doctor is done")
         pi.end_run(scan_id, "success", "polysight doctor --move")
-
-
-def _until_rest(bench: Bench) -> None:
-    """Wait until nothing moves any more; a run cannot end before."""
-    deadline = time.monotonic() + _REST_LIMIT_S
-    while bench.pi.status().state in ("homing", "running", "held", "done") and time.monotonic() < deadline:
-        time.sleep(_LOOK_MS / 1e3)
 
 
 def _row_end(bench: Bench) -> RowFinished:

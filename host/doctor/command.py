@@ -10,6 +10,7 @@ from host.doctor.bench import Bench, System, Wanted
 from host.doctor.check_pi import SIMULATED
 from host.doctor.finding import Finding
 from host.doctor.walk import walk
+from shared.backends import is_simulated
 
 _WIDTH = 16
 
@@ -23,7 +24,7 @@ def doctor(wanted: Wanted, as_json: bool, system: System = System()) -> int:  # 
             if not as_json:
                 sys.stdout.write(line(finding))
                 sys.stdout.flush()
-        simulated = bench.hello is not None and bench.hello.backend == "wires"
+        simulated = bench.hello is not None and is_simulated(bench.hello.backend)
     wrong = [f.check for f in findings if f.verdict == "error"]
     if as_json:
         found = {"ok": not wrong, "simulated": simulated, "findings": [asdict(f) for f in findings]}

@@ -26,6 +26,12 @@ def _calibration(bench: Bench) -> Finding:
     return check_calibration(bench)
 
 
+def _library(bench: Bench) -> Finding:
+    from host.doctor.check_library import check_library
+
+    return check_library(bench)
+
+
 def _level(bench: Bench, board: Board) -> Finding:
     from host.doctor.check_level import check_level
 
@@ -63,6 +69,7 @@ CHECKS = (
     Check("pi clock", check_pi_clock, ("pi",)),
     Check("rig is free", check_free, ("pi",)),
     Check("calibration", _calibration, ("config",)),
+    Check("library", _library, ("config",)),
     Check("stage", check_stage, ("pi",)),
     Check("card", check_card, ("config",), ("rig is free",), each_board=True),
     Check("network", check_network, ("config",), each_board=True),

@@ -1,6 +1,6 @@
 """Products for other programs: HDF5, MATLAB, PNG, CSV."""
 
-from host.export.read import Exported, read_products
 from host.export.table import material_columns, write_csv
+from host.report.read import SavedProducts, read_products
 
-__all__ = ["Exported", "material_columns", "read_products", "write_csv"]
+__all__ = ["SavedProducts", "material_columns", "read_products", "write_csv"]

@@ -8,8 +8,8 @@ from pathlib import Path
 from host.export.hdf5 import write_hdf5
 from host.export.matlab import write_mat
 from host.export.pictures import write_pngs
-from host.export.read import read_products
 from host.export.table import write_csv
+from host.report.read import read_products
 from shared.errors import ConfigError, DataError
 
 FORMATS = ("hdf5", "mat", "png", "csv")

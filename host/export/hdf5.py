@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from host.export.read import Exported
 from host.export.table import material_columns
+from host.report.read import SavedProducts
 from shared.errors import ConfigError
 
 CONVENTION = (
@@ -31,7 +31,7 @@ def _h5py() -> Any:
         ) from None
 
 
-def write_hdf5(path: Path, products: Exported) -> None:
+def write_hdf5(path: Path, products: SavedProducts) -> None:
     """Write a file of these products.
 
     /h, /v, /p complex64 [y, x], /valid bool [y, x]; /x, /y float64 in metres, the dimension scales of all four; group
@@ -71,7 +71,7 @@ def write_hdf5(path: Path, products: Exported) -> None:
     part.replace(path)
 
 
-def _documents(products: Exported) -> dict[str, dict[str, Any]]:
+def _documents(products: SavedProducts) -> dict[str, dict[str, Any]]:
     return {"quality": products.quality, "materials": products.materials, "scan": products.scan}
 
 

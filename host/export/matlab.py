@@ -12,14 +12,14 @@ import numpy as np
 import scipy.io
 
 from host.export.hdf5 import CONVENTION
-from host.export.read import Exported
 from host.export.table import material_columns
 from host.report import write_atomically
+from host.report.read import SavedProducts
 
 _LONGEST_NAME = 63
 
 
-def write_mat(path: Path, products: Exported) -> None:
+def write_mat(path: Path, products: SavedProducts) -> None:
     """Write `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, struct `materials` of columns, structs `config`, `versions`.
 
     `quality_json` and `materials_json` are those files as text: jsondecode reads them.

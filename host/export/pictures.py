@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from host.export.read import Exported
 from host.report import ReportContext, figures, write_atomically
+from host.report.read import SavedProducts
 
 
-def write_pngs(folder: Path, products: Exported) -> list[Path]:
+def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
     """Amplitude (dB), phase (degrees) of H, V and P, and what is known of the materials, as PNG; returns the files."""
     context = ReportContext(
         title=products.scan_id,

@@ -8,8 +8,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from host.export.read import Exported
 from host.report import write_atomically
+from host.report.read import SavedProducts
 
 _COLUMNS = (
     "patch", "name", "confidence", "metal_reference", "metal_like", "centre_x_mm", "centre_y_mm", "width_mm",
@@ -19,7 +19,7 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def material_columns(products: Exported) -> dict[str, list[Any]]:
+def material_columns(products: SavedProducts) -> dict[str, list[Any]]:
     """Columns by name, an entry for each patch; None where a number is not known.
 
     Permittivity is `permittivity_real` - j `permittivity_loss`; p_imag and p_phase are those of P = H / V relative to
@@ -66,7 +66,7 @@ def _minus(value: float | None) -> float | None:
     return None if value is None else -value
 
 
-def write_csv(path: Path, products: Exported) -> None:
+def write_csv(path: Path, products: SavedProducts) -> None:
     """Write the table as CSV: comma, UTF-8, a header line; what is not known is empty. Numbers keep all digits."""
     columns = material_columns(products)
     text = io.StringIO()

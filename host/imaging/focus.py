@@ -58,6 +58,10 @@ class Focus:
         inside = abs(self.depth_mm) < 0.95 * self.depths_mm[-1] and max(map(abs, self.tilt_deg)) < 0.95 * _MAX_TILT_DEG
         return inside and float(max(self.sharpness[0], self.sharpness[-1])) < 0.98
 
+    def transposed(self) -> Focus:
+        """The same with x and y swapped."""
+        return replace(self, tilt_deg=(self.tilt_deg[1], self.tilt_deg[0]))
+
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON."""
         return {
@@ -149,7 +153,7 @@ def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.flo
 def _at(stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
     """Intensity on a surface through the stack, by cubic convolution between its planes (Keys 1981)."""
     place = (z - depths[0]) / (depths[1] - depths[0])
-    base = np.clip(np.floor(place).astype(np.intp), 1, len(depths) - 3)
+    base = np.clip(np.floor(place).astype(np.intp), 0, len(depths) - 2)
     t = place - base
     weights = (
         ((-0.5 * t + 1.0) * t - 0.5) * t,
@@ -157,5 +161,8 @@ def _at(stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.f
         ((-1.5 * t + 2.0) * t + 0.5) * t,
         (0.5 * t - 0.5) * t * t,
     )
+    # Beyond each end one plane more, as Keys has it.
+    ends = [3 * stack[:1] - 3 * stack[1:2] + stack[2:3], 3 * stack[-1:] - 3 * stack[-2:-1] + stack[-3:-2]]
+    stack = np.concatenate([ends[0], stack, ends[1]])
     rows, columns = np.indices(z.shape)
-    return sum((w * stack[base + i - 1, rows, columns] for i, w in enumerate(weights)), np.zeros(z.shape))
+    return sum((w * stack[base + i, rows, columns] for i, w in enumerate(weights)), np.zeros(z.shape))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +85,7 @@ def row_offsets_m(rig: Instrument, row: Row) -> NDArray[np.float64]:
     The stage does not stop: a burst is centred half its duration after the trigger point, so even and odd rows differ.
     """
     travel = row.direction * mean_burst_travel_mm(rig.burst, rig.stage)
-    x = row.x_start_mm + np.arange(row.points) * row.step_mm + travel
+    x = np.array(row.x_mm) + travel
     return np.stack([x, np.full(row.points, row.y_mm)], axis=1) / 1e3
 
 
@@ -92,6 +93,7 @@ def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     """The same of all rows, metres [row, column, 3], columns from the smallest x."""
     plan = plan_raster(rig.grid)
     out = np.zeros((plan.rows, plan.columns, 3))
+    along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}
     for row in plan:
-        out[row.index, :, :2] = row_offsets_m(rig, row)[:: row.direction]
+        out[row.index, :, 0], out[row.index, :, 1] = along[row.direction], row.y_mm / 1e3
     return out

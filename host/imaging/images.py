@@ -30,10 +30,12 @@ class ChannelImages:
     Attributes
     ----------
     h, v
-        complex64 [ny, nx]: reflectivity, image divided by the footprint of a uniform mirror; 0 where not valid. Still
-        to be referenced to metal: each holds its channel's constant gain.
+        complex64 [ny, nx]: reflectivity as Fresnel's coefficients state it (time dependence exp(+j omega t)): the
+        conjugate of the image divided by the footprint of a uniform mirror; 0 where not valid. Samples whose phase is
+        +2 pi f tau are the conjugate of the wave, for which a delay is exp(-j 2 pi f tau), and so is what they show of
+        the object. Still to be referenced to metal: each holds its channel's constant gain.
     h_raw, v_raw
-        complex64 [ny, nx]: before that division.
+        complex64 [ny, nx]: before that, as the samples have it.
     h_footprint, v_footprint
         complex64 [ny, nx].
     x_m, y_m
@@ -142,7 +144,7 @@ class ImageBuilder:
             # The footprint's rim ripples with the row spacing: the majority of the neighbourhood decides, not stripes.
             share = ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
             visible &= (share > 0.5) & (weight != 0)
-        flat = [np.divide(raw, w, out=np.zeros_like(raw), where=visible) for raw, w, _ in (h, v)]
+        flat = [np.divide(raw, w, out=np.zeros_like(raw), where=visible).conj() for raw, w, _ in (h, v)]
         calibration = {name: board.rx_calibration() for name, board in self.boards.items()}
         notices = tuple(f"{name}: {notice}" for name, (_, _, notice) in made.items() if notice)
         axes = (self.grid.x_m, self.grid.y_m)

@@ -17,6 +17,10 @@ from numpy.typing import NDArray
 from host.imaging.imager import choose_imager
 from host.imaging.samples import BoardSamples
 
+STRENGTH = 0.002
+"""By measurement on simulated plates (docs/decisions/0002-imaging.md): more takes what hardly reflects in V out of the
+image, and with it the plates' names; less leaves more of the aliases in.
+"""
 _POWER_ROUNDS = 12  # of the power iteration for the largest eigenvalue
 
 
@@ -39,7 +43,7 @@ class Reconstruction:
 def reconstruct(
     board: BoardSamples,
     iterations: int = 60,
-    strength: float = 0.05,
+    strength: float = STRENGTH,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reconstruction:
     """Reconstruct one board's image from the positions that are valid.
@@ -51,7 +55,8 @@ def reconstruct(
     iterations
         Steps, each one forward and one adjoint imaging.
     strength
-        Weight of sparsity, of the strongest pixel of the matched filter: pixels below about this level come out 0.
+        Weight of sparsity, of the strongest pixel of the matched filter: pixels below about this level come out 0, and
+        the others as much weaker. A few points with much left out at random come sooner with 0.01.
     progress
         Called with steps done and steps in all.
     """

@@ -4,7 +4,7 @@ from host.materials.analyse import MaterialsResult, PatchResult, analyse, image_
 from host.materials.classify import UNKNOWN, Classifier, NamedPatch, Verdict
 from host.materials.fit import fit_library
 from host.materials.knn import Fit, Weights, fit_weights
-from host.materials.labels import patches_from_labels, read_labels, write_labels
+from host.materials.labels import patches_from_labels, patches_from_plates, read_labels, write_labels
 from host.materials.library import Entry, Library
 from host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
 from host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
@@ -44,6 +44,7 @@ __all__ = [
     "metal_by_label",
     "metal_in_box",
     "patches_from_labels",
+    "patches_from_plates",
     "pixel_accuracy",
     "read_labels",
     "read_truth",

@@ -143,12 +143,13 @@ def analyse(
     if reference is not None:
         reference.check_axes(x_m, y_m)
         valid = reference.valid if valid is None else valid & reference.valid
-        segmentation = None if segmentation is None else _within(segmentation, reference.valid)
+        segmentation = _within(segmentation, valid)
         even = reference.apply(h, v)
         found = segmentation or segment(even.h, even.v, x_m, y_m, valid, settings)
         if not found.patches and float(np.median(np.abs(even.h[valid]))) > FILLED:
             found = whole_plane(valid, x_m, y_m, (settings or SegmentSettings()).margin_mm)
     else:
+        segmentation = _within(segmentation, valid)
         found = segmentation or segment(h, v, x_m, y_m, valid, settings)
     if reference is not None:
         metal = MetalReference(reference.valid, None, reference.how)
@@ -197,17 +198,25 @@ def reference_error(h: Image, v: Image, metal: MetalReference, reference: PlaneR
     return spread if np.isfinite(spread) else 0.0
 
 
-def _within(found: Segmentation, valid: npt.NDArray[np.bool_]) -> Segmentation:
-    """The same patches, their interiors cut to the pixels that are valid."""
+def _within(found: Segmentation | None, valid: npt.NDArray[np.bool_] | None) -> Segmentation | None:
+    """The same patches, if any, their interiors cut to the pixels that are valid."""
+    if found is None or valid is None:
+        return found
     return replace(found, patches=tuple(replace(p, interior=p.interior & valid) for p in found.patches))
 
 
 def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
-    """Gaussian filter over the patches' interiors only; not a number elsewhere."""
-    inside = np.zeros(image.shape, bool)
+    """Gaussian filter over each patch's interior by itself, however close the next one; not a number elsewhere."""
+    out = np.full(image.shape, complex(np.nan, np.nan), image.dtype)
+    reach = int(np.ceil(4 * sigma_px))
     for patch in found.patches:
-        inside |= patch.interior
-    return smooth(np.where(inside, image, complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
+        if patch.interior.any():
+            lines, columns = (np.flatnonzero(patch.interior.any(axis=axis)) for axis in (1, 0))
+            near = tuple(slice(max(0, at[0] - reach), at[-1] + reach + 1) for at in (lines, columns))
+            inside = patch.interior[near]
+            one = smooth(np.where(inside, image[near], complex(np.nan, np.nan)).astype(image.dtype), sigma_px)
+            out[near] = np.where(inside, one, out[near])
+    return out
 
 
 def pixel_accuracy(result: MaterialsResult) -> float | None:
@@ -264,6 +273,6 @@ def _row(r: PatchResult, metal: MetalReference, incidence_deg: float) -> dict[st
         "ratio": _complex(e.ratio),
         "inverse_ratio_std": e.inverse_std if math.isfinite(e.inverse_std) else None,
         "permittivity": permittivity,
-        "metal_like": not e.determinable,
+        "metal_like": not e.determinable and bool(np.isfinite(e.ratio)),  # a box without a valid pixel is nothing
         "truth": truth,
     }

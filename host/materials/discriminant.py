@@ -29,7 +29,7 @@ from host.materials.samples import Real, Samples, by_angle
 REJECTED = 0.01
 """Share of the known materials' pixels, and of their patches, that may be called unknown."""
 METAL_LIKE = 0.25
-"""|1/P - 1| below this: the reference or another metal. The reference has no error of its own, so it tells of none."""
+"""|1/P - 1| of a patch below this: the reference or another metal. It has no error of its own, so it tells of none."""
 _ROUNDS = 30
 
 
@@ -66,7 +66,7 @@ class ErrorDiscriminant(Model):
         first = np.array([np.flatnonzero(patch == i)[0] for i in range(len(ids))])
         material, scan = of[first], np.unique(samples.groups, return_inverse=True)[1][first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
-        tells = ~self._metal_like(samples.x)[first]
+        tells = ~self._metal_like(samples.x, patch)
         if not tells.any():
             tells[:] = True
 
@@ -114,10 +114,11 @@ class ErrorDiscriminant(Model):
 
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
         """Names in one scan: the reference's error is found from all patches, and what is named is freed of it."""
-        ids, d = np.unique(patches), self._deviations(x)
-        mean = np.stack([d[patches == i].mean(axis=0) for i in ids])
-        pixels = min([self.pixels, *np.bincount(np.searchsorted(ids, patches)).tolist()])
-        tells = np.array([not self._metal_like(x[patches == i]).all() for i in ids])
+        ids, patch = np.unique(patches, return_inverse=True)
+        d = self._deviations(x)
+        mean = np.stack([d[patch == i].mean(axis=0) for i in range(len(ids))])
+        pixels = min([self.pixels, *np.bincount(patch).tolist()])
+        tells = ~self._metal_like(x, patch)
         own = [self._patch_covariance(k, pixels) for k in range(len(self.names))]
         offset, spread = self._reference_error(mean[tells], own)
         q, cost = self._costs(self._wrapped(mean - offset), [c + spread for c in own])
@@ -169,8 +170,13 @@ class ErrorDiscriminant(Model):
     def _middle(self, z: Real) -> Real:
         return np.where(self._cyclic, np.angle(np.exp(1j * z).mean(axis=0)), z.mean(axis=0))
 
-    def _metal_like(self, x: Real) -> npt.NDArray[np.bool_]:
-        return np.asarray((np.abs(by_angle(x)[2] - 1) < METAL_LIKE).all(axis=1), np.bool_)
+    @staticmethod
+    def _metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+        """Patches 0, 1, ... whose median V / H, by real and imaginary part, is nearly 1 under every angle, bool."""
+        q = by_angle(x)[2]
+        parts = [q[patch == i] for i in range(patch.max() + 1)]
+        middle = np.stack([np.median(p.real, axis=0) + 1j * np.median(p.imag, axis=0) for p in parts])
+        return np.asarray((np.abs(middle - 1) < METAL_LIKE).all(axis=1), np.bool_)
 
     def _independent(self, covariance: Real) -> Real:
         return np.where(self._same_angle, covariance, 0.0)

@@ -31,7 +31,10 @@ def fit_library(library: Library) -> Library:
 
 
 def fit_samples(samples: Samples) -> dict[str, Any]:
-    """Model and scores on labelled pixels, as plain values for a library's file."""
+    """Model and scores on labelled pixels, as plain values for a library's file.
+
+    The scores are of materials that two scans or more hold; `not_judged` names the others.
+    """
     model, scores = best_model(samples)
     weighted = fit_weights(samples)
     chosen = next(s for s in scores if s.model == model)
@@ -49,4 +52,6 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
         "known_called_unknown": chosen.unknown,
         "pixel_accuracy_in_scan": chosen.in_scan,
         "judged": judged,
+        "materials": len(chosen.names),
+        "not_judged": list(chosen.not_judged),
     }

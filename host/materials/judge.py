@@ -3,6 +3,9 @@
 Whole groups are left out (scans, or physical samples): pixels of one patch share their speckle, their placement and
 their metal reference, so that a split by pixel measures how well a patch knows itself. That figure is given too,
 because the paper seems to use it; it is optimistic and called so.
+
+A material can be judged only where another scan taught it. One that a single scan holds is not judged: it stays among
+the materials that the others may be confused with, counts neither as right nor as wrong, and is named.
 """
 
 from __future__ import annotations
@@ -41,11 +44,14 @@ class Score:
     unknown
         Share of the patches, all of them of known materials, that were called unknown.
     confusion
-        float64 [material, material] of pixels on their own, rows the truth, each adding to 1, in the order of `names`.
+        float64 [material, material] of pixels on their own, rows the truth, each adding to 1, in the order of `names`;
+        0 in the rows of materials that were not judged.
     patch_confusion
         The same of pixels by their patch.
     names
         Materials, sorted.
+    not_judged
+        Those of them that no training pixels were left for; the shares above are of the others.
     """
 
     model: str
@@ -59,15 +65,18 @@ class Score:
     confusion: Real
     patch_confusion: Real
     names: tuple[str, ...]
+    not_judged: tuple[str, ...] = ()
 
 
 def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
     """Training and test pixels of each fold: whole groups apart, or single pixels.
 
+    Every group is a fold of its own where `folds` could put all that hold a material into one.
+
     Raises
     ------
     DataError
-        when there are fewer than two groups to keep apart.
+        when there are fewer than two groups to keep apart, or no material is in two.
     """
     from sklearn.model_selection import GroupKFold, StratifiedKFold
 
@@ -83,6 +92,15 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
             "whole scans are left out, and none would remain to learn from",
             "process more scans",
         )
+    held = samples.groups_of_material[samples.shared]
+    if not held.size:
+        raise DataError(
+            f"no material is in two of the {groups.size} scans",
+            "a scan that is left out shows only what was never learnt",
+            "process a second scan with the same materials",
+        )
+    if held.min() <= -(-groups.size // folds):
+        folds = groups.size
     yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, samples.groups)
 
 
@@ -103,11 +121,12 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     Raises
     ------
     DataError
-        when there are fewer than two groups.
+        when there are fewer than two groups, or no material is in two of them.
     """
     alone, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
-    unknown = np.zeros(samples.names.size, bool)
+    unknown, learnt = np.zeros((2, samples.names.size), bool)
     for train, test in splits(samples, by_pixel, folds):
+        learnt[test] = np.isin(samples.names[test], samples.names[train])
         fitted = MODELS[model](channels)
         fitted.fit(samples.take(train))
         alone[test], far = fitted.by_pixel(samples.x[test])
@@ -122,25 +141,28 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
             row = np.searchsorted(found.patches, samples.patches[at])
             in_scan[at], of_patch[at], unknown[at] = found.pixel_names, found.names[row], (found.distance > 1)[row]
     names = np.unique(samples.names)
-    tables = [_confusion(samples.names, found, names) for found in (alone, in_scan, of_patch)]
+    tables = [_confusion(samples.names[learnt], found[learnt], names) for found in (alone, in_scan, of_patch)]
+    judged = np.isin(names, samples.names[learnt])
     first = np.unique(samples.patches, return_index=True)[1]
+    first = first[learnt[first]]
     return Score(
         model,
         channels,
         OPTIMISTIC if by_pixel else f"whole scans left out, {np.unique(samples.groups).size} scans",
-        *(float(np.mean(np.diag(t))) for t in tables),
+        *(float(np.mean(np.diag(t)[judged])) for t in tables),
         patches=float(np.mean((of_patch == samples.names)[first])),
         unknown=float(np.mean(unknown[first])),
         confusion=tables[0],
         patch_confusion=tables[2],
         names=tuple(str(n) for n in names),
+        not_judged=tuple(str(n) for n in names[~judged]),
     )
 
 
 def _confusion(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Real:
     table = np.zeros((names.size, names.size))
     np.add.at(table, (np.searchsorted(names, true), np.searchsorted(names, found)), 1)
-    return table / table.sum(axis=1, keepdims=True)
+    return table / np.maximum(table.sum(axis=1, keepdims=True), 1)
 
 
 def best_model(samples: Samples) -> tuple[str, tuple[Score, ...]]:

@@ -121,12 +121,12 @@ class PaperKnn(Model):
         self.channels, self.given, self.thresholds = channels, weights, dict(thresholds or {})
 
     def fit(self, samples: Samples) -> PaperKnn:
-        """Keep the pixels, and fit the weights unless they are given; on one scan nothing can be fitted."""
+        """Keep the pixels, and fit the weights unless they are given, or no two scans hold one material."""
         if self.given is not None:
             self.weights = self.given
         elif self.channels in ("H", "V"):
             self.weights = Weights(h=float(self.channels == "H"), v=float(self.channels == "V"), p=0.0)
-        elif np.unique(samples.groups).size < 2:
+        elif not samples.shared.any():
             self.weights = Weights()
         else:
             self.weights = fit_weights(samples, channels=self.channels).weights
@@ -162,7 +162,7 @@ class Fit:
     weights
         Best weights.
     pixel_accuracy
-        Of those weights on scans that were left out, mean over materials.
+        Of those weights on scans that were left out, mean over the materials that two scans or more hold.
     by_channel
         Pixel accuracy with H, V, or P alone, same splits.
     thresholds
@@ -200,11 +200,11 @@ def fit_weights(
     Raises
     ------
     DataError
-        with fewer than two scans: a split by pixel would be flattering.
+        with fewer than two scans, or no material in two: a split by pixel would be flattering.
     """
-    if np.unique(samples.groups).size < 2:
+    if not samples.shared.any():
         raise DataError(
-            f"there is {np.unique(samples.groups).size} scan; fitting weights needs at least 2",
+            f"no material is in two of the {np.unique(samples.groups).size} scans; fitting weights needs one",
             "whole scans are left out to judge weights; pixels of one patch are too much alike",
             "process more scans with other placements",
         )
@@ -219,14 +219,14 @@ def fit_weights(
         scale = [1 / max(float(np.median(c)), 1e-12) for c in distances]
         for wh, wv in grid:
             w = Weights(wh * scale[0], wv * scale[1], scale[2], measure, neighbours)
-            accuracy = _left_out(combine(distances, w), knn, few.names, same_scan)
+            accuracy = _left_out(combine(distances, w), knn, few, same_scan)
             tried.append((accuracy, -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1))), w))
             if wh == wv == 0:
                 alone[measure] = accuracy
     top = max(accuracy for accuracy, _, _ in tried)
     accuracy, _, weights = max((t for t in tried if t[0] >= top - 0.005), key=lambda t: t[1])
     distances = channel_distances(few.x, few.x, weights.measure)
-    by_channel = {c: _left_out(distances[i], knn, few.names, same_scan) for i, c in enumerate("hv")}
+    by_channel = {c: _left_out(distances[i], knn, few, same_scan) for i, c in enumerate("hv")}
     by_channel["p"] = alone[weights.measure]
     return Fit(weights, accuracy, by_channel, _thresholds(combine(distances, weights), neighbours, few))
 
@@ -237,10 +237,10 @@ def _few(samples: Samples, per_patch: int, rng: np.random.Generator) -> Samples:
     return samples.take(np.sort(np.concatenate(at)))
 
 
-def _left_out(distance: Real, knn: Any, names: npt.NDArray, same_scan: npt.NDArray[np.bool_]) -> float:
-    """Pixel accuracy, mean over materials, when no pixel of the same scan may vote."""
+def _left_out(distance: Real, knn: Any, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
+    """Pixel accuracy, mean over the materials of two scans or more, when no pixel of the same scan may vote."""
     found = knn.predict(np.where(same_scan, _FAR, distance))
-    return float(np.mean([(found[names == n] == n).mean() for n in np.unique(names)]))
+    return float(np.mean([(found[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))
 
 
 def _thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, float]:

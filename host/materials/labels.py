@@ -7,6 +7,7 @@ index left out. Whether their y counts from the top or the bottom was not seen o
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from host.materials.analyse import MaterialsResult
 from host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
+from host.materials.truth import TruthPlate
 from shared.errors import DataError
 
 
@@ -61,6 +63,18 @@ def labels_of(found: MaterialsResult) -> dict[str, Box]:
         key = name if name not in out else f"{name} ({r.patch.label})"
         out[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
     return out
+
+
+def patches_from_plates(
+    plates: Sequence[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float
+) -> tuple[Segmentation, dict[int, str]]:
+    """Patches where plates are known to be, and the name of each label; several plates may have the same name.
+
+    Parameters as of :func:`patches_from_labels`. Raises DataError when a plate holds no pixel.
+    """
+    boxes = {f"{plate.name} ({n})": plate.box_mm for n, plate in enumerate(plates, 1)}
+    found, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
+    return found, {n: plate.name for n, plate in enumerate(plates, 1)}
 
 
 def patches_from_labels(

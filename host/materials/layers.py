@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, optimize
+from scipy import ndimage, optimize, stats
 
 from host.materials.spectrum import Bands, Spectrum
 from host.polarimetry import multilayer
@@ -32,7 +32,10 @@ START_PHASE_RAD = 0.5
 """Steps of the grid of starts in the phase of the wave's way through the layer and back: no valley lies between."""
 LOSS_STARTS = 25
 RIVAL = 9.0
-"""A second solution is a rival when its chi-square is within this of the best: three standard deviations."""
+"""A second solution is a rival when its chi-square is within this of the best: three standard deviations, as wide as
+the error bars are where the model misses the data."""
+UNLIKELY = 1e-3
+"""The stack does not explain data that it would miss by as much in one of a thousand scans."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,9 @@ class LayerFit:
     chi2, freedom
         Sum of squared residuals over their deviations; data minus unknowns.
     rivals
-        Other solutions that the data cannot exclude (chi-square within 9).
+        Other solutions that the data cannot exclude (chi-square within 9, or more where the model misses the data).
+    at_limit
+        Unknowns that lie at an end of where they are looked for; no loss is not one.
     """
 
     permittivity: complex
@@ -71,6 +76,12 @@ class LayerFit:
     chi2: float
     freedom: int
     rivals: tuple[LayerFit, ...] = field(default=())
+    at_limit: tuple[str, ...] = ()
+
+    @property
+    def stretch(self) -> float:
+        """Chi-square per degree of freedom where the model misses the data by more than their deviations, else 1."""
+        return max(1.0, self.chi2 / self.freedom) if self.freedom > 0 else 1.0
 
     @property
     def ambiguous(self) -> bool:
@@ -84,10 +95,12 @@ class LayerFit:
             size = "" if r.thickness_m == self.thickness_m else f" at {r.thickness_m or 0:.3g} m"
             e = r.permittivity
             out.append(f"{e.real:.3g} - j{-e.imag:.3g}{size} explains the data as well (chi-square {r.chi2:.1f})")
-        if self.freedom > 0 and self.chi2 > self.freedom + 5 * np.sqrt(2 * self.freedom):
+        if self.freedom > 0 and stats.chi2.sf(self.chi2, self.freedom) < UNLIKELY:
             out.append(f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees")
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
             out.append("the data hardly depend on this layer: its error bar is large")
+        if self.at_limit:
+            out.append(f"{' and '.join(self.at_limit)} at the limit of what was looked for: the truth may lie beyond")
         return out
 
 
@@ -187,7 +200,7 @@ def fit_layer(
     best = found[0]
     rivals: list[LayerFit] = []
     for other in found[1:]:
-        if other.chi2 <= best.chi2 + RIVAL and all(_differ(other, known) for known in (best, *rivals)):
+        if other.chi2 <= best.chi2 + RIVAL * best.stretch and all(_differ(other, known) for known in (best, *rivals)):
             rivals.append(other)
     return replace(best, rivals=tuple(rivals))
 
@@ -277,17 +290,25 @@ class _Model:
             ftol=1e-12,
             gtol=1e-12,
         )
-        chi2 = float(2 * done.cost)
-        stretch = max(1.0, chi2 / self.freedom) if self.freedom > 0 else 1.0
         # On a bound (no loss at all) the solver's Jacobian still has the slope that the error bar needs.
-        std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(done.jac.T @ done.jac)), 0.0) * stretch)
+        std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(done.jac.T @ done.jac)), 0.0))
         thickness = float(done.x[2]) if self.unknowns == 3 else self.stack[self.at].thickness_m
-        return LayerFit(
+        names = ("the real part", "the loss", "the thickness")
+        ends = zip(names, done.active_mask, (True, False, True), strict=False)
+        fit = LayerFit(
             complex(done.x[0], -done.x[1]),
             thickness,
             float(std[0]),
             float(std[1]),
             float(std[2]) if self.unknowns == 3 else 0.0,
-            chi2,
+            float(2 * done.cost),
             self.freedom,
+            at_limit=tuple(name for name, end, both in ends if end > 0 or (both and end < 0)),
+        )
+        wider = float(np.sqrt(fit.stretch))
+        return replace(
+            fit,
+            std_real=fit.std_real * wider,
+            std_loss=fit.std_loss * wider,
+            std_thickness_m=fit.std_thickness_m * wider,
         )

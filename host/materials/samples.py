@@ -54,6 +54,18 @@ class Samples:
     groups: npt.NDArray
     patches: npt.NDArray
 
+    @property
+    def groups_of_material(self) -> npt.NDArray[np.int64]:
+        """In how many groups each pixel's material is, [n]."""
+        names, of = np.unique(self.names, return_inverse=True)
+        count = [np.unique(self.groups[of == k]).size for k in range(names.size)]
+        return np.array(count, np.int64)[of]
+
+    @property
+    def shared(self) -> npt.NDArray[np.bool_]:
+        """Pixels whose material another group holds too, so that it can be judged with whole groups left out, [n]."""
+        return self.groups_of_material > 1
+
     @classmethod
     def of(cls, library: Library, pixels_per_patch: int | None = None, seed: int = 0) -> Samples:
         """Pixels of a library of one angle, grouped by scan; at most so many of each patch, drawn at random.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,8 @@ def band_rows(
 
     Returns
     -------
-    Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, amplitude_h.
+    Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, amplitude_h. Null where
+    the sub-band shows nothing of the patch, or nothing of the metal: its footprint is another than the whole sweep's.
 
     Raises
     ------
@@ -54,15 +56,21 @@ def band_rows(
     if references is not None and len(references) != len(bands):
         raise DataError(
             f"the metal reference holds {len(references)} sub-bands, not {len(bands)}",
-            "a calibration file keeps none",
-            f"give the scan of the metal plate: --reference SCAN --bands {len(bands)}",
+            "a sub-band is divided by metal in the same part of the sweep",
+            f"give a reference with --bands {len(bands)}",
         )
     out: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
     for k, (band, made) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
-        relative = to_metal(made.h, made.v, found.metal, leakage, reference)
-        h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
-        error = reference_error(h, v, found.metal, reference)
+        metal = replace(found.metal, mask=found.metal.mask & made.valid)  # elsewhere the images are 0, and not metal
+        if metal.mask.any():
+            h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (made.h, made.v))
+            relative = to_metal(h, v, metal, leakage, reference)
+            h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
+            error = reference_error(h, v, metal, reference)
+        else:
+            h = v = np.full(made.valid.shape, complex(np.nan, np.nan))
+            error = float("nan")
         for r in found.patches:
             at = r.patch.interior & made.valid
             ratio = median_ratio(h[at], v[at])

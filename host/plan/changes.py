@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from shared.config import Instrument, decode, to_builtins
+from shared.config import Instrument
+from shared.tables import decode, to_builtins
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,20 @@ class Changes:
         return decode(table, Instrument, f"{rig.name}, changed")
 
 
-def rig_lines(rig: Instrument) -> str:
-    """The lines that put a plan into a rig file."""
-    g, b, s = rig.grid, rig.burst, rig.stage
-    return (
-        f"[burst]\npulses = {b.pulses}\nperiod_us = {b.period_us}\n\n"
-        f"[grid]\ncolumns = {g.columns}\nrows = {g.rows}\nstep_x_mm = {g.step_x_mm}\nstep_y_mm = {g.step_y_mm}\n\n"
-        f"[stage]\nspeed_mm_s = {s.speed_mm_s}\n"
-    )
+ON_THE_PI = ("speed_mm_s", "accel_mm_s2")
+"""Of [stage]: the Pi drives with its own rig file's acceleration, and refuses speeds above that file's."""
+
+
+def rig_lines(plan: Instrument, begun_with: Instrument) -> str:
+    """The lines that make a plan of the rig file it began with: every number that differs; "" when none does."""
+    new, old = to_builtins(plan), to_builtins(begun_with)
+    parts = []
+    for section, keys in new.items():
+        if not isinstance(keys, dict):
+            continue
+        lines = [f"{key} = {value}" for key, value in keys.items() if value != old[section].get(key)]
+        if section == "stage" and any(old[section][key] != keys[key] for key in ON_THE_PI):
+            lines.append("# speed_mm_s and accel_mm_s2: into the Pi's rig file too, then restart polysight-pi there")
+        if lines:
+            parts.append("\n".join([f"[{section}]", *lines, ""]))
+    return "\n".join(parts)

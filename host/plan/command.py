@@ -14,7 +14,7 @@ from host.plan.search import propose
 from host.plan.text import describe, numbers, table
 from host.plan.timing import ROW_OVERHEAD_S
 from host.store.scanfolder import ScanFolder
-from shared.config import load_instrument
+from shared.config import Instrument, load_instrument
 
 _SIMULATED = "the simulated rig's (no hardware has been measured; --like SCAN or --snr-db give another)"
 
@@ -40,7 +40,8 @@ def plan(config: Path, changes: Changes, wanted: Wanted) -> int:
     PolysightError
         when the rig file, a number or the scan named by --like is wrong.
     """
-    rig = changes.apply(load_instrument(config))
+    begun_with = load_instrument(config)
+    rig = changes.apply(begun_with)
     noise, overhead = _assumed(wanted)
     if wanted.minutes is not None:
         plans = propose(rig, wanted.minutes, wanted.count, noise, overhead, wanted.scene_mm)
@@ -52,7 +53,7 @@ def plan(config: Path, changes: Changes, wanted: Wanted) -> int:
                 f"Best plans within {wanted.minutes:g} minutes for this aperture, least noise in the image first"
                 f" (dB: point over noise; motion: wavelengths within a burst)\n\n{table(plans)}\n"
                 f"The first one in full:\n\n{describe(plans[0])}\n"
-                f"Its lines in the rig file:\n\n{rig_lines(plans[0].rig)}"
+                f"{_lines(plans[0].rig, begun_with)}"
             )
         else:
             sys.stderr.write(
@@ -64,6 +65,11 @@ def plan(config: Path, changes: Changes, wanted: Wanted) -> int:
     told = forecast(rig, noise, overhead, wanted.scene_mm)
     sys.stdout.write(json.dumps(numbers(told), indent=1) + "\n" if wanted.as_json else describe(told))
     return 0 if told.possible else 1
+
+
+def _lines(plan: Instrument, begun_with: Instrument) -> str:
+    lines = rig_lines(plan, begun_with)
+    return f"Its lines in the rig file, all that differ:\n\n{lines}" if lines else "The rig file says so already.\n"
 
 
 def _assumed(wanted: Wanted) -> tuple[Noise, float]:

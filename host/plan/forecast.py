@@ -127,7 +127,7 @@ def forecast(
     return Forecast(
         rig,
         scan_time(rig, row_overhead_s),
-        len(rig.recorded) * rig.row_bytes * rig.grid.rows,
+        rig.scan_bytes,
         burst_facts(rig),
         point_response(aperture, taper),
         field_limits(rig),

@@ -10,7 +10,7 @@ import numpy as np
 
 from host.plan.changes import Changes
 from host.plan.forecast import Forecast, Noise, burst_facts, cautions, forecast, noise_facts
-from host.plan.timing import ROW_OVERHEAD_S, payload_bytes, run_up_mm, scan_time
+from host.plan.timing import ROW_OVERHEAD_S, payload_bytes, scan_time
 from host.plan.warn import MAX_STEPS_PER_S, Caution
 from host.radar.program import TRIGGER_MARGIN_US, chirp_us
 from host.radar.validator import INTER_FRAME_US
@@ -123,9 +123,8 @@ def _whole(rig: Instrument, pulses: int) -> bool:
 def _speeds(rig: Instrument, minutes: float) -> Iterator[float]:
     """Whole speeds, ascending, from one that might keep the time to what stage and travel allow."""
     length = (rig.grid.columns - 1) * rig.grid.step_x_mm
-    room = min(rig.stage.centre_x_mm, rig.stage.travel_x_mm - rig.stage.centre_x_mm)
     slowest = max(1, int(rig.grid.rows * length / (60 * minutes)))
     for speed in range(slowest, int(MAX_STEPS_PER_S / rig.stage.steps_per_mm) + 1):
         at = msgspec.structs.replace(rig.stage, speed_mm_s=float(speed))
-        if length / 2 + run_up_mm(rig.grid, at) <= room:
+        if not at.misfit(rig.grid):
             yield float(speed)

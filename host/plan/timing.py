@@ -75,14 +75,9 @@ def straight_move_s(distance_mm: float, speed_mm_s: float, accel_mm_s2: float) -
     return distance_mm / speed_mm_s + speed_mm_s / accel_mm_s2
 
 
-def run_up_mm(grid: Grid, stage: Stage) -> float:
-    """From rest to the first point: the ramp v^2 / 2a, and a step (or the backlash) at constant speed."""
-    return stage.speed_mm_s**2 / (2 * stage.accel_mm_s2) + max(grid.step_x_mm, stage.backlash_mm)
-
-
 def row_motion_s(grid: Grid, stage: Stage) -> float:
     """One row from rest to rest."""
-    length = (grid.columns - 1) * grid.step_x_mm + 2 * run_up_mm(grid, stage)
+    length = (grid.columns - 1) * grid.step_x_mm + 2 * stage.run_up_mm(grid.step_x_mm)
     return straight_move_s(length, stage.speed_mm_s, stage.accel_mm_s2)
 
 
@@ -125,7 +120,7 @@ def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTi
     grid, stage = rig.grid, rig.stage
     row = row_motion_s(grid, stage)
     measuring = (grid.columns - 1) * grid.step_x_mm / stage.speed_mm_s
-    x = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - run_up_mm(grid, stage)
+    x = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - stage.run_up_mm(grid.step_x_mm)
     y = stage.centre_y_mm - (grid.rows - 1) / 2 * grid.step_y_mm
     return ScanTime(
         approach_s=straight_move_s(max(x, y), stage.travel_speed_mm_s, stage.accel_mm_s2),

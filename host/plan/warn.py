@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
+from host.options import Options
 from host.plan.field import FieldLimits
-from host.plan.timing import payload_bytes, run_up_mm, tail_s
+from host.plan.timing import payload_bytes, tail_s
 from host.radar.validator import constraints
 from shared.config import Instrument
 from shared.errors import ConfigError
@@ -46,6 +47,7 @@ def warnings_of(
         *_aliases(rig, field, scene_mm),
         *_mirrors(rig, field, scene_mm),
         *_noise(noise),
+        *_library(rig),
     ]
     return tuple(sorted(found, key=lambda w: not w.refused))
 
@@ -62,15 +64,6 @@ def _stage(rig: Instrument) -> Iterator[Caution]:
         steps = step * stage.steps_per_mm
         if abs(steps - round(steps)) > 1e-6:
             yield Caution(f"step {axis}", f"a step of {step:g} mm in {axis} is {steps:g} motor steps, not whole", True)
-    half = (grid.columns - 1) / 2 * grid.step_x_mm + run_up_mm(grid, stage)
-    room = min(stage.centre_x_mm, stage.travel_x_mm - stage.centre_x_mm)
-    if half > room:
-        yield Caution(
-            "run-up",
-            f"rows need {half:.0f} mm on either side of the centre, {run_up_mm(grid, stage):.0f} mm of it to speed up;"
-            f" the stage has {room:.0f} mm: narrow the grid, slow down, or raise accel_mm_s2",
-            True,
-        )
     if stage.speed_mm_s > PUBLISHED_SPEED_MM_S:
         yield Caution(
             "speed",
@@ -175,3 +168,8 @@ def _noise(noise: NoiseFacts) -> Iterator[Caution]:
             f"the direct path's phase is known to {noise.direct_phase_rad:.3f} rad only (published rig after all"
             f" stages: {PUBLISHED_PHASE_RAD}): more pulses a position",
         )
+
+
+def _library(rig: Instrument) -> Iterator[Caution]:
+    if text := Options().unnamed(rig):
+        yield Caution("library", text.replace("was named", "will be named", 1))

@@ -3,7 +3,7 @@
 One metal patch in the scene gives one number for each channel. A plate over the plane gives one for each pixel: what
 differs from place to place, antenna patterns and illumination of H against V, is divided out with the gains. Samples
 are referenced to the direct path, so the gains of another power cycle do not matter; the geometry and the boards must
-be the same.
+be the same: :meth:`PlaneReference.check_rig`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, stats
 
+from host.imaging.imaged_with import ImagedWith
 from host.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
 from shared.errors import DataError
 
@@ -42,6 +43,8 @@ class PlaneReference:
         One sentence for the report.
     bands
         The same plate in sub-bands of the sweep, where those were imaged.
+    made_with
+        The rig that it was imaged with; None where that is not known.
     """
 
     h: Image
@@ -52,6 +55,7 @@ class PlaneReference:
     spread: float
     how: str
     bands: tuple[PlaneReference, ...] = ()
+    made_with: ImagedWith | None = None
 
     def mean(self) -> PlaneReference:
         """The same plate as one number a channel (Eq. 9), usable at every pixel."""
@@ -87,6 +91,33 @@ class PlaneReference:
                 "scan the metal plate with the same rig file; only [grid] may differ",
             )
 
+    def check_rig(self, now: ImagedWith, name: str = "the metal reference") -> None:
+        """Refuse images of another rig: the gains would not be theirs. `name` is for the message. Raises DataError."""
+        if self.made_with is None:
+            raise DataError(
+                f"{name} does not say which rig it was scanned with",
+                "an older release wrote it, which could not tell when a board was moved afterwards",
+                "make it again from the same scan: `polysight calibrate metal SCAN`; one scan can be processed with"
+                " --reference SCAN instead",
+            )
+        if found := self.made_with.differences(now):
+            raise DataError(
+                f"{name} is of another rig: {'; '.join(found)}",
+                "the rig or its file was changed after the metal plate was scanned, and the gains with it",
+                "scan the metal plate again with the rig as it is, and calibrate with it; or put the rig file back",
+            )
+
+    def check_bands(self, count: int, name: str = "the metal reference") -> None:
+        """Refuse to divide so many sub-bands by a reference that has others, or none. Raises DataError."""
+        if count > 1 and len(self.bands) != count:
+            held = f"{len(self.bands)} sub-bands" if self.bands else "no sub-bands"
+            instead = f"--bands {len(self.bands)} uses those it has" if self.bands else "leave --bands out"
+            raise DataError(
+                f"{name} holds {held}, not {count}",
+                "a sub-band is divided by metal in the same part of the sweep",
+                f"`polysight calibrate metal SCAN --bands {count}` keeps so many; or {instead}; or --reference SCAN",
+            )
+
     def facts(self) -> dict[str, Any]:
         """How much the gains vary over the plane, for quality.json; plain numbers."""
         at = self.valid
@@ -98,6 +129,8 @@ class PlaneReference:
         turned = np.angle(h / v * np.conj(np.mean(h / v)))
         out["ratio_variation_deg"] = round(float(np.degrees(np.std(turned))), 4)
         out["spread"] = round(self.spread, 5)
+        if self.bands:
+            out["sub_bands"] = len(self.bands)
         return out
 
 

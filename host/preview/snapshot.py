@@ -13,12 +13,13 @@ from host.preview.story import Story
 from host.preview.verdict import Signs, judge, no_scan, sync_notices, unreadable
 from host.preview.words import Notice
 from host.scan.control import Wish
+from host.scan.time_left import time_left
+from shared.sync_in import WIDTH_US
 
 PAPER_PHASE_RAD = 0.022
 """Phase residual after all stages, paper section 9.1."""
 
 _NOTICES = 30
-_WIDTH_LIMIT_NS = 4000  # longest SYNC_IN pulse an AWR2243 takes
 _MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 
 
@@ -85,8 +86,7 @@ def remaining(story: Story, now_s: float) -> tuple[int | None, str]:
         return (0, "measured") if left == 0 else (None, "")
     row_s, basis = known
     since = max(story.last_commit_s, story.run_started_s)
-    elapsed = 0.0 if story.paused else min(max(now_s - since, 0.0), row_s)
-    return max(0, round(left * row_s - elapsed)), basis
+    return round(time_left(left, row_s, 0.0 if story.paused else now_s - since)), basis
 
 
 def _scan(c: Content, story: Story) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def _trigger(story: Story) -> dict[str, Any] | None:
     return {
         "width_max_us": max(h.width_max_ns for h in health) / 1e3,
         "jitter_max_us": max(h.jitter_max_ns for h in health) / 1e3,
-        "width_limit_us": _WIDTH_LIMIT_NS / 1e3,
+        "width_limit_us": WIDTH_US[1],
         "pulses": len(story.takes) * story.plan.columns * story.instrument.burst.pulses,
     }
 

@@ -6,7 +6,6 @@ begins to look later.
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -14,15 +13,16 @@ from typing import Any, Literal
 
 from host.plan.timing import scan_time
 from host.preview.words import Notice, of_fault, of_kept, of_rejection
+from host.scan.time_left import usual_row_s
+from host.store.connection import reconnected
 from host.store.manifest import Fact
 from shared.config import Instrument
-from shared.config import decode as decode_config
 from shared.messages import AnyEvent, Capture
 from shared.messages import Fault as FaultEvent
 from shared.raster import RasterPlan, plan_raster
+from shared.tables import decode as decode_config
 
 RowMark = Literal["committed", "kept", "rejected"]
-_RECENT_ROWS = 25  # whose times say how long a row takes
 _RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
@@ -118,7 +118,7 @@ class Story:
         self._rows[row] = fact["boards"]
         self.rows_since_trouble = 0 if kept else self.rows_since_trouble + 1
         if kept:
-            self.notices.append(of_kept(row, kept, fact.get("committed_utc", "")))
+            self.notices.append(of_kept(row, kept, fact.get("faults", []), fact.get("committed_utc", "")))
         if not fact.get("committed_utc"):
             return  # made in one step, by `polysight simulate`
         at = seconds(fact["committed_utc"])
@@ -127,12 +127,12 @@ class Story:
         self.last_commit_s = at
 
     def _row_rejected(self, fact: Fact) -> None:
-        row, reasons = int(fact["row"]), [str(r) for r in fact["reasons"]]
+        row, reasons, faults = int(fact["row"]), [str(r) for r in fact["reasons"]], fact.get("faults", [])
         self.marks[row] = "rejected"
         self.rows_since_trouble = 0
         for name in self._rejected:
-            self._rejected[name] += any(r.startswith(f"{name}:") for r in reasons)
-        self.notices.append(of_rejection(row, int(fact["take"]), reasons, fact.get("rejected_utc", "")))
+            self._rejected[name] += any(f.get("board") == name for f in faults)
+        self.notices.append(of_rejection(row, int(fact["take"]), reasons, faults, fact.get("rejected_utc", "")))
 
     def _row_withdrawn(self, fact: Fact) -> None:
         row = int(fact["row"])
@@ -155,6 +155,8 @@ class Story:
     def _scan_resumed(self, fact: Fact) -> None:
         self.ended, self.paused = None, False
         self.run_started_s = seconds(fact["resumed_utc"])
+        if fact.get("rig"):  # the Pi is somewhere else from now on
+            self.instrument = reconnected(self.instrument, fact["rig"])
 
     def _scan_paused(self, fact: Fact) -> None:
         self.paused, self._paused_at = True, seconds(fact["paused_utc"])
@@ -199,7 +201,7 @@ class Story:
     def row_seconds(self) -> tuple[float, str] | None:
         """How long a row takes, and from what that is known; None when it is not."""
         if self._row_seconds:
-            return statistics.median(self._row_seconds[-_RECENT_ROWS:]), "measured"
+            return usual_row_s(self._row_seconds), "measured"
         if self.last_commit_s > self.run_started_s:
             return self.last_commit_s - self.run_started_s, "first row"
         if self.simulated:

@@ -90,7 +90,7 @@ def judge(story: Story, folder: Path, signs: Signs, heard: Heard, shown: Shown, 
         )  # fmt: skip
     if heard.state == "fault":
         unknown = Notice(
-            "bad", "It came before this view.", "Its terminal says more", "On the Pi: `polysight-pi check`"
+            "bad", "It came before this view.", "Its terminal says more", "On the Pi: `journalctl -u polysight-pi`"
         )
         told = heard.faults[-1] if heard.faults else unknown
         return Status("bad", "The rig has stopped with a fault", told.what, told.why, told.do)
@@ -108,7 +108,8 @@ def judge(story: Story, folder: Path, signs: Signs, heard: Heard, shown: Shown, 
     if heard.state == "held":
         return Status(
             "warn", "The stage is held", "Within a row. Held for more than 2 s, the row is taken again.",
-            "Somebody sent the Pi a hold", "Tell the Pi to resume",
+            "A program other than polysight sent the Pi `Hold`",
+            f"That program sends `Resume`; or end the scan: `touch {folder}/control/abort`",
         )  # fmt: skip
     if heard.state == "homing":
         return Status("good", "Homing the stage", "Rows begin when it knows where it is.")

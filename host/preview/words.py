@@ -6,51 +6,53 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from host.scan.take_faults import FaultKind
+from host.store.manifest import Fact
 from shared.errors import PolysightError
 from shared.faults import PiFault, explain
 from shared.messages import Fault
 
 Level = Literal["bad", "warn", "note"]
 
-# A word of the reason, its likely cause, what to do.
-_LOSSES: tuple[tuple[str, str, str], ...] = (
-    (
-        "asked for at the host",
-        "Somebody stopped the scan in this row",
-        "Nothing; `polysight resume` takes the row again",
-    ),
-    (
-        "the radar has stopped",
+K = FaultKind
+CAUSES: dict[FaultKind, tuple[str, str]] = {
+    K.ON_REQUEST: ("Somebody stopped the scan in this row", "Nothing; `polysight resume` takes the row again"),
+    K.RADAR_STOPPED: (
         "The radar hit a fault of its own",
         "It is armed anew; if that fails too, power-cycle the board",
     ),
-    (
-        "the radar still waits",
-        "SYNC_IN pulses did not reach the board",
-        "Check its SYNC_IN wire and the fan-out buffer",
-    ),
-    (
-        "no data",
+    K.RADAR_WAITS: ("SYNC_IN pulses did not reach the board", "Check its SYNC_IN wire and the fan-out buffer"),
+    K.NO_END: ("The Pi or the network was busy", "Nothing, while it is rare; else the Pi's load and network"),
+    K.COUNTS_DIFFER: ("The stage and the Pi do not agree on what was passed", "Check the stage's trigger wire"),
+    K.NO_DATA: (
         "The radar is not armed, or its card has lost network or power",
         "`polysight card` names the silent hop",
     ),
-    (
-        "(0 packets dropped by this machine)",
+    K.HELD: ("Somebody held the stage for more than 2 s", "Nothing"),
+    K.PULSES_MISSED: (
+        "The board missed SYNC_IN pulses",
+        "Check its SYNC_IN wire; after the scan `polysight doctor` sends some to try",
+    ),
+    K.SLIPPED: (
+        "The board saw edges on SYNC_IN that the Pi did not send",
+        "Check its SYNC_IN wire and ground, and what runs beside it",
+    ),
+    K.FRAMES_MISSING: (
+        "The board missed SYNC_IN pulses, or the end of its data was lost",
+        "Check its SYNC_IN wire; after the scan `polysight doctor` sends some to try",
+    ),
+    K.CARD_DROPPED: ("The card could not send as fast as the radar measured", "Check its cable and the switch"),
+    K.LOST_BY_HOST: ("This machine was too busy to take the packets", "Close other programs on the host"),
+    K.LOST_ON_THE_WAY: (
         "Packets were lost between card and host",
         "Nothing, while it is rare; else check cable and switch",
     ),
-    (
-        "dropped by this machine",
-        "This machine was too busy to take the packets",
-        "Close other programs on the host",
+    K.UNLOCATED: (
+        "Packets were lost at the row's beginning, or the radar saw triggers that were not sent",
+        "Nothing, while it is rare; else check cable, switch and SYNC_IN wire",
     ),
-    ("held", "Somebody held the stage for more than 2 s", "Nothing"),
-    (
-        "pulse",
-        "The board missed SYNC_IN pulses",
-        "Check its SYNC_IN wire; `polysight-pi pulse` sends some to try",
-    ),
-)
+}
+"""Likely cause of a fault and what to do. Those of the Pi are in shared/faults.py."""
 
 
 @dataclass(frozen=True)
@@ -94,20 +96,25 @@ def of_fault(event: Fault) -> Notice:
     )
 
 
-def _cause(reasons: Sequence[str]) -> tuple[str, str]:
-    """Likely cause and remedy of a row's faults, from the first one that is known."""
-    found = ((why, do) for reason in reasons for word, why, do in _LOSSES if word in reason)
-    return next(found, ("", ""))
+def _cause(faults: Sequence[Fact]) -> tuple[str, str]:
+    """Likely cause and remedy of a row's faults, from the first one that is known; newer kinds are not."""
+    for fault in faults:
+        if fault["kind"] == K.PI_FAULT and fault.get("number"):
+            table = explain(int(fault["number"]))
+            return sentence(table.why), sentence(table.remedy)
+        if fault["kind"] in CAUSES:
+            return CAUSES[fault["kind"]]
+    return "", ""
 
 
-def of_rejection(row: int, take: int, reasons: Sequence[str], utc: str) -> Notice:
+def of_rejection(row: int, take: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
     """A take that did not count."""
-    why, do = _cause(reasons)
+    why, do = _cause(faults)
     do = do or "Nothing: the row is taken again by itself"
     return Notice("warn", f"Row {row}, take {take}, did not count", why, do, "; ".join(reasons), row, utc)
 
 
-def of_kept(row: int, reasons: Sequence[str], utc: str) -> Notice:
+def of_kept(row: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) -> Notice:
     """A row that is kept though something of it is missing."""
-    why, do = _cause(reasons)
+    why, do = _cause(faults)
     return Notice("warn", f"Row {row} is kept with gaps, which are masked", why, do, "; ".join(reasons), row, utc)

@@ -129,6 +129,13 @@ class RadarBoard:
             if self._state is not State.ARMED:
                 raise DeviceError(f"{self.name}: {self.reason}", "a fatal event while it was armed", "resume the scan")
 
+    def reconnect(self, words: WordLink) -> None:
+        """Go on over another link, the one before being gone; the next `arm` resets and configures the board."""
+        warnings = self._link.warnings
+        self._words, self._link = words, Link(self.name, words, self._clock, self._sent.append)
+        self._link.warnings += warnings
+        self.fail("its link was opened anew")
+
     def pulses_begin(self) -> None:
         """The host knows that pulses come from now on; the radar does not say so."""
         if self._state is State.ARMED:

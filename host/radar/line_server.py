@@ -20,7 +20,10 @@ from shared.errors import DeviceError
 
 LINE = b"Retrigger\n"
 _LOOK_MS = 5
-_START = "start the control server of this board (beside mmWave Studio), or correct radar.servers in instrument.toml"
+_START = (
+    "start the control server of this board (beside mmWave Studio), or correct radar.servers in instrument.toml"
+    " (a scan that was begun: `polysight resume SCAN --config instrument.toml`)"
+)
 
 
 class LineServers(RadarControl):

@@ -1,13 +1,13 @@
 """Radars that this host configures and arms itself, over USB: the backend `native`.
 
-A board that failed is reset and configured anew when the next row, or the same one again, is armed. Not run on
-hardware yet.
+A board that failed is reset and configured anew when the next row, or the same one again, is armed; where its link is
+gone, that is opened anew. Not run on hardware yet.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 
 from host.radar.board import RadarBoard, State
 from host.radar.interface import BoardState, RadarControl, RadarState
@@ -17,6 +17,7 @@ from host.radar.usb import open_usb
 from host.radar.usb_tcp import SCHEME, open_tcp
 from host.radar.validator import constraints, direct_if_hz, require
 from shared.config import Instrument
+from shared.errors import DeviceError
 
 
 def open_board(serial: str) -> WordLink:
@@ -25,12 +26,42 @@ def open_board(serial: str) -> WordLink:
 
 
 _LOOK_S = 0.005
+_REOPEN_S = 5.0  # USB takes a moment to find a chip again
+_REOPEN_EVERY_S = 0.25
 _TOLD = {
     State.ARMED: RadarState.ARMED,
     State.RUNNING: RadarState.ARMED,
     State.DONE: RadarState.DONE,
     State.FAULT: RadarState.FAULT,
 }
+
+
+class _NoLink:
+    """In place of a link that did not come back: whatever is asked of it fails as opening it did."""
+
+    def __init__(self, error: DeviceError) -> None:
+        self._error = error
+
+    def write(self, words: Sequence[int]) -> None:
+        del words
+        raise self._again()
+
+    def read(self, count: int) -> list[int]:
+        del count
+        raise self._again()
+
+    def interrupt(self) -> bool:
+        raise self._again()
+
+    def reset(self, held: bool) -> None:
+        del held
+        raise self._again()
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _again(self) -> DeviceError:
+        return DeviceError(self._error.what, self._error.why, self._error.remedy)
 
 
 class NativeRadars(RadarControl):
@@ -56,7 +87,7 @@ class NativeRadars(RadarControl):
     def __init__(
         self, rig: Instrument, open_words: Callable[[str], WordLink] = open_board, clock: Clock | None = None
     ) -> None:
-        self._rig, self._clock = rig, clock or SystemClock()
+        self._rig, self._clock, self._open_words = rig, clock or SystemClock(), open_words
         frames = rig.grid.columns * rig.burst.pulses
         require(rig, frames)
         self._constraints = [str(c) for c in constraints(rig, frames)]
@@ -65,20 +96,43 @@ class NativeRadars(RadarControl):
             opened.callback(self.close)
             for board in rig.boards:
                 made = program(rig, board)
-                words = open_words(rig.radar.native[board.name].usb_serial)
+                words = self._open(board.name)
                 self._boards[board.name] = RadarBoard(board.name, words, self._clock, made)
             for board in self._boards.values():
                 board.configure()
             opened.pop_all()
 
     def arm(self, frames: int) -> None:
-        """Start `frames` frames on every board; each has said that it waits for triggers when this returns.
+        """Start `frames` frames on every board; each has said that it waits for triggers when this returns, or failed.
 
-        Raises ConfigError, DeviceError.
+        One that failed says so in `states`: that costs a take, not the scan. Raises ConfigError.
         """
         require(self._rig, frames)
         for board in self._boards.values():
-            board.arm(frames)
+            try:
+                board.arm(frames)
+            except DeviceError:  # a chip that went and came back has left a dead link behind
+                if self._reopen(board):
+                    with suppress(DeviceError):
+                        board.arm(frames)
+
+    def _open(self, name: str) -> WordLink:
+        return self._open_words(self._rig.radar.native[name].usb_serial)
+
+    def _reopen(self, board: RadarBoard) -> bool:
+        """Open a failed board's link anew; False when it does not come back."""
+        with suppress(OSError):  # of a device that is not there any more
+            board.close()
+        deadline = self._clock.now() + _REOPEN_S
+        while True:
+            try:
+                board.reconnect(self._open(board.name))
+                return True
+            except DeviceError as e:
+                if self._clock.now() > deadline:
+                    board.reconnect(_NoLink(e))
+                    return False
+            self._clock.sleep(_REOPEN_EVERY_S)
 
     def row_begins(self) -> None:
         """Pulses may come from now on."""

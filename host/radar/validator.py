@@ -13,13 +13,13 @@ from host.radar.program import chirp_us, frame_period_us
 from shared.config import Board, Instrument
 from shared.errors import ConfigError
 from shared.geometry import direct_path_m
+from shared.sync_in import MIN_PERIOD_US, WIDTH_US
 from shared.units import SPEED_OF_LIGHT_M_S
 
 BAND_HZ = (76e9, 81e9)
 INTER_FRAME_US = 300.0
 AFTER_FRAME_US = 150.0
-FRAME_PERIOD_US = (300.0, 1.342e6)
-PULSE_US = (0.025, 4.0)
+FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
 SAMPLE_MEMORY_BYTES = 16384
 TRIGGER_UNCERTAINTY_S = 5e-9  # of one board against the pulse (ICD 92)
 PASSBAND = 0.9  # of the sample rate
@@ -91,7 +91,7 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
     )  # ICD 91
     gap = rig.burst.period_us - period
     yield Constraint("pulse gap", "pulse period - frame period", gap, AFTER_FRAME_US, None, "us", slower)  # ICD 93
-    yield Constraint("pulse width", "SYNC_IN pulse", rig.burst.width_us, *PULSE_US, "us", "set burst.width_us")
+    yield Constraint("pulse width", "SYNC_IN pulse", rig.burst.width_us, *WIDTH_US, "us", "set burst.width_us")
 
 
 def _chirp(rig: Instrument) -> Iterator[Constraint]:

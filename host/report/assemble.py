@@ -76,4 +76,9 @@ def classifier_sentence(classifier: Classifier) -> str:
             alone = ", ".join(f"{k.upper()} {100 * channel[k]:.0f} %" for k in "hvp")
             out += f"; the KNN by one channel alone: {alone}"
         out += "."
+        if missing := fit.get("not_judged"):
+            out += (
+                f" Of its {fit['materials']} materials {len(missing)} could not be judged, because one scan alone holds"
+                f" them: {', '.join(missing)}."
+            )
     return f"{out} {library.note}".strip()

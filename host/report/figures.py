@@ -233,11 +233,15 @@ def draw_truth(ax: Axes, ctx: ReportContext, size: float = 7.5) -> None:
     """The plates as they really lie."""
     colours = colours_of(ctx)
     _crop(ax, ctx)
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     for plate in ctx.truth or []:
         x0, y0, x1, y1 = plate["box_mm"]
         colour = colours[str(plate["name"])]
         ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=colour, edgecolor=INK, linewidth=0.9))
-        _label(ax, (x0 + x1) / 2, y1 + 0.5, str(plate["name"]), size, above=True)
+        if y1 < top:
+            _label(ax, (x0 + x1) / 2, y1 + 0.5, str(plate["name"]), size, above=True)
+        else:  # larger than the image: a name above it would be far outside the picture
+            _label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, str(plate["name"]), size)
 
 
 def map_figure(ctx: ReportContext, draw: Callable[[Axes, ReportContext], None], title: str) -> bytes:

@@ -53,9 +53,9 @@ def key_numbers(ctx: ReportContext, rows: list[dict[str, Any]]) -> list[dict[str
     def add(value: str, what: str) -> None:
         out.append({"value": value, "text": what})
 
-    if ctx.truth:
+    if ctx.truth and any(m.get("name") for m in ctx.materials):  # of what nobody named nothing is wrong
         right = sum(r["right"] for r in rows)
-        add(f"{right} of {len(ctx.truth)}", "plates named right by majority of their pixels")
+        add(f"{right} of {len(ctx.truth)}", "plates named right")
     elif rows:
         add(str(len(rows)), "patches found")
     if ctx.pixel_accuracy is not None:

@@ -15,8 +15,9 @@ from host.report.context import ReportContext
 from host.report.products import write_json
 from host.store.scanfolder import versions
 from host.store.source import Scan
-from shared.config import Instrument, to_builtins
+from shared.config import Instrument
 from shared.raster import RasterPlan
+from shared.tables import to_builtins
 
 SCAN = "scan.json"
 

@@ -111,7 +111,7 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
         raise DataError(
             f"{folder}: neither materials/*.pkl nor labels/<scan> with a known material is in it",
             "; ".join(notices) or "the download is not complete, or this is another folder",
-            "give the folder of the published data set; --names FILE says what its names mean",
+            "give the folder of the published data set; `polysight reproduce --names FILE` says what its names mean",
         )
     return AuthorsData(folder, base, sources, meaning, tuple(dict.fromkeys(notices)))
 
@@ -202,6 +202,9 @@ def _named(
             sources[source] = Library(tuple(kept), {}, source)
     if unknown:
         told = ", ".join(sorted(unknown))
-        notices.append(f"not judged, as their names mean no row of Table 2: {told}; --names says what they mean")
+        notices.append(
+            f"not judged, as their names mean no row of Table 2: {told}; `polysight reproduce --names FILE` says what"
+            " they mean"
+        )
     meaning = {f"{n}, {t:g} mm" if t else n: number for (n, t), number in rows.items()}
     return dict(sorted(meaning.items())), sources

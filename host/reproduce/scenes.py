@@ -14,7 +14,7 @@ import numpy.typing as npt
 import tomli_w
 
 from host.demo import run_simulator
-from host.materials import MaterialsResult, TruthPlate, patches_from_labels, read_truth
+from host.materials import MaterialsResult, TruthPlate, patches_from_plates, read_truth
 from host.offline import EDGE_MM, TRUTH
 from host.pipeline import Pipeline
 from host.store.scanfolder import ScanFolder
@@ -65,7 +65,6 @@ def imaged(source: ScanSource, plates: tuple[TruthPlate, ...]) -> Imaged:
         pipeline.add_row(row)
     images = pipeline.form_images()
     metal = next(p for p in plates if p.metal)
-    boxes = {p.name: p.box_mm for p in plates}
-    known, _ = patches_from_labels(boxes, images.x_m, images.y_m, unit="mm", margin_mm=EDGE_MM)
+    known, _ = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     result = pipeline.find_materials(images, metal.box_mm, plates=plates, segmentation=known)
     return Imaged(result, images.x_m, images.y_m)

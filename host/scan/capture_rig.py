@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Collection
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 
 from host.capture.card import CardClient
 from host.capture.dca1000 import Status, Version
+from host.capture.end_of_record import TAIL_S
 from host.capture.receiver import ReceiverProcess
 from host.capture.receiver_words import Progress, RowCapture
 from host.capture.scheduling import receiver_cores
@@ -15,6 +18,8 @@ from host.capture.udp import check_receive_buffer
 from host.store.scanfolder import PART
 from shared.config import Instrument
 from shared.errors import PolysightError
+
+_COMPLETED_LIMIT_S = 0.2  # from a record's stop to its last packet and its status
 
 
 class CaptureRig:
@@ -50,12 +55,18 @@ class CaptureRig:
                 self.warnings += receiver.warnings
                 if warning := check_receive_buffer(board.name, receiver.granted_bytes, wanted, burst_bytes):
                     self.warnings.append(warning)
+            if (silence_s := instrument.limits.end_of_record_s) <= TAIL_S:
+                self.warnings.append(
+                    f"limits.end_of_record_s is {silence_s:g}: a card sends the last packet after {TAIL_S:g} s of"
+                    " silence, or at the record's stop, but not every card may do the latter; 3 s is safe"
+                )
             self._stack = stack.pop_all()
 
-    def configure(self) -> dict[str, Version]:
-        """Set every card up and stop what it may record; returns the FPGA versions. Raises DeviceError."""
+    def configure(self, names: Collection[str] = ()) -> dict[str, Version]:
+        """Set cards up, all unless named, and stop what they may record; returns FPGA versions. Raises DeviceError."""
         found = {}
-        for name, card in self.cards.items():
+        for name in names or self.cards:
+            card = self.cards[name]
             card.alive()
             card.record_stop()
             card.configure(self._instrument.card)
@@ -75,7 +86,9 @@ class CaptureRig:
     @property
     def complete(self) -> bool:
         """Whether every expected byte of the row is there, on every board."""
-        return all(receiver.poll().complete for receiver in self.receivers.values())
+        # Each one is asked, also behind one that is not complete: a process that died is noticed by asking.
+        found = [receiver.poll() for receiver in self.receivers.values()]
+        return all(progress.complete for progress in found)
 
     def reports(self) -> dict[str, Progress]:
         """How far the row is on every board, asked for."""
@@ -88,6 +101,9 @@ class CaptureRig:
     def end_row(self) -> dict[str, RowCapture]:
         """Stop the records and take the rows: their files are durable when this returns. Raises DeviceError."""
         self.stop_records()
+        deadline = time.monotonic() + _COMPLETED_LIMIT_S
+        for card in self.cards.values():
+            card.wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()
         return {name: receiver.end_row(statuses[name]) for name, receiver in self.receivers.items()}
 

@@ -6,10 +6,11 @@ from host.capture.decode import valid_frames
 from host.capture.hops import silent_radar
 from host.scan.slipped_row import write_in_place
 from host.scan.take import Take
+from host.scan.take_faults import TakeFault, reasons
 from host.store.appending import sync_folder
 from host.store.manifest import Fact, ManifestWriter
 from host.store.scanfolder import PART, ScanFolder, utc_now
-from shared.errors import DeviceError, ScanError
+from shared.errors import DeviceError, ScanError, advice
 from shared.faults import explain
 
 _KINDS = (
@@ -33,7 +34,7 @@ _KINDS = (
 """What the manifest says of each board's reception, beside what makes the row count."""
 
 
-def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[str], events: Fact) -> None:
+def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[TakeFault], events: Fact) -> None:
     """Give the files their names, make that durable, then write the line that makes the row count.
 
     `events` is the digest of the event log, which is on the disk already. `faults` says why a row that is kept is
@@ -77,12 +78,12 @@ def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
         "events": events,
         "committed_utc": utc_now(),
     }
-    kept: Fact = {"kept_incomplete": faults} if faults else {}
+    kept: Fact = {"kept_incomplete": [str(f) for f in faults], "faults": [f.fact() for f in faults]} if faults else {}
     note: Fact = {"note": take.note} if take.note else {}
     writer.append({**fact, **kept, **note})
 
 
-def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[str]) -> None:
+def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[TakeFault]) -> None:
     """Remove what was received, and write down why. Raises DeviceError when the disk fails."""
     for name in take.captures:
         path = scan.row_path(name, take.row.index)
@@ -93,7 +94,8 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
             "fact": "row_rejected",
             "row": take.row.index,
             "take": take.number,
-            "reasons": faults,
+            "reasons": [str(f) for f in faults],
+            "faults": [f.fact() for f in faults],
             "boards": {name: _counts(take, name) for name in take.captures},
             "rejected_utc": utc_now(),
         }
@@ -105,19 +107,25 @@ def _counts(take: Take, name: str) -> Fact:
     return {**{kind: getattr(c, kind) for kind in _KINDS}, "located": c.located, "received_bytes": c.bytes}
 
 
-def gave_up(take: Take, faults: list[str], scan: ScanFolder, takes: int) -> ScanError:
+def gave_up(take: Take, faults: list[TakeFault], scan: ScanFolder, takes: int) -> ScanError:
     """The error for a row whose retakes are used up, with the likeliest cause."""
-    what = f"row {take.row.index} is not complete after {takes} takes: {'; '.join(faults)}"
+    what = f"row {take.row.index} is not complete after {takes} takes: {reasons(faults)}"
     resume = f"then `polysight resume {scan.path}`; with --keep-incomplete it keeps such rows, masked"
+    if take.stopped_radars:
+        return ScanError(
+            what,
+            "a radar has stopped by itself, or the link to it is gone",
+            f"check its USB cable, its power and its SYNC_IN (docs/how-to/radar-bring-up.md); {resume}",
+        )
     if take.silent_boards:
         silent = [silent_radar(scan.instrument.by_name(name), take.captures[name]) for name in take.silent_boards]
         asked = [f"{n}'s radar was {take.radars[n].detail}" for n in take.silent_boards if n in take.radars]
         return ScanError(
-            what, "; ".join([f"{e.what}: {e.why}" for e in silent] + asked), f"{silent[0].remedy}; {resume}"
+            what, "; ".join([f"{e.what}: {e.why}" for e in silent] + asked), advice(silent[0].remedy, resume)
         )
     if take.finished is not None and take.finished.fault:
         e = explain(take.finished.fault)
-        return ScanError(what, e.why, f"{e.remedy}; {resume}")
+        return ScanError(what, e.why, advice(e.remedy, resume))
     return ScanError(
         what,
         "packets are lost on the network or in this machine, or a board misses SYNC_IN pulses",

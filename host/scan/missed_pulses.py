@@ -102,6 +102,35 @@ def place_frames(
     return PlacedFrames(slots, missed, n, reason)
 
 
+def slipped_frames(
+    pulses_ns: Times, told_ns: Times, arrivals: Times, frame_bytes: int, payload_bytes: int
+) -> PlacedFrames | None:
+    """Where the frames belong of a row with a frame for every pulse, when they are not all at their pulses' times.
+
+    A radar that counts its frames takes an edge on SYNC_IN that nobody sent for a pulse, and has none left for the last
+    one: the count is right, and every frame between them is one place off. So is what lies between a missed pulse and
+    such an edge. Then more frames have come by the begin of a burst than pulses were sent before it, or as many fewer
+    at three bursts in a row, which late data do not make. Frames of bursts that came whole are placed.
+
+    Parameters and slots as :func:`place_frames`; None where every frame is at its pulse, or the times do not tell.
+    """
+    count = pulses_ns.shape[1]
+    try:
+        starts = _starts(pulses_ns, told_ns, arrivals, frame_bytes)
+    except _UndecidedError:
+        return None
+    if frame_bytes < payload_bytes or starts[-1] != pulses_ns.size:
+        return None
+    ahead = starts - count * np.arange(len(starts))
+    behind = (ahead[:-2] < 0) & (ahead[:-2] > -count) & (ahead[1:-1] == ahead[:-2]) & (ahead[2:] == ahead[:-2])
+    if not (ahead > 0).any() and not behind.any():
+        return None
+    slots = np.full(pulses_ns.size, -1, dtype=np.int64)
+    for burst in np.flatnonzero(np.diff(starts) == count):
+        slots[starts[burst] : starts[burst] + count] = burst * count + np.arange(count)
+    return PlacedFrames(slots, [], pulses_ns.size)
+
+
 class _UndecidedError(Exception):
     """The arrival times do not tell; the message says why."""
 

@@ -46,6 +46,9 @@ from shared.messages import (
 from shared.sockets import requester, subscriber
 
 ATTEMPTS = 3
+AT_WORK: tuple[State, ...] = ("homing", "running", "held", "done")  # which change by themselves
+_REST_LIMIT_S = 10.0
+_LOOK_S = 0.05
 _REPLAY_LIMIT = 1000
 R = TypeVar("R", bound=AnyReply)
 
@@ -162,6 +165,18 @@ class PiClient:
         """Stop the row now; aborting twice does no harm. Raises RefusedError, DeviceError."""
         self._ask(Abort(reason=reason), Accepted)
 
+    def come_to_rest(self, reason: str) -> None:
+        """Stop whatever moves, and wait until it stands: a run cannot end before. Raises RefusedError, DeviceError.
+
+        What moves for another host's run is left alone.
+        """
+        if self.status().scan_id != self._scan_id:
+            return
+        self.abort(reason)
+        deadline = time.monotonic() + _REST_LIMIT_S
+        while self.status().state in AT_WORK and time.monotonic() < deadline:
+            time.sleep(_LOOK_S)
+
     def _ask(self, command: AnyCommand, kind: type[R]) -> R:
         """A command that may be sent twice."""
         for _ in range(ATTEMPTS):
@@ -187,7 +202,9 @@ class PiClient:
         return DeviceError(
             f"the Pi at {self._address} did not answer {command} within {self._timeout_s:g} s ({ATTEMPTS} attempts)",
             "`polysight-pi run` is not running there, the address is wrong, or the CURVE keys do not match",
-            "on the Pi: `systemctl status polysight-pi` and `polysight-pi check`; here: check pi.command_address",
+            "on the Pi: `systemctl status polysight-pi`, `journalctl -u polysight-pi -n 20`; here: check"
+            " pi.command_address (a scan that was begun takes another one with `polysight resume SCAN --config"
+            " instrument.toml`)",
         )
 
     # --- events ---

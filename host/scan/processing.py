@@ -57,6 +57,11 @@ class ProcessingQueue:
         self._own = [f for f in self._own if not f.done()]
         return len(self._own) if len(self._own) > self._limit else 0
 
+    @property
+    def left(self) -> int:
+        """Rows that are not processed, of this run and of earlier ones."""
+        return sum(not f.done() for f in self._all)
+
     def wait(self, timeout_s: float) -> None:
         """Until the oldest row is processed, at most so long."""
         wait(self._own[:1], timeout_s)

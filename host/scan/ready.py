@@ -7,53 +7,96 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from host.scan.pi_client import PiClient
+from host.scan.pi_client import AT_WORK, PiClient
 from host.scan.stop import StopRequest
+from host.scan.take_faults import ON_REQUEST
 from shared.config import Instrument
 from shared.errors import ScanError
-from shared.faults import explain
+from shared.faults import PiFault, explain
+from shared.messages import StatusReply
+from shared.stage_line import HOMING_LIMIT_S
 
-_HOMING_LIMIT_S = 300.0
+_HOMING_LIMIT_S = HOMING_LIMIT_S + 30.0  # longer than the Pi, whose reason is the exact one
+STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # homed by hand, after a look: `polysight-pi home`
 
 
-def make_ready(pi: PiClient, stop: StopRequest, say: Callable[[str, str], None]) -> bool:
-    """Home the stage when the Pi says that it must be. False when it was asked to stop now meanwhile.
+def make_ready(
+    pi: PiClient, stop: StopRequest, say: Callable[[str, str], None], scan_id: str = "", first: bool = True
+) -> bool:
+    """Wait until a row may begin, and home the stage for it where that is safe; False when asked to stop now meanwhile.
+
+    The stage is homed before the first row only, when somebody has just asked for a scan and expects it to move, and
+    never out of a stage that was lost or is in alarm: somebody pressed the emergency stop, or has an arm in the way.
+
+    Parameters
+    ----------
+    pi, stop, say
+        The Pi, what may ask to stop, and who is told of homing.
+    scan_id
+        The run that has to be begun; "" for any.
+    first
+        Whether nothing has moved for this program yet.
 
     Raises
     ------
     ScanError
-        when the stage does not become ready.
+        when the stage is not ready, and may not be homed or does not become ready by it.
     """
     status = pi.status()
-    if status.state == "ready" and status.homed:
+    if status.state == "ready" and status.homed and status.scan_id == (scan_id or status.scan_id):
         return not stop.now
-    say("home", "homing the stage")
-    if status.state != "homing":
+    check_may_move(status, scan_id, first)
+    if status.state in AT_WORK:
+        say("wait", f"the stage is {status.state!r}; the row begins when it is ready")
+    else:
+        say("home", "homing the stage")
         pi.home()
     deadline = time.monotonic() + _HOMING_LIMIT_S
     while True:
         status = pi.status()
         if status.state == "ready":
             return not stop.now
-        if status.state == "fault":
-            e = explain(status.fault)
-            raise ScanError(f"the stage could not be homed: {e.what}; {status.reason}", e.why, e.remedy)
+        if status.state not in AT_WORK:
+            check_may_move(status, scan_id, first=False)
         if stop.now:
-            pi.abort("asked for at the host")
+            pi.abort(ON_REQUEST.text)
             return False
         if time.monotonic() > deadline:
             raise ScanError(
                 f"the stage is {status.state!r} {_HOMING_LIMIT_S:.0f} s after homing began",
                 "the stage stands still, or its switches are not reached",
-                "`polysight-pi check` on the Pi",
+                "look at the stage; `journalctl -u polysight-pi -n 20` on the Pi",
             )
         pi.event_socket.poll(100)
         pi.events()
 
 
+def check_may_move(status: StatusReply, scan_id: str, first: bool) -> None:
+    """Raise ScanError where a row could begin only after homing, and somebody has to have a look before that."""
+    if scan_id and status.scan_id not in ("", scan_id):
+        raise ScanError(
+            f"the Pi has begun another run meanwhile: {status.scan_id}", "another host uses it", "wait for its end"
+        )
+    if scan_id and not status.scan_id:
+        raise ScanError(
+            "the Pi's program was started anew between two rows",
+            "power was lost there, or the program ended",
+            "why it ended: `journalctl -u polysight-pi` on the Pi",
+        )
+    if status.state == "fault" and (not first or status.fault in STAGE_FAULTS):
+        e = explain(status.fault)
+        raise ScanError(f"the stage is not ready: {e.what}: {status.reason}", e.why, e.remedy)
+    if not first and (status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)):
+        raise ScanError(
+            f"the stage is {status.state!r} between two rows" + (f": {status.reason}" if status.reason else ""),
+            "its position was lost, homing was stopped, or somebody ended the run at the Pi",
+            "see that nothing is in the way, then `polysight-pi home`",
+        )
+
+
 def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
     """Refuse to go on without space for so many rows and the reserve. Raises ScanError."""
-    need = rows * len(instrument.recorded) * instrument.row_bytes
+    need = rows * instrument.recorded_row_bytes
     reserve = instrument.limits.free_disk_bytes
     free = shutil.disk_usage(folder).free
     if free < need + reserve:
@@ -61,5 +104,6 @@ def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
             f"{folder}: {free / 1e9:.2f} GB free, {need / 1e9:.2f} GB needed for {rows} rows and"
             f" {reserve / 1e9:.2f} GB kept free",
             "the disk is too full for this scan",
-            f"free space, or lower limits.free_disk_bytes; `polysight resume {folder}` goes on behind its last row",
+            f"free space, then `polysight resume {folder}`; or lower limits.free_disk_bytes in instrument.toml, and add"
+            " --config instrument.toml",
         )

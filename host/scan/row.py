@@ -13,10 +13,11 @@ from host.capture.end_of_record import record_ending
 from host.radar.interface import RadarControl
 from host.scan.capture_rig import CaptureRig
 from host.scan.pi_client import PiClient
-from host.scan.slipped_row import ToldCapture, find_frames
+from host.scan.slipped_row import ToldCapture, find_frames, find_slip
 from host.scan.states import RowState, RowTransaction
 from host.scan.stop import StopRequest
 from host.scan.take import Take
+from host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
 from host.store.scanfolder import PART
 from shared.config import Instrument
 from shared.errors import ScanError
@@ -28,7 +29,6 @@ from shared.units import NS_PER_S
 _TURN_MS = 50  # how often stop requests and limits are looked at
 _ABORT_LIMIT_S = 10.0
 _DISK_NOTICE_S = 2.0
-ON_REQUEST = "asked for at the host"
 
 
 class RowTaker:
@@ -70,7 +70,7 @@ class RowTaker:
         if self._stop.now:
             take.aborted = ON_REQUEST
         elif take.stopped_radars:
-            take.aborted = "the row was not begun"
+            take.aborted = TakeFault(FaultKind.RADAR_STOPPED, "the row was not begun")
         else:
             transaction.to(RowState.RUNNING)
             self._radars.row_begins()
@@ -96,18 +96,18 @@ class RowTaker:
         held = False
         while take.finished is None:
             self._turn(take)
-            reason = ON_REQUEST if self._stop.now else "" if take.aborted else self._in_vain(take, silence)
-            if take.finished is None and reason and not take.aborted:
-                take.aborted = reason
+            fault = ON_REQUEST if self._stop.now else None if take.aborted else self._in_vain(take, silence)
+            if take.finished is None and fault and not take.aborted:
+                take.aborted = fault
                 deadline = time.monotonic() + _ABORT_LIMIT_S
                 transaction.to(RowState.ABORTING)
-                self._pi.abort(reason)
+                self._pi.abort(fault.text)
             if take.finished is None and self._pi.state in ("fault", "idle"):
                 self._check_stopped(take)
             if self._pi.state == "held" and not take.aborted:
                 deadline = time.monotonic() + limit_s  # however long somebody looks at it
                 if not held:
-                    self._say("held", f"row {take.row.index} is held; it goes on when the Pi is told to resume")
+                    self._say("held", f"row {take.row.index} is held; who sent `Hold` sends `Resume`")
                 held = True
             if time.monotonic() > deadline:
                 if take.aborted:
@@ -115,17 +115,18 @@ class RowTaker:
                 raise ScanError(
                     f"row {take.row.index} did not end within {limit_s:.0f} s",
                     "the stage stands still, or the Pi's program hangs",
-                    f"`polysight-pi check` on the Pi, then `polysight resume {self._folder}`",
+                    f"`journalctl -u polysight-pi -n 20` on the Pi, then `polysight resume {self._folder}`",
                 )
 
-    def _in_vain(self, take: Take, silence: _Silence) -> str:
-        """Why the row cannot become whole any more and is not worth its time; "" while it can."""
+    def _in_vain(self, take: Take, silence: _Silence) -> TakeFault | None:
+        """Why the row cannot become whole any more and is not worth its time; None while it can."""
         take.radars = self._radars.states()
-        if take.stopped_radars:
-            return "; ".join(f"{name}: the radar has stopped: {s.detail}" for name, s in take.stopped_radars.items())
+        if stopped := take.stopped_radars:
+            told = (f"{name}: the radar has stopped: {s.detail}" for name, s in stopped.items())
+            return TakeFault(FaultKind.RADAR_STOPPED, "; ".join(told))
         if boards := silence.boards(take.told):
-            return f"no data from {', '.join(boards)}"
-        return ""
+            return TakeFault(FaultKind.NO_DATA, f"no data from {', '.join(boards)}")
+        return None
 
     def _check_stopped(self, take: Take) -> None:
         """A Pi that cannot write its journal, or was started anew, cannot tell how the row ended, only where it is."""
@@ -184,11 +185,13 @@ class RowTaker:
             take.captures = ending.result()
 
     def _find_missed_pulses(self, take: Take) -> None:
-        """For boards that are short of frames though every pulse was sent: which pulses they missed."""
+        """Every pulse was sent. Which ones boards missed that are short of frames, and whether the others slipped."""
         for name, capture in take.captures.items():
+            path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
             if capture.slipped:
-                path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
                 take.placed[name] = find_frames(path, take.row, take.told, self._instrument)
+            elif not capture.missing and (slipped := find_slip(path, take.row, take.told, self._instrument)):
+                take.placed[name] = slipped
 
 
 class _Silence:

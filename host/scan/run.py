@@ -16,20 +16,22 @@ from host.radar.backends import radar_control
 from host.radar.interface import RadarControl
 from host.scan.capture_rig import CaptureRig
 from host.scan.pi_client import PiClient
+from host.scan.pi_stage import check_same_stage, pi_fact
 from host.scan.processing import OnRow
 from host.scan.result import OnProgress, ScanProgress, ScanResult
 from host.scan.running import RunningScan
 from host.scan.stop import StopRequest, interrupts_wait
+from host.store.connection import check_same_scan, connection_of
 from host.store.manifest import ManifestWriter
 from host.store.scanfolder import ScanFolder, new_scan_id, utc_now
 from host.store.validate import damaged_rows
+from shared.backends import is_simulated
 from shared.config import Instrument
 from shared.errors import ScanError
 from shared.messages import HelloReply
 from shared.raster import check_burst_fits, plan_raster
 
 __all__ = ["OnRow", "ScanProgress", "ScanResult", "resume_scan", "run_scan"]
-HARDWARE_BACKEND = "gpiod"  # the Pi's backend that drives real lines; any other is simulated
 
 
 def run_scan(
@@ -70,7 +72,8 @@ def run_scan(
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
     with ExitStack() as stack:
         pi, rig, hello = _connect(stack, instrument, progress)
-        simulated = hello.backend != HARDWARE_BACKEND
+        untold = check_same_stage(instrument.stage, hello, "this scan")
+        simulated = is_simulated(hello.backend)
         scan = ScanFolder.create(
             folder,
             instrument,
@@ -78,14 +81,16 @@ def run_scan(
             simulated=simulated,
             scan_id=new_scan_id(),
             extra={
-                "pi": {"release": hello.pi_release, "firmware": hello.firmware, "backend": hello.backend},
+                "pi": pi_fact(hello),
                 "calibration": keep_in_scan(instrument, folder, simulated),
             },
         )
         writer = stack.enter_context(scan.writer())
         radars = stack.enter_context(radars or radar_control(instrument))
         stop = stop or StopRequest()
-        return RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop).run()
+        running = RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop)
+        running.result.warnings += untold
+        return running.run()
 
 
 def resume_scan(
@@ -96,32 +101,40 @@ def resume_scan(
     keep_incomplete: bool = False,
     stop: StopRequest | None = None,
     radars: RadarControl | None = None,
+    rig_now: Instrument | None = None,
 ) -> ScanResult:
     """Go on with a scan at its first row that is not committed; committed rows are compared with their digests.
 
-    A row that is not what was committed is taken again.
+    A row that is not what was committed is taken again. `rig_now` says how the Pi and the boards are reached from now
+    on, and the limits; in all else it has to be the rig that the scan was begun with (:mod:`host.store.connection`).
 
     Parameters and errors as :func:`run_scan`. `on_row` is called for the rows committed earlier too.
     """
     scan = ScanFolder.load(folder)
+    if rig_now is not None:
+        check_same_scan(scan.instrument, rig_now, "the rig file given")
     with ExitStack() as stack:
         writer = stack.enter_context(scan.writer())
         scan.reload()
         withdrawn = _withdraw_damaged(scan, writer, progress)
-        pi, rig, hello = _connect(stack, scan.instrument, progress)
-        if (hello.backend != HARDWARE_BACKEND) != scan.simulated:
+        pi, rig, hello = _connect(stack, rig_now or scan.instrument, progress)
+        if is_simulated(hello.backend) != scan.simulated:
             kind = "simulated" if scan.simulated else "of the real rig"
             raise ScanError(
                 f"{folder} is a scan that is {kind}, and the Pi's backend is {hello.backend!r}",
                 "simulated and measured rows must never be mixed in one scan",
                 "start the Pi with the backend the scan was begun with, or make a new scan",
             )
+        untold = check_same_stage(scan.instrument.stage, hello, f"{folder}")
         missing = scan.plan.rows - len(scan.committed())
-        writer.append({"fact": "scan_resumed", "resumed_utc": utc_now(), "rows_missing": missing})
+        fact = {"fact": "scan_resumed", "resumed_utc": utc_now(), "rows_missing": missing, "pi": pi_fact(hello)}
+        told = {} if rig_now is None else {"rig": connection_of(rig_now)}
+        writer.append({**fact, **told})
+        scan.reload()
         radars = stack.enter_context(radars or radar_control(scan.instrument))
         stop = stop or StopRequest()
         running = RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop)
-        running.result.warnings += withdrawn
+        running.result.warnings += withdrawn + untold
         return running.run()
 
 

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 from host.radar.interface import RadarControl
 from host.scan.capture_rig import CaptureRig
 from host.scan.commit import commit_row, gave_up, reject_row
 from host.scan.pi_client import PiClient
 from host.scan.processing import OnRow, ProcessingQueue
-from host.scan.ready import check_disk, make_ready
+from host.scan.ready import check_disk, check_may_move, make_ready
 from host.scan.result import OnProgress, ScanProgress, ScanResult
-from host.scan.row import ON_REQUEST, RowTaker
+from host.scan.row import RowTaker
 from host.scan.states import RowState, RowTransaction
 from host.scan.stop import StopRequest, interrupts_request
 from host.scan.take import Take
+from host.scan.take_faults import ON_REQUEST, reasons
+from host.scan.time_left import time_left, usual_row_s
 from host.store.events import EventWriter, read_events
 from host.store.manifest import Fact, ManifestWriter
 from host.store.scanfolder import EVENTS, ScanFolder, utc_now
-from shared.errors import PolysightError
+from shared.errors import PolysightError, advice
 from shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
 from shared.raster import Row
 
@@ -48,9 +51,11 @@ class RunningScan:
         self._queue = ProcessingQueue(on_row, scan.instrument.limits.rows_waiting)
         self._committed = set(scan.committed())
         self._row_seconds: list[float] = []
+        self._row_began: float | None = None  # monotonic, moved on by what is no time of a row; None between rows
         self._current = (-1, 0, 0)
         self._state = ""
         self._told_stop = False
+        self._was_ready = False  # the stage was, in this run
         self._remedy: Fact = {}  # of the error that ended the scan
         self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
 
@@ -74,19 +79,32 @@ class RunningScan:
                 self._end(begun)
                 events.sync()
         except BaseException as e:
-            aborted = isinstance(e, KeyboardInterrupt)
-            self.result.exit_status = "abort" if aborted else "fail"
-            self.result.reason = e.what if isinstance(e, PolysightError) else f"{type(e).__name__}: {e}"
-            if isinstance(e, PolysightError):
-                self._remedy = {"why": e.why, "remedy": e.remedy}
-            with suppress(PolysightError):  # what failed first is what is told
-                self._end(begun)
+            self._fail(e, begun)
             raise
         finally:
             events.close()
             self.result.processing_error = self._queue.close(now=self._stop.now)
         self._scan.reload()
         return self.result
+
+    def _fail(self, e: BaseException, begun: bool) -> None:
+        """An error ends the scan: bring the rig to rest, write down why, and add to the error what is safe."""
+        self.result.exit_status = "abort" if isinstance(e, KeyboardInterrupt) else "fail"
+        safe = f"{len(self._committed)} of {self._plan.rows} rows are safe"
+        resume = f"`polysight resume {self._scan.path}` goes on from there"
+        if isinstance(e, PolysightError):
+            e.remedy = advice(e.remedy, safe, "" if f"polysight resume {self._scan.path}" in e.remedy else resume)
+            self._remedy = {"why": e.why, "remedy": e.remedy}
+            self.result.reason = e.what
+        else:
+            e.add_note(advice(safe, resume))
+            self.result.reason = f"{type(e).__name__}: {e}"
+        with interrupts_request(self._stop):
+            if begun:
+                with suppress(PolysightError):  # what failed first is what is told
+                    self._pi.come_to_rest(self.result.reason[:500])
+            with suppress(PolysightError):
+                self._end(begun)
 
     def _begin_run(self, last_seq: int) -> BeginRun:
         i = self._instrument
@@ -132,11 +150,12 @@ class RunningScan:
         for row in todo:
             if self._stop.after_row:
                 break
-            began = time.monotonic()
+            self._row_began = time.monotonic()
             self._row(row, takes.get(row.index, 0) + 1, taker, events)
             if row.index not in self._committed:
                 break
-            self._row_seconds.append(time.monotonic() - began)
+            self._row_seconds.append(time.monotonic() - self._row_began)
+            self._row_began = None
             self._say("committed", f"row {row.index} committed")
         left = self._plan.rows - len(self._committed)
         if left == 0:
@@ -164,16 +183,22 @@ class RunningScan:
             faults = take.faults(self._instrument.burst.pulses)
             if number == last_take:
                 raise gave_up(take, faults, self._scan, number - first_take + 1)
+            check_may_move(self._pi.status(), self._scan.scan_id, first=False)
+            if take.silent_boards:
+                self._rig.configure(take.silent_boards)  # a card that was without power has forgotten how
             self.result.retakes += 1
-            self._say("retake", f"row {row.index} is taken again: {'; '.join(faults)}")
+            self._say("retake", f"row {row.index} is taken again: {reasons(faults)}")
 
     def _take(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
         """Wait until the row may begin, and take it; None when asked to stop before it began."""
         check_disk(self._scan.path, self._instrument, 1)
         if not self._wait_while_paused() or not self._wait_for_processing():
             return None
-        if not make_ready(self._pi, self._stop, self._say):
+        with self._clock_stopped():
+            ready = make_ready(self._pi, self._stop, self._say, self._scan.scan_id, first=not self._was_ready)
+        if not ready:
             return None
+        self._was_ready = True
         self._current = (row.index, number, row.points)
         self._say("row", f"row {row.index}" + (f", take {number}" if number > 1 else ""))
         try:
@@ -186,17 +211,28 @@ class RunningScan:
         if told := self._radars.report():
             self._writer.append({"fact": "radars", **of, **told})
 
+    @contextmanager
+    def _clock_stopped(self) -> Iterator[None]:
+        """What happens within is no time of a row: the next one does not take it. Waiting for processing is."""
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            if self._row_began is not None:
+                self._row_began += time.monotonic() - began
+
     def _wait_while_paused(self) -> bool:
         """Until nobody wants a pause any more; the manifest says from when to when. False when asked to stop."""
         if not self._stop.paused:
             return not self._stop.now
         self._writer.append({"fact": "scan_paused", "paused_utc": utc_now()})
         self._say("wait", "paused on request; the next row begins when the scan is told to go on")
-        while self._stop.paused:
-            if self._stop.after_row:
-                return False
-            time.sleep(_LOOK_S)
-            self._pi.events()
+        with self._clock_stopped():
+            while self._stop.paused:
+                if self._stop.after_row:
+                    return False
+                time.sleep(_LOOK_S)
+                self._pi.events()
         self._writer.append({"fact": "scan_continued", "continued_utc": utc_now()})
         self._say("wait", "going on")
         return not self._stop.after_row
@@ -228,7 +264,7 @@ class RunningScan:
         self._queue.add(row)
         if faults:
             self.result.incomplete_rows.append(row)
-            self._say("warning", f"row {row} is kept incomplete: {'; '.join(faults)}")
+            self._say("warning", f"row {row} is kept incomplete: {reasons(faults)}")
         return True
 
     def _end(self, begun: bool) -> None:
@@ -245,7 +281,8 @@ class RunningScan:
                 "ended_utc": utc_now(),
             }
         )
-        self._say("end", reason)
+        waiting = f"; {self._queue.left} rows wait to be processed" if self._queue.left else ""
+        self._say("end", reason + waiting)
         if begun:
             self._pi.end_run(self._scan.scan_id, status, reason)
             self._pi.drain()
@@ -262,11 +299,16 @@ class RunningScan:
         rows, committed = self._plan.rows, len(self._committed)
         remaining = None
         if self._row_seconds:
-            remaining = (rows - committed) * sum(self._row_seconds) / len(self._row_seconds)
+            elapsed_s = time.monotonic() - self._row_began if self._row_began is not None else 0.0
+            remaining = time_left(rows - committed, usual_row_s(self._row_seconds), elapsed_s)
         row, take, row_points = self._current
-        self._progress(
-            ScanProgress(phase, message, rows, committed, row, take, points, row_points, remaining, self._state)
-        )
+        told = ScanProgress(phase, message, rows, committed, row, take, points, row_points, remaining, self._state)
+        try:
+            self._progress(told)
+        # A terminal that is gone, or a log on a full disk, is no reason to end a row.
+        except Exception as e:  # noqa: BLE001
+            self._progress = None
+            self.result.warnings.append(f"progress is told no more: {type(e).__name__}: {e}")
 
     def _entered(self, state: RowState) -> None:
         self._state = str(state)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from host.capture.receiver_words import RowCapture
 from host.capture.segment import read_index, write_index
-from host.scan.missed_pulses import PlacedFrames, place_frames
+from host.scan.missed_pulses import PlacedFrames, place_frames, slipped_frames
 from shared.config import Instrument
 from shared.errors import DeviceError
 from shared.messages import Capture
@@ -32,7 +32,7 @@ class ToldCapture(NamedTuple):
 
 
 def find_frames(path: Path, row: Row, told: list[ToldCapture], rig: Instrument) -> PlacedFrames:
-    """Where the frames of a slipped row belong.
+    """Where the frames of a row that lacks some belong.
 
     Parameters
     ----------
@@ -50,21 +50,45 @@ def find_frames(path: Path, row: Row, told: list[ToldCapture], rig: Instrument) 
     DataError
         when the index is not readable.
     """
+    times = _times(path, row, told, rig)
+    if times is None:
+        nothing = np.full(0, -1, dtype=np.int64)
+        return PlacedFrames(
+            nothing, [], row.points * rig.burst.pulses, "the capture events of the row are not complete"
+        )
+    return place_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES)
+
+
+def find_slip(path: Path, row: Row, told: list[ToldCapture], rig: Instrument) -> PlacedFrames | None:
+    """Where the frames of a row that seems whole belong, when they are not at their pulses; else None.
+
+    Parameters and errors as :func:`find_frames`.
+    """
+    times = _times(path, row, told, rig)
+    return slipped_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES) if times else None
+
+
+def _times(
+    path: Path, row: Row, told: list[ToldCapture], rig: Instrument
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None:
+    """When each pulse was sent, when each event was told, and the row's arrivals; None without all of the events."""
     pulses = rig.burst.pulses
-    _, arrivals = read_index(path.with_suffix(".idx"))
     events = [t for t in sorted(told, key=lambda t: t.event.point) if t.event.pulses == pulses]
     if [t.event.point for t in events] != list(range(row.points)):
-        nothing = np.full(0, -1, dtype=np.int64)
-        return PlacedFrames(nothing, [], row.points * pulses, "the capture events of the row are not complete")
+        return None
+    _, arrivals = read_index(path.with_suffix(".idx"))
     first, last = [t.event.first_pulse_ns for t in events], [t.event.last_pulse_ns for t in events]
     sent = np.linspace(first, last, pulses, axis=1, dtype=np.int64)
-    told_ns = np.array([t.told_ns for t in events], dtype=np.int64)
-    return place_frames(sent, told_ns, arrivals, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES)
+    return sent, np.array([t.told_ns for t in events], dtype=np.int64), arrivals
 
 
 def describe(placed: PlacedFrames, pulses: int) -> str:
     """What was missed, for people; `pulses` in a burst."""
     count = placed.pulses - placed.slots.size
+    if count == 0:
+        return (
+            f"frames are not at their pulses: it saw edges on SYNC_IN that were not sent; {placed.uncertain} are lost"
+        )
     places = [f"position {s // pulses} pulse {s % pulses}" for s in placed.missed[:_SHOWN]]
     more = ["..."] if len(placed.missed) > _SHOWN else []
     found = f"missed {count} SYNC_IN pulses ({', '.join(places + more) or 'where is not certain'})"

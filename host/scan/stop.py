@@ -56,6 +56,19 @@ def interrupts_request(stop: StopRequest) -> Iterator[None]:
 
 
 @contextmanager
+def hangups_pass() -> Iterator[None]:
+    """Within the block, the end of the terminal (SIGHUP: a lost ssh connection) ends nothing; in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@contextmanager
 def interrupts_wait() -> Iterator[None]:
     """Within the block, Ctrl-C and SIGTERM are held back from this thread; they come at its end."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})

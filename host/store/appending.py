@@ -45,11 +45,21 @@ class AppendFile:
             raise self._failed("made" if fresh else "opened", e) from None
 
     def lock(self) -> bool:
-        """Keep other programs from locking this file, until it is closed; whether that worked."""
+        """Keep other programs from locking this file, until it is closed; False when one has.
+
+        Raises DeviceError when the file system cannot lock; the file is closed then.
+        """
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             return False
+        except OSError as e:
+            self._file.close()
+            raise DeviceError(
+                f"{self.path}: cannot be locked: {e.strerror}",
+                "a network disk whose server offers no locks, or the disk fails",
+                "put the scan on a local disk, or have its server offer locks",
+            ) from None
         return True
 
     def cut(self, length: int) -> None:

@@ -190,17 +190,18 @@ def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
 def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
     """Sequence number of the row's first packet, which may itself be lost.
 
-    1 (or 0) when the numbers fit a record that starts there (the card's counters usually start at 1). Else, where lost
-    packets are in the file, as many before the first that arrived as the file begins with packets of zeros; where they
-    are not, counted back from a short last packet if no position is missing; else the first that arrived.
+    Where lost packets are in the file, as many before the first that arrived as the file begins with packets of zeros;
+    where they are not, counted back from a short last packet if no position is missing; else the first that arrived.
+    But 1 where that is neither 1 nor 0, and the numbers fit a record that starts there: the card's counters do, a log
+    may count from 0.
     """
-    expected, first = -(-shape.bytes // full), int(log.sequence[0])
-    if log.sequence[-1] <= expected:
-        return min(1, first)  # a log may count from 0
+    expected, first, last = -(-shape.bytes // full), int(log.sequence[0]), int(log.sequence[-1])
+    begin = first
     if zero_filled is not None:
-        return first - int(np.argmin(np.append(_silent(zero_filled, full), False)))
-    complete = _pauses(log.at_s, shape.positions - 1).size == shape.positions - 1
-    return min(first, int(log.sequence[-1]) - expected + 1) if complete and log.size[-1] < full else first
+        begin -= int(np.argmin(np.append(_silent(zero_filled, full), False)))
+    elif log.size[-1] < full and _pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
+        begin = min(first, last - expected + 1)
+    return begin if last > expected or begin in (0, 1) else 1
 
 
 def _pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:

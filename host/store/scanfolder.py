@@ -17,13 +17,15 @@ import shared
 from host.capture.segment import read_index
 from host.store import manifest
 from host.store.appending import sync_folder
+from host.store.connection import reconnected
 from host.store.crc import crc32
 from host.store.manifest import Fact, Manifest, ManifestWriter
 from host.store.source import RowData
-from shared.config import Instrument, to_builtins
-from shared.config import decode as decode_config
+from shared.config import Instrument
 from shared.errors import DataError, DeviceError
 from shared.raster import RasterPlan
+from shared.tables import decode as decode_config
+from shared.tables import to_builtins
 
 FORMAT = 1
 MANIFEST = "manifest.jsonl"
@@ -87,12 +89,18 @@ class ScanFolder:
             )
         source = f"{path / MANIFEST} (scan_started)"
         try:
-            self.instrument: Instrument = decode_config(started["instrument"], Instrument, f"{source} instrument")
+            self._begun: Instrument = decode_config(started["instrument"], Instrument, f"{source} instrument")
             self.plan: RasterPlan = decode_config(started["plan"], RasterPlan, f"{source} plan")
             self.scan_id = str(started["scan_id"])
             self.simulated = bool(started["simulated"])
         except KeyError as e:
             raise DataError(f"{source}: no {e}", "written by another program or release") from None
+        self.instrument = self._latest()
+
+    def _latest(self) -> Instrument:
+        """The rig as it was begun with, reached as the last run that said so reached it. Raises ConfigError."""
+        told = [f["rig"] for f in self.facts("scan_resumed") if f.get("rig")]
+        return reconnected(self._begun, told[-1]) if told else self._begun
 
     @staticmethod
     def create(
@@ -137,6 +145,7 @@ class ScanFolder:
     def reload(self) -> None:
         """Read the manifest again."""
         self.content = manifest.read(self.path / MANIFEST)
+        self.instrument = self._latest()
 
     def writer(self) -> ManifestWriter:
         """Open the scan for appending; a torn last line is cut off. Raises DeviceError when the scan is in use."""
@@ -175,6 +184,14 @@ class ScanFolder:
             )
             rows[row.row] = row
         return dict(sorted(rows.items()))
+
+    def retaken(self) -> dict[str, Any]:
+        """For quality.json: `rows_retaken`, takes of all runs that did not count; `rows_incomplete`, rows kept so."""
+        last = {f["row"]: f for f in self.facts("row_committed") if f["row"] in self._committed()}
+        return {
+            "rows_retaken": len(self.facts("row_rejected")),
+            "rows_incomplete": sorted(row for row, fact in last.items() if fact.get("kept_incomplete")),
+        }
 
     def rows(self) -> Iterator[int]:
         """Indices of the committed rows, ascending."""

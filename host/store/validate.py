@@ -14,7 +14,7 @@ from host.store import manifest
 from host.store.events import read_events
 from host.store.raw import dropped_files
 from host.store.scanfolder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
-from shared.errors import PolysightError
+from shared.errors import DeviceError, PolysightError
 from shared.raster import plan_raster
 
 _CHUNK = 1 << 22
@@ -30,6 +30,7 @@ class Finding:
     where: str
     what: str
     remedy: str = ""
+    unreadable: bool = False  # the disk did not say what is there: it may be whole
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.where}: {self.what}" + (f" ({self.remedy})" if self.remedy else "")
@@ -67,9 +68,18 @@ def validate(path: Path) -> list[Finding]:
 
 
 def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
-    """Committed rows that are not, on the disk, what was committed: row to what is wrong with it. Reads every byte."""
-    found = {row.row: [str(f) for f in _row(scan, row)] for row in scan.committed().values()}
-    return {row: faults for row, faults in found.items() if faults}
+    """Committed rows that are not, on the disk, what was committed: row to what is wrong with it. Reads every byte.
+
+    Raises DeviceError when the disk does not give a file back: it may be whole, and must not be taken again.
+    """
+    found = {row.row: _row(scan, row) for row in scan.committed().values()}
+    if unreadable := [f for faults in found.values() for f in faults if f.unreadable]:
+        raise DeviceError(
+            f"{scan.path / unreadable[0].where}: {unreadable[0].what}",
+            f"the disk fails, or its server is away ({len(unreadable)} files); nothing was changed",
+            f"see that the disk is well, then `polysight resume {scan.path}` once more",
+        )
+    return {row: [str(f) for f in faults] for row, faults in found.items() if faults}
 
 
 def _damaged_lines(content: manifest.Manifest, matters: bool) -> list[Finding]:
@@ -113,7 +123,7 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
         # Of a payload dropped by choice the committed digest is what is left.
         size, crc = _digest(path) if kept else (board.bytes, int(board.crc32, 16))
     except OSError as e:
-        return [*found, Finding("error", where, f"cannot be read: {e.strerror}", _COPY)]
+        return [*found, _not_read(where, e)]
     if size != board.bytes:
         found.append(Finding("error", where, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
@@ -123,7 +133,11 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     if not index.exists():
         needed = board.missing_bytes > 0 or board.index_crc32 != ""
         return [*found, Finding("error", where, "absent", _COPY)] if needed else found
-    if board.index_crc32 and f"{zlib.crc32(index.read_bytes()):08x}" != board.index_crc32:
+    try:
+        index_crc = zlib.crc32(index.read_bytes())
+    except OSError as e:
+        return [*found, _not_read(where, e)]
+    if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
         return [*found, Finding("error", where, "not the bytes that were committed (CRC)", _COPY)]
     try:
         facts, _ = read_index(index)
@@ -135,6 +149,11 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     if not ordered or not inside or sum(b - a for a, b in gaps) != board.missing_bytes:
         found.append(Finding("error", where, f"its gaps do not make the {board.missing_bytes} missing bytes"))
     return found
+
+
+def _not_read(where: str, e: OSError) -> Finding:
+    absent = isinstance(e, FileNotFoundError)
+    return Finding("error", where, f"cannot be read: {e.strerror}", _COPY, unreadable=not absent)
 
 
 def _digest(path: Path) -> tuple[int, int]:

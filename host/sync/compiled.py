@@ -1,10 +1,14 @@
 """The passes of `host.sync.plain`, compiled: a chirp is taken from the card's words into the cache and used there.
 
-Each pass reads the words anew, which costs less than any copy of them in memory would. For four RX. Compiled at the
+Each pass reads the words anew, which costs less than any copy of them in memory would, and all of a chirp even where
+only its linear samples are needed: memory is fetched ahead only where it is read in line. For four RX. Compiled at the
 first call and cached on disk.
 """
 
 from __future__ import annotations
+
+import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,90 +20,119 @@ from host.sync.tone import block_edges, block_times, search_size
 CHUNK = 512
 """Positions at a time: as many as NumPy needs for its calls to cost little; reading words from memory costs less."""
 
+_roots = lru_cache(kernels.roots)
+
 
 def match(words, reference, linear):
     """See `plain.match`."""
-    size = search_size(linear[1] - linear[0])
-    roots = np.exp(-2j * np.pi * np.arange(size) / size).astype(np.complex64)
-    return _match(words, reference, linear, roots)
-
-
-@compiled
-def _match(words, reference, linear, roots):
-    positions, chirps, samples, _, _ = words.shape
-    a, b = linear[0] * RX, linear[1] * RX
-    n, size, records = linear[1] - linear[0], roots.size, chirps + RX
-    frequency, amplitude = np.empty((positions, chirps)), np.empty((positions, chirps), np.complex128)
-    energy, peak = np.empty((positions, chirps), np.float32), np.empty((positions, chirps), np.int32)
-    centre = np.empty(positions)
-    x, y = np.empty(samples * RX, np.float32), np.empty(samples * RX, np.float32)
-    u, v = np.empty(b - a, np.float32), np.empty(b - a, np.float32)
-    re, im = np.empty(b - a, np.float32), np.empty(b - a, np.float32)
-    first, second = np.empty(size * records, np.complex64), np.empty(size * records, np.complex64)
-    best, top = np.empty(chirps, np.float32), np.empty(chirps, np.int32)
-    band, smooth = np.empty(size), np.empty(size)
-    for p in range(positions):
-        kernels.split(words[p, reference[p]].reshape(-1), x, y)
-        u[:] = x[a:b]
-        v[:] = y[a:b]
-        first[n * records :] = 0
-        for i in range(n):  # the reference chirp itself comes behind the products
-            for r in range(RX):
-                first[i * records + chirps + r] = complex(u[i * RX + r], v[i * RX + r])
-        for k in range(chirps):
-            chirp = words[p, k].reshape(-1)
-            kernels.split(chirp, x, y)
-            peak[p, k] = kernels.largest(chirp)
-            energy[p, k] = kernels.correlate(x[a:b], y[a:b], u, v, re, im)
-            for i in range(n):
-                j = i * RX
-                real, imag = re[j] + re[j + 1] + re[j + 2] + re[j + 3], im[j] + im[j + 1] + im[j + 2] + im[j + 3]
-                first[i * records + k] = complex(real, imag)
-        spectrum = kernels.transform(first, second, records, roots)
-        best[:] = -1
-        for f in range(size):
-            for k in range(chirps):
-                z = spectrum[f * records + k]
-                power = z.real * z.real + z.imag * z.imag
-                if power > best[k]:
-                    best[k], top[k] = power, f
-            total = np.float32(0)
-            for r in range(RX):
-                z = spectrum[f * records + chirps + r]
-                total += z.real * z.real + z.imag * z.imag
-            band[f] = total
-        for k in range(chirps):
-            frequency[p, k], amplitude[p, k] = _interpolated(spectrum[k::records], top[k], n)
-        centre[p] = _highest(band, smooth, BAND_BINS * size // n // 2) / size
+    n = linear[1] - linear[0]
+    c, s, order = _roots(search_size(n))
+    frequency, amplitude, energy, peak = _offsets(words, reference, linear, c, s, order)
+    centre = _centres(words, reference, linear, c, s, order, BAND_BINS * order.size // n // 2)
     return frequency, amplitude, centre, energy, peak
 
 
 @compiled
-def _interpolated(spectrum, top, samples):
-    """`tone.strongest`, given the strongest bin."""
-    size = spectrum.size
-    at = spectrum[top]
-    below, peak, above = abs(spectrum[(top - 1) % size]), abs(at), abs(spectrum[(top + 1) % size])
+def _offsets(words, reference, linear, c, s, order):
+    """What :func:`match` returns, but for the centre."""
+    positions, chirps, _, _, _ = words.shape
+    a, b = linear
+    n, size = b - a, order.size
+    frequency, amplitude = np.empty((positions, chirps)), np.empty((positions, chirps), np.complex128)
+    energy, peak = np.empty((positions, chirps), np.float32), np.empty((positions, chirps), np.int32)
+    flat, spare = np.empty(n * 2 * RX, np.int16), np.empty(n * 2 * RX, np.int16)
+    x, u = flat.reshape(2 * RX, n), np.empty((2 * RX, n), np.float32)
+    product_re, product_im = np.empty(LANES * n, np.float32), np.empty(LANES * n, np.float32)
+    re, im = np.empty(LANES * size, np.float32), np.empty(LANES * size, np.float32)
+    power, between = np.empty(LANES * size, np.float32), np.empty(LANES * n, np.float32)
+    bins, best = order.repeat(LANES), np.empty(LANES * size, np.int32)
+    place = np.argsort(order)
+    for p in range(positions):
+        kernels.by_channel(words[p, reference[p], a:b].reshape(-1), flat, spare)
+        for i in range(2 * RX):
+            for j in range(n):
+                u[i, j] = x[i, j]
+        for first in range(0, chirps, LANES):
+            count = min(LANES, chirps - first)
+            product_re[count * n :] = 0
+            product_im[count * n :] = 0
+            for k in range(count):
+                peak[p, first + k] = kernels.largest(words[p, first + k].reshape(-1))
+                kernels.by_channel(words[p, first + k, a:b].reshape(-1), flat, spare)
+                own = slice(k * n, (k + 1) * n)
+                energy[p, first + k] = kernels.correlate(x, u, product_re[own], product_im[own])
+            kernels.interleave(product_re, between, re)
+            kernels.interleave(product_im, between, im)
+            kernels.transform(re, im, c, s)
+            for j in range(power.size):
+                power[j] = re[j] * re[j] + im[j] * im[j]
+                best[j] = bins[j]
+            kernels.strongest(power, best)
+            for k in range(count):
+                tone = _interpolated(re[k::LANES], im[k::LANES], place, best[k], n)
+                frequency[p, first + k], amplitude[p, first + k] = tone
+    return frequency, amplitude, energy, peak
+
+
+@compiled
+def _interpolated(re, im, place, top, samples):
+    """`tone.strongest`, given the strongest bin; bins of the spectrum are at `place`."""
+    size, at = re.size, place[top]
+    i, j = place[(top - 1) % size], place[(top + 1) % size]
+    below, peak, above = math.hypot(re[i], im[i]), math.hypot(re[at], im[at]), math.hypot(re[j], im[j])
     bend = below - 2 * peak + above
     part = 0.5 * (below - above) / bend if bend < 0 else 0.0
     whole = (top if top < size // 2 else top - size) / size
     c, s = kernels.cis(whole * (samples - 1) / 2)
-    return whole + part / size, at * complex(c, s)
+    return whole + part / size, complex(re[at], im[at]) * complex(c, s)
+
+
+@compiled
+def _centres(words, reference, linear, c, s, order, width):
+    """The centre that :func:`match` returns, of as many positions at once as fill the transform with their RX."""
+    positions, at_once = words.shape[0], LANES // RX
+    a, b = linear
+    n, size = b - a, order.size
+    centre = np.empty(positions)
+    flat, spare = np.empty(n * 2 * RX, np.int16), np.empty(n * 2 * RX, np.int16)
+    signal_re, signal_im = np.zeros(LANES * n, np.float32), np.zeros(LANES * n, np.float32)
+    re, im = np.empty(LANES * size, np.float32), np.empty(LANES * size, np.float32)
+    between, power, smooth = np.empty(LANES * n, np.float32), np.empty(size + width), np.empty(size + width)
+    for first in range(0, positions, at_once):
+        count = min(at_once, positions - first)
+        for p in range(count):
+            kernels.by_channel(words[first + p, reference[first + p], a:b].reshape(-1), flat, spare)
+            start = p * RX * n
+            for j in range(RX * n):
+                signal_re[start + j], signal_im[start + j] = flat[j], flat[RX * n + j]
+        kernels.interleave(signal_re, between, re)
+        kernels.interleave(signal_im, between, im)
+        kernels.transform(re, im, c, s)
+        for p in range(count):
+            for i in range(size):
+                total = np.float32(0)
+                for r in range(RX):
+                    j = i * LANES + p * RX + r
+                    total += re[j] * re[j] + im[j] * im[j]
+                power[order[i]] = total
+            centre[first + p] = _highest(power, smooth, width) / size
+    return centre
 
 
 @compiled
 def _highest(power, smooth, width):
-    """Where the power is highest after three boxes of a width; overwrites both."""
-    size = power.size
+    """Where the power, which has `width` values of room behind it, is highest after three boxes; overwrites both."""
+    size = power.size - width
     for _ in range(3):
+        power[size:] = power[:width]
         total = 0.0
         for i in range(width):
-            total += power[(i - width // 2) % size]
+            total += power[i]
         for i in range(size):
-            smooth[i] = total
-            total += power[(i - width // 2 + width) % size] - power[(i - width // 2) % size]
+            smooth[i] = total  # of the box that begins here
+            total += power[i + width] - power[i]
         power, smooth = smooth, power
-    return np.argmax(power)
+    return (np.argmax(power[:size]) + 3 * (width // 2)) % size
 
 
 def against_others(words, frequency, taps, good, linear):
@@ -111,21 +144,22 @@ def against_others(words, frequency, taps, good, linear):
 @compiled
 def _against_others(words, frequency, taps, good, linear, edges, times):
     positions, chirps, samples, _, _ = words.shape
-    a, b = linear[0] * RX, linear[1] * RX
-    blocks, parts = (b - a) // LANES, times.size
-    origin = (linear[1] - linear[0] - 1) / 2
+    a, b = linear
+    blocks, parts, origin = (b - a) // FOLD, times.size, (b - a - 1) / 2
     found, amplitude = np.empty((positions, chirps)), np.empty((positions, chirps), np.complex128)
     own, level = np.empty((positions, chirps), np.float32), np.empty(positions, np.float32)
     apart = np.empty((2, positions, chirps))
-    x, y = np.empty(samples * RX, np.float32), np.empty(samples * RX, np.float32)
-    mixed_re, mixed_im = np.empty(b - a, np.float32), np.empty(b - a, np.float32)
-    raw_re, raw_im = np.empty((blocks + 2) * RX, np.float32), np.empty((blocks + 2) * RX, np.float32)
-    re, im = np.empty((chirps, blocks * RX), np.float32), np.empty((chirps, blocks * RX), np.float32)
-    all_re, all_im = np.empty(blocks * RX, np.float32), np.empty(blocks * RX, np.float32)
-    within, steps = np.empty((2, LANES), np.float32), np.empty((2, blocks), np.float32)
-    product_re, product_im = np.empty(blocks * RX, np.float32), np.empty(blocks * RX, np.float32)
-    energy = np.empty(blocks * RX, np.float32)
-    part = np.empty((3, 2, parts), np.float32)  # real, imaginary, energy; of even and of odd RX
+    read = (samples - a) // FOLD  # blocks to the chirp's end
+    flat, spare = np.empty(read * LANES * 2, np.int16), np.empty(read * LANES * 2, np.int16)
+    x = flat.reshape(FOLD, 2, RX, read)
+    c, s = np.empty(blocks, np.float32), np.empty(blocks, np.float32)
+    # RX behind each other, two values between them that mean nothing.
+    mixed_re, mixed_im = np.empty(RX * (blocks + 2), np.float32), np.empty(RX * (blocks + 2), np.float32)
+    n = mixed_re.size - 2
+    re, im = np.empty((chirps, n), np.float32), np.empty((chirps, n), np.float32)
+    all_re, all_im = np.empty(n, np.float32), np.empty(n, np.float32)
+    product = np.empty((5, blocks), np.float32)  # real, imaginary of even RX, of odd RX; energy
+    part = np.empty((5, parts), np.float32)
     even, odd = np.empty(parts, np.complex128), np.empty(parts, np.complex128)
     rest = np.empty(parts, np.complex128)
     for p in range(positions):
@@ -134,37 +168,39 @@ def _against_others(words, frequency, taps, good, linear, edges, times):
         all_re[:] = 0
         all_im[:] = 0
         for k in range(chirps):
-            kernels.split(words[p, k].reshape(-1), x, y)
-            kernels.ramp(frequency[p, k], origin, within, steps)
-            kernels.mix(x[a:b], y[a:b], within, steps, mixed_re, mixed_im)
-            kernels.fold(mixed_re, raw_re[RX:-RX])
-            kernels.fold(mixed_im, raw_im[RX:-RX])
-            kernels.extend(raw_re, RX)
-            kernels.extend(raw_im, RX)
-            kernels.add_filtered(raw_re, raw_im, taps[p, k], RX, re[k], im[k])
+            kernels.by_phase(words[p, k, a : a + read * FOLD].reshape(-1), flat, spare)
+            kernels.steps(frequency[p, k], origin, c, s)
+            kernels.mix_and_fold(x, frequency[p, k], c, s, mixed_re, mixed_im)
+            kernels.add_filtered(mixed_re, mixed_im, taps[p, k], 1, re[k], im[k])
             if good[p, k]:
                 all_re += re[k]
                 all_im += im[k]
         total = np.float32(0)
-        for j in range(blocks * RX):
-            total += all_re[j] * all_re[j] + all_im[j] * all_im[j]
+        for r in range(RX):
+            for j in range(r * (blocks + 2), r * (blocks + 2) + blocks):
+                total += all_re[j] * all_re[j] + all_im[j] * all_im[j]
         level[p] = total
         for k in range(chirps):
-            own[p, k] = kernels.correlate(re[k], im[k], all_re, all_im, product_re, product_im)
-            for j in range(blocks * RX):
-                energy[j] = re[k, j] * re[k, j] + im[k, j] * im[k, j]
-            kernels.by_part(product_re, edges, part[0, 0], part[0, 1])
-            kernels.by_part(product_im, edges, part[1, 0], part[1, 1])
-            kernels.by_part(energy, edges, part[2, 0], part[2, 1])
+            product[:] = 0
+            for r in range(RX):
+                j, h = slice(r * (blocks + 2), r * (blocks + 2) + blocks), r % 2 * 2
+                kernels.add_products(re[k, j], im[k, j], all_re[j], all_im[j], product[h], product[h + 1], product[4])
+            for h in range(5):
+                for i in range(parts):
+                    total = np.float32(0)
+                    for m in range(edges[i], edges[i + 1]):
+                        total += product[h, m]
+                    part[h, i] = total
+            own[p, k] = part[4].sum()
             for i in range(parts):
-                even[i], odd[i] = complex(part[0, 0, i], part[1, 0, i]), complex(part[0, 1, i], part[1, 1, i])
-                rest[i] = even[i] + odd[i] - (part[2, 0, i] + part[2, 1, i]) * good[p, k]
+                even[i], odd[i] = complex(part[0, i], part[1, i]), complex(part[2, i], part[3, i])
+                rest[i] = even[i] + odd[i] - part[4, i] * good[p, k]
             w, amplitude[p, k] = kernels.newton(rest, times, 2)
             found[p, k] = w / (2 * np.pi)
             for i in range(parts):
-                c, s = kernels.cis(-w * times[i] / (2 * np.pi))
-                even[i] *= complex(c, s)
-                odd[i] *= complex(c, s)
+                turn_re, turn_im = kernels.cis(-w * times[i] / (2 * np.pi))
+                even[i] *= complex(turn_re, turn_im)
+                odd[i] *= complex(turn_re, turn_im)
             w, z = kernels.newton(even, times, 1)
             w_odd, z_odd = kernels.newton(odd, times, 1)
             z *= z_odd.conjugate()
@@ -178,11 +214,12 @@ def average(words, frequency, weights, second_half, linear):
     positions, chirps, samples, _, _ = words.shape
     a, b = linear
     full, blocks, count = -(-samples // FOLD), (b - a) // FOLD, weights.shape[2]
-    mean = np.zeros((positions, RX, samples), np.complex64)
+    mean = np.empty((positions, RX, samples), np.complex64)
     halves = np.empty((positions, 2, RX, blocks), np.complex64)
-    x, y = np.zeros(full * LANES, np.float32), np.zeros(full * LANES, np.float32)
+    fours_x, fours_y = np.zeros(full * FOLD, np.int64), np.zeros(full * FOLD, np.int64)  # words of four RX in one
+    x, y = fours_x.view(np.int16), fours_y.view(np.int16)
     re, im = np.empty((full + 2) * LANES, np.float32), np.empty((full + 2) * LANES, np.float32)
-    within, steps = np.empty((2, LANES), np.float32), np.empty((2, full), np.float32)
+    c, s = np.empty(full, np.float32), np.empty(full, np.float32)
     total = np.empty((2, 2, samples * RX), np.float32)
     block_re, block_im = np.empty(blocks * RX, np.float32), np.empty(blocks * RX, np.float32)
     inside = slice(LANES, LANES + full * LANES)
@@ -191,9 +228,9 @@ def average(words, frequency, weights, second_half, linear):
         for k in range(chirps):
             if weights[p, k, count // 2] == 0:
                 continue
-            kernels.split(words[p, k].reshape(-1), x, y)
-            kernels.ramp(frequency[p, k], (a + b - 1) / 2, within, steps)
-            kernels.mix(x, y, within, steps, re[inside], im[inside])
+            kernels.unzip(words[p, k].reshape(-1).view(np.int64), fours_x[:samples], fours_y[:samples])
+            kernels.steps(frequency[p, k], (a + b - 1) / 2, c, s)
+            kernels.mix(x, y, frequency[p, k], c, s, re[inside], im[inside])
             kernels.extend(re[: samples * RX + 2 * LANES], LANES)
             kernels.extend(im[: samples * RX + 2 * LANES], LANES)
             h = 1 if second_half[p, k] else 0

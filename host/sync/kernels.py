@@ -1,8 +1,9 @@
-"""Small compiled loops of `host.sync.compiled`, over one chirp of four RX at a time.
+"""Small compiled loops of `host.sync.compiled`, over one chirp of four RX at a time, or one burst of sixteen chirps.
 
-A chirp's samples lie in a row, its four RX next to each other, real and imaginary parts apart: float32 [sample * 4 +
-rx]. So every loop is long, contiguous and turned into vector instructions, sums over chirps need no rearranging, and
-four samples of four RX fill one vector of sixteen. All of a chirp fits the first-level cache.
+What makes them fast: every loop runs over values that lie next to each other, so it becomes vector instructions. The
+card's integers are sorted into that order before they become numbers, since they are half as wide. Strides are
+constants, and arrays are handed over as slices that start at 0, for the compiler to see that nothing overlaps. All of a
+chirp fits the first-level cache.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from host.sync.plain import FOLD
 
 RX = 4
-LANES = FOLD * RX  # samples that are averaged, of every RX
+LANES = FOLD * RX  # samples that are averaged, of every RX; also chirps that are transformed at once
 
 
 def _forget_stale() -> None:
@@ -32,16 +33,7 @@ def _forget_stale() -> None:
 
 
 _forget_stale()
-compiled = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-
-
-@compiled
-def split(words, re, im):
-    """Words int16 [sample * 8] of a chirp, I of the RX before Q, as float32 [sample * 4] each."""
-    for n in range(words.size // (2 * RX)):
-        for r in range(RX):
-            re[RX * n + r] = words[2 * RX * n + r]
-            im[RX * n + r] = words[2 * RX * n + RX + r]
+compiled = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
 
 
 @compiled
@@ -54,15 +46,156 @@ def largest(words):
 
 
 @compiled
-def correlate(x, y, u, v, re, im):
-    """`(x + j y) conj(u + j v)` into re + j im; returns the energy of x + j y."""
+def unzip(values, even, odd):
+    """Values at even and at odd places."""
+    for i in range(even.size):
+        even[i] = values[2 * i]
+        odd[i] = values[2 * i + 1]
+
+
+@compiled
+def _halves(values, out):
+    """Values at even places, then those at odd ones: of what an index means, the last factor of two comes first."""
+    unzip(values, out[: values.size // 2], out[values.size // 2 :])
+
+
+@compiled
+def by_channel(words, out, spare):
+    """Words [sample, 2, rx] of a chirp in the order [2, rx, sample]; all flat, int16 [sample * 8]."""
+    _halves(words, out)
+    _halves(out, spare)
+    _halves(spare, out)
+
+
+@compiled
+def by_phase(words, out, spare):
+    """Words [block, FOLD, 2, rx] of a chirp in the order [FOLD, 2, rx, block]; all flat."""
+    _halves(words, out)
+    _halves(out, spare)
+    _halves(spare, out)
+    _halves(out, spare)
+    _halves(spare, out)
+
+
+@compiled
+def correlate(x, u, re, im):
+    """Products of a chirp x int16 [2 * rx, sample] with the conjugate of u float32 (alike), summed over RX, into re and
+    im [sample]; returns the energy of x.
+    """
     energy = np.float32(0)
-    for j in range(re.size):
-        f, g = x[j], y[j]
-        energy += f * f + g * g
-        re[j] = f * u[j] + g * v[j]
-        im[j] = g * u[j] - f * v[j]
+    for i in range(re.size):
+        power, f, g = np.float32(0), np.float32(0), np.float32(0)
+        for r in range(RX):
+            a, b = np.float32(x[r, i]), np.float32(x[RX + r, i])
+            power += a * a + b * b
+            f += a * u[r, i] + b * u[RX + r, i]
+            g += b * u[r, i] - a * u[RX + r, i]
+        energy += power
+        re[i] = f
+        im[i] = g
     return energy
+
+
+@compiled
+def _quarters(values, out):
+    """Four records, flat, into one with theirs in turn."""
+    q = values.size // 4
+    for i in range(q):
+        out[4 * i] = values[i]
+        out[4 * i + 1] = values[q + i]
+        out[4 * i + 2] = values[2 * q + i]
+        out[4 * i + 3] = values[3 * q + i]
+
+
+@compiled
+def interleave(values, spare, out):
+    """Records [LANES, sample] in the order [sample, LANES], all flat; zeros behind them."""
+    _quarters(values, spare)
+    _quarters(spare, out[: values.size])
+    out[values.size :] = 0
+
+
+def roots(size):
+    """What :func:`transform` needs: cosines and sines of its steps, float32, and the order of its results, int32 [bin].
+
+    Bin `order[i]` of the transforms comes out at place i.
+    """
+    turns, radices, n = [], [], size
+    while n > 1:
+        radix = 4 if n in (256, 64, 16, 4) else 2
+        turns += [r * np.arange(n // radix) / n for r in range(1, radix)]
+        radices.append(radix)
+        n //= radix
+    angles = 2 * np.pi * np.repeat(np.concatenate(turns), LANES)
+    order = np.arange(size, dtype=np.int32).reshape(radices[::-1]).T.ravel()
+    return np.cos(angles).astype(np.float32), -np.sin(angles).astype(np.float32), order
+
+
+@compiled
+def transform(re, im, c, s):
+    """Fourier transforms of interleaved records [size * LANES], in place, by decimation in frequency.
+
+    Radix four, after steps of radix two down to a size whose strides are constants. `c` and `s` as of :func:`roots`.
+    """
+    n, at = re.size // LANES, 0
+    while n not in (256, 64, 16, 4):
+        q = n // 2 * LANES
+        for i in range(0, re.size, 2 * q):
+            j, k = i + q, i + 2 * q
+            _step_of_two(re[i:j], im[i:j], re[j:k], im[j:k], c[at:], s[at:])
+        n, at = n // 2, at + q
+    if n == 256:
+        _step_of_four(re, im, c[at:], s[at:], 64 * LANES)
+        at += 3 * 64 * LANES
+    if n >= 64:
+        _step_of_four(re, im, c[at:], s[at:], 16 * LANES)
+        at += 3 * 16 * LANES
+    if n >= 16:
+        _step_of_four(re, im, c[at:], s[at:], 4 * LANES)
+        at += 3 * 4 * LANES
+    _step_of_four(re, im, c[at:], s[at:], LANES)
+
+
+@compiled
+def _step_of_two(re, im, f, g, c, s):
+    for j in range(re.size):
+        x, y = re[j] - f[j], im[j] - g[j]
+        re[j] += f[j]
+        im[j] += g[j]
+        f[j] = x * c[j] - y * s[j]
+        g[j] = x * s[j] + y * c[j]
+
+
+@compiled
+def _step_of_four(all_re, all_im, c, s, q):
+    for first in range(0, all_re.size, 4 * q):
+        re, im = all_re[first : first + 4 * q], all_im[first : first + 4 * q]
+        for j in range(q):
+            a, b = re[j] + re[2 * q + j], im[j] + im[2 * q + j]
+            d, e = re[j] - re[2 * q + j], im[j] - im[2 * q + j]
+            f, g = re[q + j] + re[3 * q + j], im[q + j] + im[3 * q + j]
+            h, k = im[q + j] - im[3 * q + j], re[3 * q + j] - re[q + j]
+            re[j] = a + f
+            im[j] = b + g
+            re[q + j] = (d + h) * c[j] - (e + k) * s[j]
+            im[q + j] = (d + h) * s[j] + (e + k) * c[j]
+            re[2 * q + j] = (a - f) * c[q + j] - (b - g) * s[q + j]
+            im[2 * q + j] = (a - f) * s[q + j] + (b - g) * c[q + j]
+            re[3 * q + j] = (d - h) * c[2 * q + j] - (e - k) * s[2 * q + j]
+            im[3 * q + j] = (d - h) * s[2 * q + j] + (e - k) * c[2 * q + j]
+
+
+@compiled
+def strongest(power, index):
+    """The largest power of each interleaved record [place * LANES], and its index, come first; overwrites both."""
+    half = power.size // 2
+    while half >= LANES:
+        a, b, first, second = power[:half], power[half:], index[:half], index[half:]
+        for j in range(half):
+            u, v, i, k = a[j], b[j], first[j], second[j]
+            first[j] = k if v > u else i
+            a[j] = max(u, v)
+        half //= 2
 
 
 @compiled
@@ -78,31 +211,57 @@ def cis(turns):
 
 
 @compiled
-def ramp(frequency, origin, within, steps):
-    """`exp(-j 2 pi frequency (n - origin))` as a product: `within` [2, LANES] holds it for the first `FOLD` samples
-    from 0, every RX alike, and `steps` [2, block] for the first sample of every block, from `origin`. float32.
-    """
-    turn_re, turn_im = cis(-frequency)
-    re, im = 1.0, 0.0
-    for q in range(FOLD):
-        for r in range(RX):
-            within[0, RX * q + r], within[1, RX * q + r] = re, im
-        re, im = re * turn_re - im * turn_im, re * turn_im + im * turn_re
-    for m in range(steps.shape[1]):
-        steps[0, m], steps[1, m] = cis(frequency * (origin - FOLD * m))
+def steps(frequency, origin, re, im):
+    """`exp(-j 2 pi frequency (n - origin))` for the first sample n of every block, float32 [block]."""
+    for m in range(re.size):
+        re[m], im[m] = cis(frequency * (origin - FOLD * m))
 
 
 @compiled
-def mix(x, y, within, steps, re, im):
-    """`x + j y` times the ramp, into re + j im, all [block * LANES]."""
-    c, s = within[0], within[1]
-    for m in range(steps.shape[1]):
-        a, b = steps[0, m], steps[1, m]
+def mix_and_fold(x, frequency, c, s, re, im):
+    """Words int16 [FOLD, 2, rx, block] mixed down and averaged over every `FOLD` samples, into [rx * (1 + block + 1)].
+
+    `c` and `s` are :func:`steps`; the blocks are continued by one at either end.
+    """
+    c1, s1 = cis(-frequency)
+    c2, s2 = cis(-2 * frequency)
+    c3, s3 = cis(-3 * frequency)
+    part, n = np.float32(1 / FOLD), c.size
+    a1, a2, a3 = part * np.float32(c1), part * np.float32(c2), part * np.float32(c3)
+    b1, b2, b3 = part * np.float32(s1), part * np.float32(s2), part * np.float32(s3)
+    for r in range(RX):
+        to_re, to_im = re[r * (n + 2) : (r + 1) * (n + 2)], im[r * (n + 2) : (r + 1) * (n + 2)]
+        for m in range(n):
+            x0, y0 = np.float32(x[0, 0, r, m]), np.float32(x[0, 1, r, m])
+            x1, y1 = np.float32(x[1, 0, r, m]), np.float32(x[1, 1, r, m])
+            x2, y2 = np.float32(x[2, 0, r, m]), np.float32(x[2, 1, r, m])
+            x3, y3 = np.float32(x[3, 0, r, m]), np.float32(x[3, 1, r, m])
+            f = x0 * part + x1 * a1 - y1 * b1 + x2 * a2 - y2 * b2 + x3 * a3 - y3 * b3
+            g = y0 * part + y1 * a1 + x1 * b1 + y2 * a2 + x2 * b2 + y3 * a3 + x3 * b3
+            to_re[1 + m] = f * c[m] - g * s[m]
+            to_im[1 + m] = f * s[m] + g * c[m]
+        extend(to_re, 1)
+        extend(to_im, 1)
+
+
+@compiled
+def mix(x, y, frequency, c, s, re, im):
+    """Words x + j y int16 [block * LANES] mixed down, into re + j im. `c` and `s` are :func:`steps`."""
+    turn_re, turn_im = cis(-frequency)
+    within = np.empty((2, LANES), np.float32)
+    u, v = 1.0, 0.0
+    for q in range(FOLD):
+        for r in range(RX):
+            within[0, RX * q + r], within[1, RX * q + r] = u, v
+        u, v = u * turn_re - v * turn_im, u * turn_im + v * turn_re
+    d, e = within[0], within[1]
+    for m in range(c.size):
+        a, b = c[m], s[m]
         for i in range(LANES):
             j = m * LANES + i
-            u, v = a * c[i] - b * s[i], a * s[i] + b * c[i]
-            re[j] = x[j] * u - y[j] * v
-            im[j] = x[j] * v + y[j] * u
+            f, g = a * d[i] - b * e[i], a * e[i] + b * d[i]
+            re[j] = x[j] * f - y[j] * g
+            im[j] = x[j] * g + y[j] * f
 
 
 @compiled
@@ -141,22 +300,20 @@ def add_filtered(re, im, taps, s, to_re, to_im):
 
 
 @compiled
-def by_part(values, edges, even, odd):
-    """Sums of values [block * RX] over parts, over even and over odd RX, [part]."""
-    for i in range(edges.size - 1):
-        a, b, c, d = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-        for m in range(edges[i], edges[i + 1]):
-            j = m * RX
-            a, b, c, d = a + values[j], b + values[j + 1], c + values[j + 2], d + values[j + 3]
-        even[i], odd[i] = a + c, b + d
+def add_products(x, y, u, v, re, im, energy):
+    """Add `(x + j y) conj(u + j v)` to re + j im, and the energy of x + j y to energy."""
+    for m in range(re.size):
+        re[m] += x[m] * u[m] + y[m] * v[m]
+        im[m] += y[m] * u[m] - x[m] * v[m]
+        energy[m] += x[m] * x[m] + y[m] * y[m]
 
 
 @compiled
-def newton(blocks, times, steps):
+def newton(blocks, times, count):
     """`tone.refine` of one record of blocks complex128 [block]: radians a sample, and complex amplitude."""
     limit = 2 * np.pi / (times[-1] - times[0])
     w, step, s0, s1, s2 = 0.0, 0.0, 0j, 0j, 0j
-    for _ in range(steps):
+    for _ in range(count):
         s0, s1, s2 = 0j, 0j, 0j
         for i in range(times.size):
             c, s = cis(-w * times[i] / (2 * np.pi))
@@ -170,31 +327,3 @@ def newton(blocks, times, steps):
         step = min(max(step, -limit), limit)
         w += step
     return w, s0 - 1j * step * s1 - step**2 / 2 * s2
-
-
-@compiled
-def transform(x, y, records, roots):
-    """Fourier transforms of interleaved records, complex64 [sample * records], by Stockham's algorithm of radix two.
-
-    Overwrites both, and returns the one that holds the result. `roots` is `exp(-j 2 pi n / size)`.
-    """
-    n, s, swapped = roots.size, records, False
-    while n > 1:
-        if swapped:
-            _butterflies(y, x, n, s, roots)
-        else:
-            _butterflies(x, y, n, s, roots)
-        n, s, swapped = n // 2, 2 * s, not swapped
-    return y if swapped else x
-
-
-@compiled
-def _butterflies(x, y, n, s, roots):
-    """A step of :func:`transform`, from x to y: `s` transforms of length n become twice as many of half the length."""
-    half, turn = n // 2 * s, roots.size // n
-    for p in range(n // 2):
-        root, i, o = roots[p * turn], p * s, 2 * p * s
-        for q in range(s):
-            y[o + q] = x[i + q] + x[i + q + half]
-        for q in range(s):
-            y[o + s + q] = (x[i + q] - x[i + q + half]) * root

@@ -10,7 +10,8 @@ from zlib import crc32
 
 import pytest
 
-from shared.config import Instrument, decode, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
+from shared.tables import decode, to_builtins
 from simulators.scene import decode_scene
 from simulators.simulate import simulate
 
@@ -56,3 +57,9 @@ def scan_of() -> Callable[..., Path]:
         return folder
 
     return make
+
+
+@pytest.fixture(scope="session")
+def believe_rig() -> Callable[[Path, Instrument], None]:
+    """`believe_rig(folder, rig)`: let a scan folder say that it was taken with this rig."""
+    return believe

@@ -1,5 +1,7 @@
 """Calibration files: they read back, a scan keeps copies of what it was taken with, and changed ones are noticed."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -8,12 +10,14 @@ from host.calibration.files import BoardFilter, FilterFile, MetalFile, PlacesFil
 from host.calibration.in_force import keep_in_scan, load_calibration, of_rig, of_scan
 from host.calibration.metal import write_metal
 from host.imaging.grid import image_grid
+from host.imaging.imaged_with import ImagedWith
 from host.polarimetry import plane_reference
 from host.store.scanfolder import ScanFolder
 from host.store.validate import validate
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
 from shared.errors import ConfigError, DataError
 from shared.raster import plan_raster
+from shared.tables import to_builtins
 
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 
@@ -28,7 +32,8 @@ def metal_reference(rig, seed=0):
     y, x = np.meshgrid(np.linspace(0, 1, grid.y_m.size), np.linspace(0, 1, grid.x_m.size), indexing="ij")
     gain = (1 + 0.2 * y) * np.exp(1j * x)
     noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))
-    return plane_reference(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, smooth_mm=4.0, name="plate")
+    seen = plane_reference(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, smooth_mm=4.0, name="plate")
+    return replace(seen, made_with=ImagedWith.of(rig, {}))
 
 
 def named(make_rig, **files) -> Instrument:
@@ -37,6 +42,19 @@ def named(make_rig, **files) -> Instrument:
 
 def create(folder, rig) -> ScanFolder:
     return ScanFolder.create(folder, rig, plan_raster(rig.grid), extra={"calibration": keep_in_scan(rig, folder, True)})
+
+
+def test_a_filter_measured_with_other_corners_or_not_on_every_receiver_is_refused(make_rig, tmp_path):
+    whole = filter_file()
+    lacking = msgspec.structs.replace(whole, boards={"RH": whole.boards["RH"]})
+    refused = [(whole, 350.0, r"\[175.0, 350.0\] kHz programmed"), (lacking, 175.0, "RV is not in it")]
+    for i, (file, khz, words) in enumerate(refused):
+        path = write(file, tmp_path / str(i))
+        rig = make_rig(chirp={"hpf1_khz": khz}, calibration={"hpf": str(path)}, grid={"columns": 2, "rows": 2})
+        with pytest.raises(ConfigError, match=words):
+            keep_in_scan(rig, tmp_path / "scan", True)
+    kept = keep_in_scan(named(make_rig, hpf=write(whole, tmp_path / "good")), tmp_path / "scan", True)
+    assert list(kept) == ["hpf"]
 
 
 def test_files_survive_writing_and_never_overwrite(tmp_path):
@@ -107,8 +125,7 @@ def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig):
 
 
 def test_metal_of_other_pixels_is_refused_before_the_scan_and_not_after(tmp_path, make_rig):
-    moved = make_rig(geometry={"object_distance_mm": make_rig().geometry.object_distance_mm + 5.0})
-    metal = write_metal(metal_reference(moved), SOURCES, tmp_path / "c")
+    metal = write_metal(metal_reference(make_rig(image={"pixel_mm": 2.5})), SOURCES, tmp_path / "c")
     with pytest.raises(DataError, match="different pixels"):
         create(tmp_path / "s", named(make_rig, metal=metal))
 

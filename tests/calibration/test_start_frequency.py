@@ -9,7 +9,7 @@ from host.calibration.files import StartFile, read
 from host.calibration.start_frequency import by_geometry, start_of
 from host.cli import main
 from host.radar.validator import direct_if_hz
-from shared.config import to_builtins
+from shared.tables import to_builtins
 
 TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {"columns": 20, "rows": 20}}
 

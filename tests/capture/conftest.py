@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from shared.config import Board, Instrument, decode, load_instrument, to_builtins
+from shared.config import Board, Instrument, load_instrument
+from shared.tables import decode, to_builtins
 from simulators.card_endpoint import CardEndpoint
 from simulators.card_faults import Faults
 from simulators.card_sender import Pace
@@ -95,6 +96,12 @@ def rig(tmp_path: Path) -> Instrument:
     made = small(load_instrument(REPO / "instrument.toml"))
     (tmp_path / "instrument.toml").write_text(tomli_w.dumps(to_builtins(made)))
     return made
+
+
+@pytest.fixture
+def board(rig: Instrument) -> Board:
+    """A receiving board whose card and host have addresses that nobody else uses."""
+    return rig.by_role("receive_h")
 
 
 @pytest.fixture

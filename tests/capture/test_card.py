@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import random
+import select
 import socket
 import threading
 import time
@@ -58,9 +58,8 @@ def reply(code: int, status: int = 0) -> bytes:
 
 
 @pytest.fixture
-def bench():
-    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
-    board = Board("RV", "receive_v", f"{subnet}.182", f"{subnet}.30", 4202, 4203, ())
+def bench(rig):
+    board = rig.by_name("RV")
     with ExitStack() as stack:
 
         def make(answers, timeout_s: float = 30.0, source_port: int = 1024) -> tuple[CardClient, Script]:
@@ -155,3 +154,36 @@ def test_command_port_in_use(bench):
     with pytest.raises(DeviceError, match="4202") as e:
         CardClient(client.board, 1.0)
     assert "ss -ulnp" in e.value.remedy
+
+
+@pytest.mark.parametrize("between", [True, False])
+def test_end_of_the_record_before_is_not_that_of_this_one(bench, between):
+    """It came after the stop: before the next start was sent, or between that and its reply."""
+    late = [reply(Code.STATUS, Status.RECORD_COMPLETED)]
+    client, card = bench(
+        lambda code, n: [*(late if between and code == Code.RECORD_START and n == 2 else []), reply(code)]
+    )
+    client.record_start()
+    client.record_stop()
+    if not between:
+        card.say(reply(Code.STATUS, Status.RECORD_COMPLETED | Status.DDR_FULL))
+        assert select.select([client], [], [], 60.0)[0]
+    client.record_start()
+    assert client.take_status() == Status(0)
+
+
+def test_completed_record_is_waited_for_but_not_for_ever(bench):
+    def answers(code, _):
+        yield reply(code)
+        if code == Code.RECORD_STOP:
+            time.sleep(0.1)
+            yield reply(Code.STATUS, Status.RECORD_COMPLETED)
+
+    client, _ = bench(answers)
+    client.record_start()
+    client.record_stop()
+    client.wait_completed(60.0)
+    assert client.take_status() == Status.RECORD_COMPLETED
+    client.record_start()
+    client.wait_completed(0.05)
+    assert client.take_status() == Status(0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from shared.config import to_builtins
+from shared.tables import to_builtins
 from simulators.card_faults import Faults
 from simulators.card_sender import bound_udp
 
@@ -63,7 +63,7 @@ def test_every_hop_of_every_card(cards, card):
             assert (receiver["verdict"], receiver["why"] != "") == ("warning", True)
             assert "limits.d" in receiver["remedy"]
     text = card().stdout
-    for part in ("RH (receive_h)", "not recorded", "answers, FPGA 2.8", "bytes granted", "--listen", "core"):
+    for part in ("RH (receive_h)", "not recorded", "answers, FPGA 2.8", "bytes granted", "polysight doctor", "core"):
         assert part in text
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import socket
 import threading
 from contextlib import ExitStack
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 from host.capture.card import CardClient
 from host.capture.dca1000 import Code, Status, decode_request, encode_reply
 from host.capture.eeprom import EepromSettings, program_eeprom
-from shared.config import Board
 from shared.errors import ConfigError, DeviceError
 from simulators.dca1000 import Network
 
@@ -63,10 +61,8 @@ def test_a_card_that_could_not_be_reached_is_refused(given):
 
 
 @pytest.fixture
-def card():
+def card(board):
     """A client, and the requests its card has seen; `status` are the bits the card reports when it writes."""
-    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
-    board = Board("RH", "receive_h", f"{subnet}.180", f"{subnet}.30", 4096, 4098, ())
     seen: list[tuple[int, bytes]] = []
     answers = {"status": Status(0), "reply": 0}
     with ExitStack() as stack:

@@ -372,3 +372,32 @@ def test_nothing_and_nonsense():
     placed, out = place(5000, [b"", b"short", b"0123456789"], Counters(0, 1))
     assert placed.counts.malformed == 3
     assert not out.any()
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
+@given(
+    rest=st.integers(1, FULL - 1),
+    count=near_wrap,
+    sequence=near_sequence_wrap,
+    known=st.booleans(),
+    batch=st.sampled_from([1, 2, 7]),
+)
+def test_last_short_packet_of_the_record_before_is_told_from_the_first_of_this_one(rest, count, sequence, known, batch):
+    """The record before was stopped early, and what its card still held comes when this one is received already."""
+    late = Record.make(rest, count, sequence, seed=1)
+    record = Record.make(20 * FULL + 100, (count + rest) % COUNT, (sequence + 1) % SEQUENCE)
+    start = Counters(count, sequence) if known else None  # the end of what the receiver got of the record before
+    placed, out = place(len(record.data), late.packets + record.packets, start, frame=4096, batch=batch)
+    assert (placed.located, placed.missing) == (True, [])
+    assert out.tobytes() == record.data
+    assert (placed.counts.leftover, placed.counts.placed) == (1, len(record.packets))
+    assert placed.next_start == Counters((count + rest + out.size) % COUNT, (sequence + 1 + 21) % SEQUENCE)
+
+
+def test_truncated_first_packet_is_not_the_last_of_the_record_before():
+    record = Record.make(20 * FULL, 5000, 7)
+    packets = [record.packets[0][:-400], *record.packets[1:]]
+    placed, out = place(out_size := len(record.data), packets, Counters(5000, 7))
+    assert (placed.located, placed.missing) == (True, [(FULL - 400, FULL)])
+    assert is_original_or_masked(record, placed, out)
+    assert out.size == out_size

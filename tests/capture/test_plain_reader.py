@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import socket
 import struct
 import time
@@ -19,10 +18,11 @@ from host.capture.segment import write_index
 from host.store.events import EventWriter
 from host.store.manifest import ManifestWriter
 from pi_controller.journal import Journal
-from shared.config import Board, load_instrument
+from shared.config import load_instrument
 from shared.messages import Capture, RunStopped, pack
 from simulators.scene import load_scene
 from simulators.simulate import simulate
+from tests.small_scene import small_scene
 
 FRAMES, SAMPLES = 96, 256
 
@@ -37,13 +37,11 @@ def read_row(path: Path) -> tuple[dict, np.ndarray, np.ndarray]:
     return index, arrivals, samples
 
 
-def test_segments(tmp_path):
+def test_segments(board, tmp_path):
     rng = np.random.default_rng(3)
     counts = rng.integers(-900, 900, (2, 4, FRAMES, SAMPLES))
     truth = counts[0] + 1j * counts[1]
     sent = counts.transpose(2, 3, 0, 1).astype("<i2").tobytes()
-    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
-    board = Board("RH", "receive_h", f"{subnet}.181", f"{subnet}.30", 4200, 4201, ())
     gone, path = (20 * 1456, 21 * 1456), tmp_path / "0000.bin"
     with ReceiverProcess(board, 1 << 20) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as card:
         card.bind((board.card_address, 1024))
@@ -112,7 +110,7 @@ def test_index(tmp_path):
 def test_whole_scan(tmp_path):
     """A simulated scan folder, from its first file to its last, by the words of docs/spec alone."""
     repo = Path(__file__).resolve().parents[2]
-    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "scene.toml").write_text(small_scene(3, 2))
     folder = simulate(load_instrument(repo / "instrument.toml"), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
     facts = [json.loads(line) for line in (folder / "manifest.jsonl").read_text("ascii").splitlines()]
     for fact in facts:
@@ -135,20 +133,6 @@ def test_whole_scan(tmp_path):
     assert [event["seq"] for event in events] == list(range(1, len(events) + 1))
     points = [event["column"] for event in events if event["type"] == "Capture" and event["row_index"] == 1]
     assert points == list(reversed(range(plan["columns"])))
-
-
-SCENE = """name = "a metal plate"
-[grid]
-columns = 3
-rows = 2
-[burst]
-pulses = 2
-[[plates]]
-name = "copper"
-centre_mm = [0.0, 0.0]
-size_mm = [60.0, 60.0]
-metal = true
-"""
 
 
 def test_journal(tmp_path):

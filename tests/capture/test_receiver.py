@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import socket
 import subprocess
@@ -31,12 +30,6 @@ from shared.config import Board
 from shared.errors import DeviceError
 
 FULL = 1456
-
-
-@pytest.fixture
-def board() -> Board:
-    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
-    return Board("RH", "receive_h", f"{subnet}.181", f"{subnet}.30", 4200, 4201, ())
 
 
 @pytest.fixture

@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 import os
-import random
 
 import pytest
 
 from host.capture.receiver import ReceiverProcess
 from host.capture.scheduling import receiver_cores, take_core, take_priority
 from host.capture.udp import check_receive_buffer, usable_packets
-from shared.config import Board
 from shared.errors import DeviceError
 
 FULL = 1456
-
-
-@pytest.fixture
-def board() -> Board:
-    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
-    return Board("RH", "receive_h", f"{subnet}.181", f"{subnet}.30", 4200, 4201, ())
 
 
 def test_cores_leave_the_first_to_the_host():

@@ -22,7 +22,8 @@ from host.doctor.finding import Finding
 from host.doctor.walk import walk
 from host.scan.pi_client import PiClient
 from shared import messages as m
-from shared.config import Instrument, decode, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
+from shared.tables import decode, to_builtins
 from simulators.loopback import on_free_subnet
 
 sys.path.insert(0, str(Path(__file__).parent))  # for doctor_case.py

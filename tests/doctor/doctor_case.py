@@ -8,7 +8,8 @@ import numpy as np
 from host.calibration.direct_signal import find_direct
 from host.doctor.bench import Bench, System, Wanted
 from host.sync import BoardSetup
-from shared.config import Instrument, decode, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
+from shared.tables import decode, to_builtins
 from simulators.radar import SimulatedRig
 from simulators.scene import decode_scene
 

@@ -18,9 +18,9 @@ from host.doctor.check_disk import check_disk, check_time
 from host.doctor.check_network import check_network
 from host.doctor.finding import Finding, error, ok
 from host.doctor.walk import CHECKS, _try, walk
-from host.scan.run import HARDWARE_BACKEND
-from shared.config import to_builtins
+from shared.backends import GPIOD, GPIOMEM, WIRES
 from shared.messages import HelloReply
+from shared.tables import to_builtins
 
 # --- the command ---
 
@@ -50,7 +50,7 @@ def test_a_bad_rig_file_is_the_first_and_only_error(tmp_path, broken, capsys):
 
 def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text(tomli_w.dumps(to_builtins(rig_with(stage={"speed_mm_s": 200.0}))))
+    path.write_text(tomli_w.dumps(to_builtins(rig_with(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
     with Bench(Wanted(path), QUICK) as bench:
         found = {f.check: f for f in walk(bench)}
     assert found["config"].verdict == "error"
@@ -58,11 +58,11 @@ def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("backend", "verdict"), [("wires", "ok"), (HARDWARE_BACKEND, "error")], ids=["simulated rig", "real rig"]
+    ("backend", "verdict"), [(WIRES, "ok"), (GPIOD, "error"), (GPIOMEM, "error")], ids=["simulated", "gpiod", "gpiomem"]
 )
 def test_calibration_files(tmp_path, backend, verdict):
     board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    file = FilterFile(**head("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board})
+    file = FilterFile(**head("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
     bench = bench_of(rig_with(calibration={"hpf": str(write(file, tmp_path))}))
     bench.hello = HelloReply(pi_release="", firmware="", backend=backend, state="homed", scan_id="", last_seq=0)
     found = walk_one(bench, "calibration")

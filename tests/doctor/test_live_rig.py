@@ -137,8 +137,9 @@ def test_a_pulse_the_radars_cannot_take_is_refused_by_the_pi(live):
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    other = BoardFilter([172.5, 347.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
     sources = [SourceScan("sweep", "scans/sweep", True, 6)]
-    path = write(FilterFile(**head("hpf", sources), boards={"RH": board}), live.folder / "calibration")
+    path = write(FilterFile(**head("hpf", sources), boards={"RH": board, "RV": other}), live.folder / "calibration")
 
     def small(table):
         table["calibration"] = {"hpf": str(path)}
@@ -155,7 +156,7 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     assert validate(scan.path) == []
     pipeline = Pipeline(ScanFolder.load(scan.path))
     assert pipeline.setups["RH"].equaliser.model.corners_hz == (180.5e3, 355e3)
-    assert pipeline.setups["RV"].equaliser.model.corners_hz == (175e3, 350e3)
+    assert pipeline.setups["RV"].equaliser.model.corners_hz == (172.5e3, 347e3)
 
 
 def test_a_trigger_wire_that_is_cut(live):

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,32 +16,16 @@ import pytest
 import tomli_w
 
 from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, decode, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
 from shared.errors import PolysightError
+from shared.tables import decode, to_builtins
 from simulators.loopback import on_free_subnet
+from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
 LIMIT_S = 60.0
-SCENE = """name = "a metal plate"
-seed = 3
-[grid]
-columns = 12
-rows = 6
-step_x_mm = 10.0
-step_y_mm = 10.0
-[burst]
-pulses = 4
-[image]
-columns = 40
-rows = 40
-pixel_mm = 4.0
-[[plates]]
-name = "copper"
-centre_mm = [0.0, 0.0]
-size_mm = [60.0, 60.0]
-metal = true
-"""
+SCENE = small_scene(12, 6, pulses=4, pixels=40, pixel_mm=4.0)
 METAL = "0,0,50,50"  # the aperture is too small for the plate to be found by itself
 
 
@@ -187,9 +171,7 @@ class Bench:
 class Rig(Bench):
     """A simulated rig that runs, with its Pi; `scan` and `folder/"rig.toml"` are for the host."""
 
-    def __init__(
-        self, folder: Path, time_scale: float = 40.0, env: dict[str, str] | None = None, scene: str = SCENE
-    ) -> None:
+    def __init__(self, folder: Path, time_scale: float, env: dict[str, str] | None, scene: str) -> None:
         super().__init__(folder)
         self._scene = scene
         self._env = env
@@ -251,9 +233,22 @@ class Rig(Bench):
         assert not left, left
 
 
+@contextmanager
+def running(
+    folder: Path, time_scale: float = 40.0, env: dict[str, str] | None = None, scene: str = SCENE
+) -> Iterator[Rig]:
+    """A simulated rig in `folder` that runs; nothing of it is left afterwards, whatever happened."""
+    made = Rig(folder, time_scale, env, scene)
+    try:
+        made.begin()
+        yield made
+    finally:
+        made.close()
+
+
 @pytest.fixture(scope="session")
-def make_rig() -> type[Rig]:
-    return Rig
+def running_rig() -> Callable[..., AbstractContextManager[Rig]]:
+    return running
 
 
 @pytest.fixture
@@ -265,26 +260,18 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path)
-    try:
-        made.begin()
+    with running(tmp_path) as made:
         yield made
-    finally:
-        made.close()
 
 
 @pytest.fixture
 def rig_without_compiler(tmp_path: Path) -> Iterator[Rig]:
-    made = Rig(tmp_path, env={"PATH": str(tmp_path)})
-    try:
-        made.begin()
+    with running(tmp_path, env={"PATH": str(tmp_path)}) as made:
         yield made
-    finally:
-        made.close()
 
 
 @pytest.fixture
-def small_scene(tmp_path: Path) -> Path:
+def scene_file(tmp_path: Path) -> Path:
     path = tmp_path / "small.toml"
     path.write_text(SCENE)
     return path

@@ -1,9 +1,10 @@
 """Runs a program of the instrument that kills itself, as by SIGKILL, at one exact operation on a file.
 
-    python killed_at.py OPERATION SUFFIX NTH polysight scan --out DIR
+    python killed_at.py HITS OPERATION:SUFFIX:NTH,... polysight scan --out DIR
 
 At the NTH `OPERATION` (pwrite, fsync, rename, ftruncate) on a file whose name ends in SUFFIX the process is gone:
-before it, but a write is half done. This finds the instants that chance hardly ever meets.
+before it, but a write is half done. This finds the instants that chance hardly ever meets. Every such operation adds
+its line OPERATION:SUFFIX to the file HITS; with NTH 0 that is all.
 """
 
 from __future__ import annotations
@@ -15,13 +16,15 @@ from pathlib import Path
 from typing import Any
 
 
-def kill_at(operation: str, suffix: str, nth: int) -> None:
+def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
     """Arm this process."""
     real, left = getattr(os, operation), [nth]
 
     def call(what: Any, *more: Any, **named: Any) -> Any:
         name = str(Path(f"/proc/self/fd/{what}").readlink()) if isinstance(what, int) else str(more[0])
         if name.endswith(suffix):
+            with hits.open("a", encoding="utf-8") as f:
+                f.write(f"{operation}:{suffix}\n")
             left[0] -= 1
             if not left[0]:
                 if operation == "pwrite":
@@ -35,8 +38,10 @@ def kill_at(operation: str, suffix: str, nth: int) -> None:
 
 def main(words: list[str]) -> int:
     """Run `polysight` or `polysight-pi` with the rest of the words."""
-    operation, suffix, nth, program, *arguments = words
-    kill_at(operation, suffix, int(nth))
+    hits, places, program, *arguments = words
+    for place in places.split(","):
+        operation, suffix, nth = place.split(":")
+        kill_at(Path(hits), operation, suffix, int(nth))
     sys.argv = [str(Path(sys.executable).with_name(program)), *arguments]
     if program == "polysight":
         from host.cli import main as run

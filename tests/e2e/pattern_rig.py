@@ -7,7 +7,8 @@ from typing import Any
 
 import tomli_w
 
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
+from shared.tables import to_builtins
 
 from .conftest import REPO
 

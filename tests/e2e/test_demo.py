@@ -12,11 +12,11 @@ pytestmark = pytest.mark.xdist_group("rig")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_while_scanning(bench, small_scene, number):
+def test_stopped_while_scanning(bench, scene_file, number):
     """Ctrl-C reaches the process group, SIGTERM the demo alone; both end everything."""
     out = bench.folder / "demo"
     demo = bench.start(
-        "polysight", "demo", "--config", REPO / "instrument.toml", "--scene", small_scene, "--out", out,
+        "polysight", "demo", "--config", REPO / "instrument.toml", "--scene", scene_file, "--out", out,
         "--time-scale", "5",
     )  # fmt: skip
 
@@ -29,7 +29,7 @@ def test_stopped_while_scanning(bench, small_scene, number):
         demo.interrupt()
     else:
         demo.process.terminate()
-    ended = demo.wait(15)
+    ended = demo.wait()
     assert ended.status == 128 + signal.SIGINT
     assert ended.err.splitlines()[-1] == "polysight demo: stopped"
     assert "Traceback" not in ended.err

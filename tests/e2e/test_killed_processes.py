@@ -1,7 +1,8 @@
 """SIGKILL of the host, the Pi, or both, wherever it hits: the scan goes on, and its image is the undisturbed one's.
 
 Real processes on a simulated rig. Where each kill hits follows from its number: some come after a drawn time, others at
-an exact operation on a file (killed_at.py), in the scan or in the resume after it. `--long` takes 50 of them.
+an exact operation on a file (killed_at.py), in the scan or in the resume after it. `--long` takes 50 of them. Scans
+that nothing kills count these operations: a kind of place that no program comes to would test nothing.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import json
 import random
 import signal
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,30 +27,14 @@ from host.store.events import read_events
 from host.store.scanfolder import ScanFolder
 from host.store.validate import validate
 from shared.messages import RowStarted
+from tests.small_scene import small_scene
 
 pytestmark = [pytest.mark.xdist_group("rig"), pytest.mark.slow]
 KILLED_AT = Path(__file__).with_name("killed_at.py")
-SCENE = """name = "a metal plate"
-seed = 4
-[grid]
-columns = 6
-rows = 4
-step_x_mm = 20.0
-step_y_mm = 20.0
-[burst]
-pulses = 4
-[image]
-columns = 20
-rows = 20
-pixel_mm = 8.0
-[[plates]]
-name = "copper"
-centre_mm = [0.0, 0.0]
-size_mm = [60.0, 60.0]
-metal = true
-"""
+SCENE = small_scene(6, 4, step_mm=(20.0, 20.0), pulses=4, seed=4)
 METAL = ["--metal", "0,0,50,50"]  # the aperture is too small for the plate to be found by itself
 ROWS, FILES = 4, 8
+Place = tuple[str, str, int]
 HOST_PLACES = [
     *(("rename", ".bin", n) for n in range(1, FILES + 1)),  # rows durable, not named: before, and between two boards
     *(("fsync", "raw/RV", n) for n in range(1, ROWS + 1)),  # named, not committed
@@ -85,8 +71,8 @@ class Kill:
     pi: bool
     rows: int = 0
     wait_s: float = 0.0
-    place: tuple[str, str, int] | None = None
-    resumes: list[tuple[str, str, int]] = field(default_factory=list)
+    place: Place | None = None
+    resumes: list[Place] = field(default_factory=list)
 
     @staticmethod
     def draw(number: int) -> Kill:
@@ -109,31 +95,54 @@ class Killed:
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
-        assert self.scan(rig.folder / "undisturbed").wait().status == 0
+        self.met: Counter[str] = Counter()  # kinds of places that programs came to, each with who
+        self.armed = 0
+        self.restart_pi(counted(PI_PLACES))
+        assert self.scan(rig.folder / "undisturbed", counted(HOST_PLACES)).wait().status == 0
+        self.note("host", self.hits)
+        self.note("Pi", self.pi_hits)
+        self.restart_pi()
         self.rows, self.image = rows(rig.folder / "undisturbed"), image(rig.folder / "undisturbed")
 
-    def start(self, place: tuple[str, str, int] | None, *command: str | Path) -> Any:
-        """A command, which kills itself at `place`."""
-        armed = [] if place is None else ["python", KILLED_AT, place[0], place[1], str(place[2])]
-        return self.rig.start(*armed, *command)
+    def start(self, places: Sequence[Place], *command: str | Path) -> tuple[Any, Path]:
+        """A command that kills itself at the first of these places it comes to; and where it writes what it met."""
+        self.armed += 1
+        hits = self.rig.folder / f"hits-{self.armed}"
+        hits.touch()
+        words = ",".join(f"{operation}:{suffix}:{nth}" for operation, suffix, nth in places)
+        return self.rig.start(*(["python", KILLED_AT, hits, words] if places else []), *command), hits
 
-    def scan(self, folder: Path, place: tuple[str, str, int] | None = None, *more: str) -> Any:
+    def scan(self, folder: Path, places: Sequence[Place] = (), *more: str) -> Any:
         """Start a scan, or go on with it when its manifest has a first line."""
         command = ("resume", folder) if begun(folder) else ("scan", "--config", self.rig.config, "--out", folder)
-        return self.start(place, "polysight", *command, *(more or ["--no-process"]))
+        program, self.hits = self.start(places, "polysight", *command, *(more or ["--no-process"]))
+        return program
 
-    def restart_pi(self, place: tuple[str, str, int] | None = None) -> None:
+    def restart_pi(self, places: Sequence[Place] = ()) -> None:
         """As systemd does. With a place, its next scan kills it."""
         self.rig.pi.kill()
         wires = self.rig.folder / "rig" / "wires.sock"
-        self.rig.pi = self.start(place, "polysight-pi", "run", "--config", self.rig.config, "--wires", wires)
+        run = ("polysight-pi", "run", "--config", self.rig.config, "--wires", wires)
+        self.rig.pi, self.pi_hits = self.start(places, *run)
         self.rig.pi.wait_ready()
+
+    def note(self, who: str, hits: Path) -> None:
+        """Remember what a program came to."""
+        self.met.update(f"{who} {kind}" for kind in hits.read_text().splitlines())
+
+    @staticmethod
+    def check_died(status: int | None, place: Place, hits: Path) -> None:
+        """A program that came to its place died of it, and any other did not."""
+        operation, suffix, nth = place
+        came = hits.read_text().splitlines().count(f"{operation}:{suffix}")
+        assert (status == -signal.SIGKILL) == (came >= nth), f"{place}: {came} times there, exit status {status}"
 
     def strike(self, kill: Kill, folder: Path) -> None:
         """Begin a scan, kill as told, and wait until nothing of it runs any more."""
-        if kill.pi and kill.place:
-            self.restart_pi(kill.place)
-        host = self.scan(folder, kill.place if kill.host else None)
+        places = [kill.place] if kill.place else []
+        if kill.pi and places:
+            self.restart_pi(places)
+        host = self.scan(folder, places if kill.host else ())
         if kill.place is None:
             there = lambda: host.process.poll() is not None or len(committed(folder)) >= kill.rows  # noqa: E731
             self.rig.wait_for(there, f"{kill.rows} rows")
@@ -143,9 +152,12 @@ class Killed:
         elif kill.pi:
             ended = lambda: self.rig.pi.process.poll() is not None or host.process.poll() is not None  # noqa: E731
             self.rig.wait_for(ended, "the Pi at its place, or the scan's end")
+            self.check_died(self.rig.pi.process.poll(), kill.place, self.pi_hits)
         if kill.pi:
             self.restart_pi()
         ended = host.wait()
+        if kill.place and kill.host:
+            self.check_died(ended.status, kill.place, self.hits)
         assert ended.status in ((-signal.SIGKILL, 0) if kill.host else (0, 5, 6)), ended.err
 
     def check(self, kill: Kill) -> list[int]:
@@ -155,8 +167,11 @@ class Killed:
         again = []
         for place in [*kill.resumes, None]:
             before = safe(folder, self.rows)
-            ended = self.scan(folder, place).wait()
+            ended = self.scan(folder, [place] if place else counted(RESUME_PLACES)).wait()
             assert ended.status == 0 or (place and ended.status == -signal.SIGKILL), f"{kill}\n{ended.err}"
+            if place:
+                self.check_died(ended.status, place, self.hits)
+            self.note("resume", self.hits)
             assert before.items() <= safe(folder, self.rows).items(), kill
             again.append(len(retaken(folder)))
         assert validate(folder) == [], kill
@@ -166,6 +181,11 @@ class Killed:
         started = [e for e in read_events(folder / "events.msgpack").events if isinstance(e, RowStarted)]
         assert len({(e.row.index, e.take) for e in started}) == len(started), "a take was used twice"
         return again
+
+
+def counted(places: Sequence[Place]) -> list[Place]:
+    """Every kind of these places, to be counted: no time of meeting it kills."""
+    return [(operation, suffix, 0) for operation, suffix in dict.fromkeys(place[:2] for place in places)]
 
 
 def begun(folder: Path) -> bool:
@@ -208,13 +228,9 @@ def image(folder: Path) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def killed(make_rig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killed]:
-    rig = make_rig(tmp_path_factory.mktemp("killed"), time_scale=50.0, scene=SCENE)
-    try:
-        rig.begin()
+def killed(running_rig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killed]:
+    with running_rig(tmp_path_factory.mktemp("killed"), time_scale=50.0, scene=SCENE) as rig:
         yield Killed(rig)
-    finally:
-        rig.close()
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -230,12 +246,25 @@ def test_killed(killed: Killed, number: int, record_property):
     print(f"{kill}: rows retaken by each resume {again}")  # noqa: T201 - shown with -s
 
 
+def test_every_kind_of_place_is_come_to(killed: Killed):
+    """Else its kills are none: a file has another name by now, or is written in another way."""
+
+    def never(who: str, places: Sequence[Place]) -> list[Place]:
+        return [place for place in counted(places) if not killed.met[f"{who} {place[0]}:{place[1]}"]]
+
+    for number, place in ((100, ("pwrite", "manifest.jsonl", 4)), (101, ("pwrite", "events.msgpack", 3))):
+        if never("resume", RESUME_PLACES):  # run alone, or not by the kills above: of a torn manifest, of torn events
+            killed.check(Kill(number, host=True, pi=False, place=place))
+    for who, places in (("host", HOST_PLACES), ("Pi", PI_PLACES), ("resume", RESUME_PLACES)):
+        assert never(who, places) == [], f"{who}: {killed.met}"
+
+
 def test_products_of_a_killed_scan(killed: Killed):
     """What was processed while the scan ran, and ran again, is what the undisturbed scan is processed into."""
     folder = killed.rig.folder / "live"
-    scan = killed.scan(folder, ("rename", ".bin", 5), *METAL)
+    scan = killed.scan(folder, [("rename", ".bin", 5)], *METAL)
     assert scan.wait().status == -signal.SIGKILL
-    resumed = killed.scan(folder, None, *METAL).wait()
+    resumed = killed.scan(folder, (), *METAL).wait()
     assert resumed.status == 0, resumed.err
     out = killed.rig.folder / "products"
     processed = killed.rig.polysight("process", killed.rig.folder / "undisturbed", "--out", out, *METAL)

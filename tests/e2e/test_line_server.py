@@ -7,7 +7,8 @@ import pytest
 from host.scan.run import run_scan
 from host.store.scanfolder import ScanFolder
 from host.store.validate import validate
-from shared.config import Instrument, decode, to_builtins
+from shared.config import Instrument
+from shared.tables import decode, to_builtins
 
 from .pattern_rig import counts, small_table, start_rig
 

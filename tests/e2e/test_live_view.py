@@ -15,28 +15,11 @@ from urllib.request import Request, urlopen
 import pytest
 
 from host.store.validate import validate
+from tests.small_scene import small_scene
 
 LIMIT_S = 120.0
 ROWS = 40
-SCENE = """name = "a metal plate"
-seed = 3
-[grid]
-columns = 10
-rows = 40
-step_x_mm = 10.0
-step_y_mm = 5.0
-[burst]
-pulses = 2
-[image]
-columns = 20
-rows = 20
-pixel_mm = 8.0
-[[plates]]
-name = "copper"
-centre_mm = [0.0, 0.0]
-size_mm = [60.0, 60.0]
-metal = true
-"""
+SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
 pytestmark = pytest.mark.xdist_group("rig")
 
 
@@ -91,14 +74,10 @@ def shown(state: dict[str, Any]) -> int:
 
 
 @pytest.fixture
-def slow_rig(make_rig, tmp_path) -> Iterator[Any]:
+def slow_rig(running_rig, tmp_path) -> Iterator[Any]:
     """A rig that takes a while for its many short rows."""
-    made = make_rig(tmp_path, time_scale=10.0, scene=SCENE)
-    try:
-        made.begin()
+    with running_rig(tmp_path, time_scale=10.0, scene=SCENE) as made:
         yield made
-    finally:
-        made.close()
 
 
 def test_a_scan_is_followed_paused_lost_and_stopped(slow_rig):

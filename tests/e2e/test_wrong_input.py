@@ -14,24 +14,13 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from shared.config import to_builtins
+from shared.tables import to_builtins
+from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]
 RIG = REPO / "instrument.toml"
 CAPTURE = REPO.parent / "shared" / "data" / "dca1000-real" / "test_one_frame.pcap"
-SCENE = """name = "plates"
-[grid]
-columns = 12
-rows = 4
-step_x_mm = 10.0
-step_y_mm = 10.0
-[burst]
-pulses = 2
-[image]
-columns = 30
-rows = 30
-pixel_mm = 5.0
-"""
+SCENE = small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
 
 
 def refused(ended, *words: str, status: int | None = None) -> None:
@@ -77,16 +66,57 @@ def test_rig_file(bench, program, old, new, words):
 def test_files_that_are_not_there(bench):
     refused(bench.polysight("scan", "--out", "s"), "instrument.toml: no such file", status=2)
     refused(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
-    refused(bench.polysight("demo", "--config", RIG, "--scene", "no.toml", "--out", "d"), "no.toml: no such file")
     refused(bench.polysight("simulate", "no.toml", "--config", RIG, "--out", "d"), "no.toml: no such file", status=2)
+    reproduce = ("reproduce", "--config", "no.toml", "--out", "r", "table1")
+    refused(bench.polysight(*reproduce), "no.toml: no such file", status=2)
+    refused(bench.polysight("preview", RIG, "--port", "0"), "instrument.toml is a file", status=2)
     refused(bench.polysight("inspect", "no.bin"), "no.bin", status=3)
     refused(bench.polysight("inspect", "no.pcap"), "no.pcap", status=3)
 
 
-@pytest.mark.parametrize("command", [["simulate", "scene.toml"], ["demo", "--scene", "scene.toml"]])
-def test_unknown_key_in_a_scene(bench, command):
-    (bench.folder / "scene.toml").write_text(SCENE.replace("[grid]", "colour = 3\n[grid]", 1))
-    refused(bench.polysight(*command, "--config", RIG, "--out", "d"), "scene.toml", "colour")
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[grid]", "colour = 3\n[grid]", ("scene.toml", "colour")),
+        ("pulses = 2", "pulses = 2000", ("burst of 2000 pulses", "passes a point every")),
+        ("", "", ("scene.toml: no such file",)),
+    ],
+)
+def test_scene_file(bench, old, new, words):
+    """Found out before anything is begun: the last demo is still there, and no rig was started."""
+    scenes = bench.folder / "scenes"
+    scenes.mkdir()
+    (scenes / "a.toml").write_text(SCENE)
+    if old:
+        (scenes / "scene.toml").write_text(SCENE.replace(old, new, 1))
+    last = bench.folder / "d"
+    last.mkdir()
+    (last / ".polysight-demo").touch()
+    (last / "report.html").touch()
+    rig = ("--config", RIG)
+    refused(bench.polysight("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
+    assert (last / "report.html").exists()
+    refused(bench.polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
+    if old:
+        refused(bench.polysight("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
+    assert {p.name for p in bench.folder.iterdir() if p.is_dir()} == {"scenes", "d"}
+
+
+def test_simulated_rig(bench):
+    """What its processes would refuse, the rig refuses before it starts them."""
+    rig = ("python", "-m", "simulators.rig", "--config", RIG, "--pattern", "--dir", "rig")
+    refused(bench.run(*rig, "--faults", "no.toml"), "no.toml: no such file", status=2)
+    refused(bench.run(*rig, "--fault", "RH.los=0.1"), "faults of RH", "los", status=2)
+    refused(bench.run(*rig, "--time-scale", "0"), "--time-scale", status=2)
+    assert not (bench.folder / "rig").exists()
+
+
+def test_rig_file_of_a_training(bench):
+    (bench.folder / "scenes").mkdir()
+    (bench.folder / "scenes" / "a.toml").write_text(SCENE)
+    train = ("train", "--simulate", "scenes")
+    refused(bench.polysight(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
+    refused(bench.polysight(*train, "--config", RIG, "--out", "no/l.npz"), "no such folder no", status=2)
 
 
 # --- recorded data ----------------------------------------------------------------------------------------------------
@@ -285,6 +315,17 @@ def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
     assert ended.status == 128 + signal.SIGINT
     assert ended.message == "polysight scan: stopped"
     assert not (bench.folder / "s").exists()
+
+
+def test_interrupted_while_simulating(bench):
+    """Ctrl-C reaches both programs, and one of them says so."""
+    (bench.folder / "scene.toml").write_text(small_scene(350, 200, step_mm=(1.0, 1.0)))
+    simulate = bench.start("polysight", "simulate", "scene.toml", "--config", RIG, "--out", "s")
+    bench.wait_for(lambda: (bench.folder / "s" / "manifest.jsonl").exists(), "the first row")
+    simulate.interrupt()
+    ended = simulate.wait()
+    assert ended.status == 128 + signal.SIGINT
+    assert ended.err == "polysight simulate: stopped\n"
 
 
 @pytest.mark.xdist_group("rig")

@@ -17,7 +17,8 @@ from host.export.hdf5 import write_hdf5
 from host.export.matlab import write_mat
 from host.export.table import write_csv
 from host.report import write_image, write_json
-from shared.config import load_instrument, to_builtins
+from shared.config import load_instrument
+from shared.tables import to_builtins
 
 REPO = Path(__file__).resolve().parents[2]
 SEGMENTS = [

@@ -12,8 +12,9 @@ from host.cli import main
 from host.pipeline import Pipeline
 from host.store.authors import AuthorsCube, open_scan
 from host.sync.cubes import recognise
-from shared.config import Image, load_instrument, to_builtins
+from shared.config import Image, load_instrument
 from shared.errors import DataError
+from shared.tables import to_builtins
 from simulators.authors_forms import write_cube
 from simulators.scene import decode_scene
 from simulators.simulate import simulate

@@ -19,7 +19,7 @@ def found(imaged):
 
 
 def again(scan, path, plates=()):
-    boxes, names, metal = Options(labels=path).drawn(scan.images)
+    boxes, names, metal = Options(labels=read_labels(path)).drawn(scan.images.x_m, scan.images.y_m)
     return scan.pipeline.find_materials(
         scan.images, None, Classifier(Library.load(LIBRARY)), plates, segmentation=boxes, metal_label=metal
     ), names

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from host.imaging import ImageBuilder, image_grid
-from host.imaging.focus import focus_sweep
+from host.imaging.focus import _at, focus_sweep
 
 PLACES_MM = [(-60, -55), (-10, -60), (58, -50), (-62, 5), (3, -4), (60, 8), (-55, 60), (8, 55), (61, 58)]
 
@@ -58,3 +58,13 @@ def test_the_found_distance_put_into_the_rig_file_leaves_nothing_to_find(make_ri
     for index, row in points_rows(right, right.receivers[0], [point], [1.0]):
         builder.add_row(right.receivers[0].name, index, row)
     assert abs(focus_sweep(builder, planes=9).depth_mm) < 0.3
+
+
+def test_the_planes_themselves_come_back_from_between_them_the_first_and_the_last_too():
+    depths = np.linspace(-4e-3, 4e-3, 9)
+    stack = 1 + np.random.default_rng(1).random((9, 3, 4))
+    for plane, depth in zip(stack, depths, strict=True):
+        np.testing.assert_allclose(_at(stack, depths, np.full((3, 4), depth)), plane, rtol=1e-9)
+    smooth = (depths**2)[:, None, None] * np.ones((3, 4))
+    between = np.full((3, 4), -3.7e-3)
+    np.testing.assert_allclose(_at(smooth, depths, between), between**2, rtol=1e-9)  # parabolas are exact

@@ -3,7 +3,12 @@
 import json
 from pathlib import Path
 
+import numpy as np
+import pytest
+
+from host import offline
 from host.cli import main
+from host.imaging.focus import Focus
 from shared.config import load_instrument
 from simulators.scene import decode_scene
 from simulators.simulate import simulate
@@ -16,10 +21,11 @@ SCENE = {
     "burst": {"pulses": 2},
     "points": [{"position_mm": [0.0, 0.0], "amplitude": [0.8, 0.0]}],
 }
+RIG = load_instrument(ROOT / "instrument.toml")
 
 
 def test_focus_writes_figure_and_numbers_and_says_when_a_scan_is_too_narrow(tmp_path, capsys):
-    simulate(load_instrument(ROOT / "instrument.toml"), decode_scene(SCENE, "t"), tmp_path / "scan")
+    simulate(RIG, decode_scene(SCENE, "t"), tmp_path / "scan")
     assert main(["focus", str(tmp_path / "scan"), "--out", str(tmp_path / "focus"), "--depth", "6"]) == 0
     said = capsys.readouterr().out
     assert "simulated scan one-point" in said
@@ -31,3 +37,28 @@ def test_focus_writes_figure_and_numbers_and_says_when_a_scan_is_too_narrow(tmp_
     assert (found["depths_mm"][0], found["depths_mm"][-1]) == (-6, 6)
     assert max(found["sharpness"]) == 1
     assert (tmp_path / "focus" / "focus.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("by_columns", [False, True])
+def test_x_and_y_are_the_rigs_whichever_way_the_scan_was_taken(tmp_path, capsys, monkeypatch, by_columns):
+    at_mm, tilt = (15.0, -9.0), (2.0, -1.0)
+    scene = decode_scene({**SCENE, "points": [{"position_mm": at_mm}]}, "t").with_disturbances(ideal=True)
+    data = simulate(RIG, scene, tmp_path, layout="authors", by_columns=by_columns)
+    found_by_the_builder = tilt[::-1] if by_columns else tilt  # which images the rig mirrored in x = y
+    swept = Focus(np.linspace(-6, 6, 3), np.ones(3), 0.0, found_by_the_builder, 1.0)
+    drawn = []
+    monkeypatch.setattr(offline, "focus_sweep", lambda *_: swept)
+    monkeypatch.setattr(offline, "focus_figure", lambda *given: drawn.append(given) or b"")
+    assert main(["focus", str(data), "--out", str(tmp_path / "focus")]) == 0
+    said = capsys.readouterr().out
+    assert "tilt: +2.00 degrees along x, -1.00 along y" in said
+    assert "swapped" not in said
+    found = json.loads((tmp_path / "focus" / "focus.json").read_text())
+    assert tuple(found["tilt_deg"]) == tilt
+    ((sweep, *pictures, x_m, y_m, _),) = drawn
+    assert tuple(sweep["tilt_deg"]) == tilt
+    assert (x_m.size, y_m.size) == (24, 20)
+    for picture in pictures:
+        row, column = np.unravel_index(np.argmax(np.abs(picture)), (20, 24))
+        place_mm = 1e3 * np.array([x_m[column] - x_m.mean(), y_m[row] - y_m.mean()])
+        np.testing.assert_allclose(place_mm, at_mm, atol=6.0)

@@ -9,6 +9,8 @@ from host.imaging import ImageBuilder, backproject, image_grid
 from host.imaging.footprint import mirror_samples
 from host.imaging.grid import Antennas, row_offsets_m
 from host.imaging.reduce import reduction, scene_gate_m
+from host.materials.spectrum import Spectrum
+from host.polarimetry import multilayer
 from host.sync import BoardSetup, synchronise_row
 from shared.errors import DataError
 from shared.geometry import specular_midpoint_m
@@ -97,9 +99,24 @@ def test_a_uniform_plane_is_flat_after_division_whatever_is_missing(make_rig, pl
     images = _build(rig, lambda b: plane_rows(rig, b, 0.5j, holes), taper=taper).finish()
     assert images.valid.mean() > 0.9
     for flat, raw in ((images.h, images.h_raw), (images.v, images.v_raw)):
-        np.testing.assert_allclose(flat[images.valid], 0.5j, atol=2e-3)
+        np.testing.assert_allclose(flat[images.valid], np.conj(0.5j), atol=2e-3)
         shown = np.abs(raw[images.valid])
         assert shown.max() > 1.3 * shown.min()  # it was not flat before
+
+
+def test_what_a_sheet_does_to_the_wave_is_what_the_image_of_its_samples_says(make_rig, plane_rows):
+    """Samples hold the wave's conjugate, so that later is +2 pi f tau; images are as Fresnel's coefficients."""
+    rig = make_rig(37, 31, step_x=6.0)
+    chirp = rig.chirp
+    f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    wave, _ = multilayer([4 - 0.4j, 1.0], [3e-3, np.inf], f, np.radians(55))
+    images = _build(rig, lambda b: plane_rows(rig, b, wave.conj())).finish()
+    spectrum = Spectrum.of(chirp)
+    expected = multilayer([4 - 0.4j, 1.0], [3e-3, np.inf], spectrum.frequency_hz[0], np.radians(55))[0]
+    mean = (expected * spectrum.weight[0]).sum()
+    assert abs(mean.imag) > 0.1  # which sign it has can be told
+    for flat in (images.h, images.v):
+        np.testing.assert_allclose(flat[images.valid], mean, atol=0.02 * abs(mean))
 
 
 def test_receiver_gains_are_measured_on_the_direct_path_and_taken_out(make_rig, points_rows):

@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 
+from host.cli import main
+from host.materials import Classifier, Entry, Library
 from host.materials.discriminant import REJECTED, ErrorDiscriminant
+from host.materials.fit import fit_samples
 from host.materials.judge import score, strangers
-from host.materials.models import DISCRIMINANT
+from host.materials.knn import fit_weights
+from host.materials.models import DISCRIMINANT, MODELS, PAPER
 from host.materials.samples import Samples, feature_matrix
+from host.report.assemble import classifier_sentence
+from shared.errors import DataError
 
 MEANS = np.array([[-0.6, -2.0, 0.1], [-0.55, -1.9, 0.2], [-0.5, -2.2, 3.1], [-0.4, -1.5, -3.1], [-0.3, -1.2, 0.5]])
 """ln|H|, ln|V| and arg P of five materials; two of them lie on either side of 180 degrees."""
@@ -101,6 +107,40 @@ def test_a_stranger_does_not_shift_the_others():
     assert joint.distance[:5] == pytest.approx(alone.distance, abs=1e-3)
 
 
+def with_metal(samples, stray):
+    """The same scans with metal beside: no error of scan or patch, and one stray pixel a patch, the first or last."""
+    rng, scans = np.random.default_rng(7), np.unique(samples.groups)
+    n = int((samples.patches == 0).sum())
+    z = 0.03 * rng.standard_normal((scans.size, n, 3))
+    z[:, stray] += [0.0, -0.5, 0.3]  # |1/P - 1| of 0.5
+    h, v = np.exp(z[..., 0]).ravel(), np.exp(z[..., 1]).ravel()
+    x = feature_matrix(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
+    patches = samples.patches.max() + 1 + np.repeat(np.arange(scans.size), n)
+    metal = Samples(x, np.full(len(x), "metal"), np.repeat(scans, n), patches)
+    both = zip(vars(samples).values(), vars(metal).values(), strict=True)
+    return Samples(*(np.concatenate(pair) for pair in both))
+
+
+def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
+    samples = with_metal(drawn(8), 0)
+    turned = samples.take(np.arange(len(samples.x))[::-1])
+    here, there = ErrorDiscriminant().fit(samples), ErrorDiscriminant().fit(turned)
+    np.testing.assert_allclose(here.scan, there.scan, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(here.mean, there.mean, rtol=1e-9, atol=1e-12)
+    assert here.patch_level == pytest.approx(there.patch_level)
+
+
+@pytest.mark.parametrize("stray", [0, 5])
+def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
+    """The reference has no error of its own: whether it is looked at changes nothing of the others."""
+    model = ErrorDiscriminant().fit(with_metal(drawn(8), 0))
+    test = with_metal(drawn(9, scans=1), stray)
+    others = test.take(test.names != "metal")
+    alone, beside = (model.by_scan(s.x, s.patches) for s in (others, test))
+    np.testing.assert_allclose(beside.distance[: len(alone.distance)], alone.distance, rtol=1e-9)
+    assert beside.names[-1] == "metal"
+
+
 def test_two_angles_are_independent_and_tell_more():
     one, two = drawn(0, pixel=0.1, patch=0.05), drawn(1, pixel=0.1, patch=0.05)
     both = one.joined(two)
@@ -108,3 +148,69 @@ def test_two_angles_are_independent_and_tell_more():
     for covariance in (model.scan, model.between[0], model.within[0]):
         assert np.abs(covariance[:3, 3:]).max() < 1e-12
     assert score(both, DISCRIMINANT).pixels > score(one, DISCRIMINANT).pixels
+
+
+def with_lonely(samples, scans=1):
+    """The same scans with another material beside, in the first few of them, unlike all others."""
+    only = drawn(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
+    names = np.full(len(only.x), "lonely")
+    more = Samples(only.x, names, only.groups, samples.patches.max() + 1 + only.patches)
+    both = zip(vars(samples).values(), vars(more).values(), strict=True)
+    return Samples(*(np.concatenate(pair) for pair in both))
+
+
+@pytest.mark.parametrize("model", [DISCRIMINANT, PAPER])
+def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
+    """It cannot be learnt from other scans: the accuracy is that of the others, and it is named."""
+    some = drawn(12, scans=4, pixels=4)
+    without, beside = score(some, model), score(with_lonely(some), model)
+    assert (without.not_judged, beside.not_judged) == ((), ("lonely",))
+    assert beside.pixels == pytest.approx(without.pixels, abs=0.02)
+    assert beside.patches == pytest.approx(without.patches, abs=0.02)
+    assert beside.names[0] == "lonely"
+    assert not beside.confusion[0].any()
+    assert beside.confusion[1:].sum(axis=1) == pytest.approx(1.0)
+
+
+def test_a_library_says_which_materials_could_not_be_judged():
+    few = drawn(12, scans=3, pixels=3, means=MEANS[[0, 3, 4]])
+    fit = fit_samples(with_lonely(few))
+    assert (fit["materials"], fit["not_judged"]) == (4, ["lonely"])
+    assert fit["pixel_accuracy"] == fit["patch_accuracy"] == 1.0
+
+
+def test_the_channels_alone_are_judged_on_the_same_materials():
+    some = drawn(0, scans=4, pixels=6)
+    without, beside = fit_weights(some).by_channel, fit_weights(with_lonely(some)).by_channel
+    assert [beside[c] for c in "hv"] == pytest.approx([without[c] for c in "hv"])
+
+
+def test_a_material_of_two_scans_among_many_is_judged():
+    """However the scans fall into folds."""
+    assert score(with_lonely(drawn(13, scans=20, pixels=3), scans=2), DISCRIMINANT).not_judged == ()
+
+
+def test_scans_without_a_common_material_are_refused():
+    samples = drawn(14, scans=5)
+    apart = samples.take(np.char.lstrip(samples.names, "m") == np.char.lstrip(samples.groups, "s"))
+    with pytest.raises(DataError, match="no material is in two of the 5 scans"):
+        score(apart, DISCRIMINANT)
+
+
+def test_the_report_and_the_table_of_models_name_what_was_not_judged(tmp_path, monkeypatch, capsys):
+    samples = with_lonely(drawn(12, scans=3, pixels=4))
+    entries = []
+    for patch in np.unique(samples.patches):
+        at = samples.patches == patch
+        h, v, q = samples.x[at, 0], samples.x[at, 1], samples.x[at, 2] + 1j * samples.x[at, 3]
+        (name, *_), (scan, *_) = samples.names[at], samples.groups[at]
+        plain = (h.astype(np.float32), v.astype(np.float32), (1 / q).astype(np.complex64))
+        entries.append(Entry(str(name), str(scan), *plain, 55.0, True))
+    fit = {"model": DISCRIMINANT, "judged": {DISCRIMINANT: {"pixels": 1.0, "patches": 1.0}}}
+    library = Library(tuple(entries), {**fit, "materials": 6, "not_judged": ["lonely"]})
+    told = classifier_sentence(Classifier(library))
+    assert "Of its 6 materials 1 could not be judged, because one scan alone holds them: lonely." in told
+    library.save(tmp_path / "library.npz")
+    monkeypatch.setattr("host.materials.models.MODELS", {DISCRIMINANT: MODELS[DISCRIMINANT]})
+    assert main(["classify", str(tmp_path / "library.npz")]) == 0
+    assert "not judged with scans left out, because one scan alone holds them: lonely" in capsys.readouterr().out

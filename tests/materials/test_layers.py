@@ -1,5 +1,6 @@
 """A layer within a stack: what was put in comes back, error bars tell the truth, ambiguity is said."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.materials.layers import Bands, Layer, Spectrum, fit_layer, predict
+from host.materials.layers import Bands, Layer, LayerFit, Spectrum, fit_layer, predict
 from host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 from shared.config import load_instrument
 from shared.errors import DataError, PolysightError
@@ -134,3 +135,25 @@ def test_fewer_data_than_unknowns_are_refused():
     bands = measured([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.of(CHIRP, 1))
     with pytest.raises(DataError, match="2 numbers for 3 unknowns"):
         fit_layer(bands, [Layer("sheet", None, 1e-3)], THETA, (0.5e-3, 2e-3))
+
+
+def test_a_solution_at_the_end_of_what_is_looked_for_says_so():
+    beyond = fit_layer(measured([Layer("dense", 60 - 2j)]), [Layer("dense")], THETA)
+    assert any("at the limit" in words for words in beyond.warnings())
+    lossless = fit_layer(measured([Layer("clear", 4 - 0j)]), [Layer("clear")], THETA)
+    assert not any("at the limit" in words for words in lossless.warnings())  # no loss is an answer
+
+
+def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept():
+    fit = LayerFit(4 - 0.4j, 3e-3, 0.03, 0.03, 0.0, 24.4, 7)  # probability 0.97e-3
+    assert any("does not explain" in words for words in fit.warnings())
+    assert not any("does not explain" in words for words in replace(fit, chi2=24.0).warnings())
+    # Two sheets that the data tell apart only as far as the model fits them.
+    sheet = [Layer("sheet", 4 - 0.1j, 3e-3)]
+    q, _ = predict(sheet, BANDS, THETA)
+    stiff = fit_layer(Bands(BANDS, q * 1.08, np.full(q.size, 0.02)), [Layer("sheet", None, 3e-3)], THETA)
+    loose = fit_layer(Bands(BANDS, q * 1.08, np.full(q.size, 0.002)), [Layer("sheet", None, 3e-3)], THETA)
+    assert stiff.stretch == 1
+    assert loose.stretch > 2
+    assert loose.rivals[0].chi2 - loose.chi2 > 9  # kept all the same
+    assert loose.rivals[0].permittivity == pytest.approx(stiff.rivals[0].permittivity, rel=1e-3)

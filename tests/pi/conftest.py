@@ -18,7 +18,8 @@ from host_side import HostSide
 from mini_hub import MiniHub
 
 from pi_controller.service import Options, Service
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
+from shared.tables import to_builtins
 
 ROOT = Path(__file__).parents[2]
 

@@ -18,7 +18,14 @@ PI = ROOT / "pi_controller"
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
 # Stands for a command that would change this machine; what it was asked is kept.
 STUB = '#!/bin/sh\necho "$(basename "$0") $*" >> "$LOG"\n'
-STUB_PYTHON = STUB + 'if [ "$2" = venv ]; then mkdir -p "$3/bin"; cp "$PIP" "$3/bin/pip"; fi\n'
+STUBS = {
+    **dict.fromkeys(("groupadd", "useradd", "udevadm", "systemctl", "chown", "pip"), STUB),
+    "getent": STUB + "exit 2\n",
+    "python3": STUB + 'if [ "$2" = venv ]; then mkdir -p "$3/bin"; cp "$PIP" "$3/bin/pip"; fi\n',
+    "python": STUB + 'mkdir -p "$7"; touch "$7/a.whl"\n',  # -m pip wheel --quiet --no-deps --wheel-dir FOLDER
+    "ssh": STUB + '[ "$1" = -t ] && shift; shift; cd "$PI_HOME" && sh -c "$*"\n',  # the Pi is a folder here
+    "sudo": STUB + '"$@"\n',
+}
 
 
 @pytest.fixture
@@ -62,30 +69,59 @@ def test_udev_rules_are_well_formed():
         assert re.fullmatch(rf"{pair}(, {pair})*", line), line
 
 
-def test_installing_twice_keeps_the_rig_file(tmp_path):
-    """The script in another root, with every command that changes a machine replaced."""
-    commands, log, root = tmp_path / "bin", tmp_path / "log", tmp_path / "root"
-    commands.mkdir()
-    for name in ("getent", "groupadd", "useradd", "udevadm", "systemctl", "chown", "pip"):
-        (commands / name).write_text(STUB + ("exit 2\n" if name == "getent" else ""))
-    (commands / "python3").write_text(STUB_PYTHON)
-    for path in commands.iterdir():
-        path.chmod(0o755)
-    environment = {
-        **os.environ, "PATH": f"{commands}:{os.environ['PATH']}", "LOG": str(log), "PIP": str(commands / "pip"),
-        "ROOT": str(root),
+@pytest.fixture
+def bench(tmp_path):
+    """Commands that change nothing outside the test's folder, and the environment in which they are found."""
+    for name in ("bin", "home/polysight", "root"):
+        (tmp_path / name).mkdir(parents=True)
+    for name, text in STUBS.items():
+        (tmp_path / "bin" / name).write_text(text)
+        (tmp_path / "bin" / name).chmod(0o755)
+    (tmp_path / "installed").touch()
+    return {
+        **os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "LOG": str(tmp_path / "log"),
+        "PIP": str(tmp_path / "bin/pip"), "ROOT": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
     }  # fmt: skip
+
+
+def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_home(bench, tmp_path):
+    """`make pi-install` as a whole, with every command that changes a machine replaced."""
+    root, log = tmp_path / "root", tmp_path / "log"
+    (tmp_path / "home/polysight/notes").write_text("mine")
+    make = [
+        "make",
+        "pi-install",
+        "HOST=pi@here",
+        f"VENV={tmp_path}",
+        f"BIN={tmp_path / 'bin'}",
+        f"OUT={tmp_path / 'out'}",
+    ]
     for rig_file in (None, "mine"):
         if rig_file:
             (root / "etc/polysight/instrument.toml").write_text(rig_file)
-        done = subprocess.run([PI / "install.sh"], env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
+            log.unlink()
+        done = subprocess.run(make, cwd=ROOT, env=bench, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        asked = log.read_text()
+        assert asked.count("-m venv") == (rig_file is None), "made once, and kept with its libraries"
+        order = [
+            asked.index(w) for w in ("pip wheel", "pip install --quiet --retries", "--force-reinstall", "try-restart")
+        ]
+        assert order == sorted(order)
+        assert "--no-index" in asked, "what was built on the host needs no internet here"
+    assert (tmp_path / "home/polysight/notes").read_text() == "mine"
     assert (root / "etc/polysight/instrument.toml").read_text() == "mine"
     assert (root / "etc/polysight/keys").stat().st_mode & 0o777 == 0o700
     for name in ("etc/systemd/system/polysight-pi.service", "etc/udev/rules.d/60-polysight.rules"):
         assert (root / name).read_text() == (PI / Path(name).name).read_text()
-    asked = log.read_text()
     assert "--groups gpio,dialout" in asked, "by hand, `polysight-pi check` as this user has no group from the unit"
-    for words in ("useradd --system", f"venv {root}/opt/polysight/venv", f"{ROOT}/pi_controller", "systemctl enable"):
+    for words in ("useradd --system", "systemctl enable"):
         assert words in asked
     assert PROGRAM in done.stdout
+
+
+def test_a_pi_that_lacks_a_library_and_the_internet_is_told_so(bench, tmp_path):
+    (tmp_path / "bin/pip").write_text(STUB + "exit 1\n")
+    done = subprocess.run([PI / "install.sh"], env=bench, capture_output=True, text=True, check=False)
+    assert (done.returncode, "to the internet once" in done.stderr) == (5, True)
+    assert "systemctl" not in (tmp_path / "log").read_text(), "what runs goes on as it was"

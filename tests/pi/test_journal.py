@@ -2,14 +2,25 @@
 
 import errno
 import os
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pi_controller import journal as journal_module
-from pi_controller.journal import MAGIC, Journal, JournalFolder, JournalFullError
+from pi_controller.journal import (
+    CAPTURE_BYTES,
+    DAMAGED,
+    MAGIC,
+    SPARE_BYTES,
+    Journal,
+    JournalFolder,
+    JournalFullError,
+)
+from pi_controller.ledger import Ledger
 from shared.errors import ConfigError, DataError, DeviceError
+from shared.raster import RasterPlan
 
 payloads = st.lists(st.binary(max_size=40), max_size=12)
 
@@ -162,3 +173,58 @@ def test_what_a_power_cut_leaves_of_a_new_journal_is_an_empty_one(tmp_path, left
     assert j.append(b"x") == 1
     j.close()
     assert reopened(path) == [b"x"]
+
+
+def test_damage_in_the_middle_is_told_and_the_file_as_it_was_is_kept(tmp_path):
+    path = tmp_path / "a.journal"
+    raw = bytearray(written(path, [b"one", b"two", b"three", b"four"]))
+    at = raw.index(b"two")
+    for number in ("", "2"):  # a second damage does not replace the first one's copy
+        raw[at] ^= 1
+        path.write_bytes(raw)
+        j = Journal(path)
+        copy = path.with_name(path.name + DAMAGED + number)
+        assert (j.last_seq, j.read(1, 9), copy.read_bytes()) == (1, [b"one"], bytes(raw))
+        assert str(copy) in j.damage
+        j.close()
+        raw[at] ^= 1
+        at = raw.index(b"two") + 1
+
+
+@given(records=st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=6), data=st.data())
+@settings(max_examples=40, deadline=None)
+def test_what_a_power_cut_leaves_is_no_damage(tmp_path_factory, records, data):
+    path = tmp_path_factory.mktemp("j") / "a.journal"
+    raw = written(path, records)
+    path.write_bytes(raw[: data.draw(st.integers(0, len(raw)))] + bytes(data.draw(st.sampled_from([0, 1, 4096]))))
+    j = Journal(path)
+    assert j.damage == ""
+    j.close()
+    assert not list(path.parent.glob("*" + DAMAGED + "*"))
+
+
+def test_a_damaged_journal_is_a_line_of_the_log(tmp_path):
+    folder = JournalFolder(tmp_path)
+    said: list[str] = []
+    ledger = Ledger(folder, lambda _: None, said.append)
+    ledger.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    ledger.close()
+    path = folder.path_of("s")
+    raw = written(path, [b"one", b"two", b"three"]).replace(b"one", b"0ne")
+    path.write_bytes(raw)
+    ledger.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    assert len(said) == 1, "the log has a line of it"
+    assert DAMAGED in said[0]
+    ledger.close()
+    folder.close()
+
+
+def test_no_scan_begins_without_room_for_its_journal(tmp_path, monkeypatch):
+    folder = JournalFolder(tmp_path)
+    folder.check_room(70_000)
+    free = SPARE_BYTES + 70_000 * CAPTURE_BYTES
+    monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    folder.check_room(70_000)
+    with pytest.raises(JournalFullError, match=r"26\.6 MB free, 26\.6 MB needed for 70001 positions"):
+        folder.check_room(70_001)
+    folder.close()

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pi_controller.burst import BurstSpec
 from pi_controller.machine import Machine
+from pi_controller.row_ending import Parts
 from pi_controller.rows import RefusedError
 from pi_controller.stage_driver import SILENT_HEARTBEATS, STATUS_PER_HEARTBEAT, read_slice_s
 from pi_controller.states import MOVES
@@ -73,8 +74,8 @@ class Bench:
         self.lines, self.stage, self.ledger = FakeLines(), FakeDriver(), FakeLedger()
         self.posted: list[Any] = []
         self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
-        parts: Any = (self.stage, self.loop, self.ledger, self.posted.append, lambda _: None)
-        self.machine = Machine(*parts, clock=lambda: self.t)
+        parts: Any = (self.stage, self.loop, self.ledger, self.posted.append, lambda _: None, lambda: self.t)
+        self.machine = Machine(Parts(*parts))
         self.seqno = 0
 
     def run_posted(self) -> None:

@@ -1,19 +1,12 @@
 """The Pi half as the host sees it: real ZeroMQ, a pty, simulated wires."""
 
-import errno
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
 import pytest
-import zmq
 from host_side import HostSide
-from zmq.auth import load_certificate
 
 from host.scan.heartbeat import HostHeartbeat
-from pi_controller import journal as journal_module
-from pi_controller.keys import make_keys
-from pi_controller.server import Server
 from pi_controller.service import Options, Service
 from shared import messages as m
 from shared.errors import DeviceError
@@ -320,33 +313,6 @@ def test_replay_from_any_sequence(pi):
     assert (beat.scan_id, beat.state) == ("scan", "ready")
 
 
-def test_a_full_disk_stops_the_row_and_is_told(pi, stage, monkeypatch):
-    host = pi.host
-    host.accepted(host.begin())
-    host.home()
-    stage.pace_s = 0.03
-    host.accepted(m.RunRow(scan_id="scan", row_index=0, take=1))
-    good = host.wait(m.Capture).seq
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(journal_module.os, "pwrite", full)
-    fault = host.wait(m.Fault)
-    done = host.wait(m.RowFinished)
-    monkeypatch.undo()
-    assert fault.number == done.fault == PiFault.JOURNAL_FULL
-    assert done.status == "fault"
-    assert host.until_state("fault").fault == PiFault.JOURNAL_FULL
-    last = host.ask(m.Hello()).last_seq
-    assert fault.seq == done.seq == last >= good
-    host.home()
-    stage.pace_s = 0.0
-    assert host.row(0, take=2).status == "done"
-    kept = host.replay()
-    assert [e.seq for e in kept] == list(range(1, len(kept) + 1))
-
-
 def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(instrument, stage, hub, monkeypatch):
     def fail(*_):
         raise ZeroDivisionError("a bug")
@@ -366,41 +332,3 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(inst
     service.close()
     assert not service._loop._lines._active
     host.close()
-
-
-@pytest.mark.parametrize("right", [True, False])
-def test_curve_lets_in_who_knows_the_key(tmp_path, right):
-    make_keys(tmp_path / "keys")
-    make_keys(tmp_path / "other")
-    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 500, "wires")
-    context = zmq.Context()
-    client = context.socket(zmq.REQ)
-    client.curve_publickey, client.curve_secretkey = load_certificate(tmp_path / "keys" / "host.key_secret")
-    client.curve_serverkey = load_certificate(tmp_path / ("keys" if right else "other") / "pi.key")[0]
-    client.connect(server.command_address.replace("0.0.0.0", "127.0.0.1"))
-    client.send(b"x", zmq.NOBLOCK)
-    assert bool(server._commands.poll(5000 if right else 300)) == right
-    context.destroy(linger=0)
-    server.close()
-
-
-@pytest.mark.parametrize("right", [True, False])
-def test_curve_lets_hear_who_knows_the_key(tmp_path, right):
-    make_keys(tmp_path / "keys")
-    make_keys(tmp_path / "other")
-    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 500, "wires")
-    context = zmq.Context()
-    listener = context.socket(zmq.SUB)
-    listener.subscribe(b"")
-    listener.curve_publickey, listener.curve_secretkey = load_certificate(tmp_path / "keys" / "host.key_secret")
-    listener.curve_serverkey = load_certificate(tmp_path / ("keys" if right else "other") / "pi.key")[0]
-    listener.connect(server.event_address.replace("0.0.0.0", "127.0.0.1"))
-    heard = False
-    for _ in range(600 if right else 10):  # until the subscription has arrived
-        server.publish([b"event"])
-        server.drain()
-        if heard := bool(listener.poll(50)):
-            break
-    assert heard == right
-    context.destroy(linger=0)
-    server.close()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import tomllib
 
 import pytest
+import tomli_w
 
 from host.cli import main
 
@@ -35,6 +37,28 @@ def test_a_plan_that_would_be_refused_says_so_and_fails(capsys):
 def test_what_breaks_the_rig_file_is_one_message(capsys):
     assert main(["plan", *RIG, "--width-mm", "5000"]) == 2
     assert "does not fit the travel" in capsys.readouterr().err
+
+
+def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
+    """Put into the rig file as they are printed, they give the plan's own figures, and nothing is left to ask for."""
+    asked = [*SMALL, "--accel-mm-s2", "345", "--object-distance-mm", "480", "--width-mm", "120"]
+    minutes = ["--minutes", "3", "--count", "1"]
+    assert main(["plan", *RIG, *asked, *minutes]) == 0
+    lines = capsys.readouterr().out.rpartition("rig file, all that differ:\n\n")[2]
+    assert "Pi's rig file too" in lines
+    assert main(["plan", *RIG, *asked, *minutes, "--json"]) == 0
+    proposed = json.loads(capsys.readouterr().out)["plans"][0]
+    table = tomllib.loads((REPO / "instrument.toml").read_text())
+    changed = tomllib.loads(lines)
+    for section, keys in changed.items():
+        assert all(table[section].get(key) != value for key, value in keys.items())
+        table[section] |= keys
+    (tmp_path / "rig.toml").write_text(tomli_w.dumps(table))
+    assert {"accel_mm_s2", "speed_mm_s"} <= set(changed["stage"])
+    assert changed["geometry"] == {"object_distance_mm": 480.0}
+    rig = ["--config", str(tmp_path / "rig.toml")]
+    assert main(["plan", *rig, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == proposed
 
 
 def test_no_plan_within_the_time(capsys):

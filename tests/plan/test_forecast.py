@@ -127,7 +127,6 @@ def test_the_published_plan_is_possible_and_takes_two_hours(rig):
     [
         (Changes(speed_mm_s=100.0), "burst", "too fast for the burst", True),
         (Changes(speed_mm_s=120.0, pulses=2), "speed", "at most 100 mm/s", True),
-        (Changes(speed_mm_s=100.0, pulses=2, width_mm=760.0), "run-up", "narrow the grid", True),
         (Changes(step_x_mm=2.001, pulses=2), "step x", "not whole", True),
         (Changes(step_y_mm=8.0), "aliasing", "in y, steps of 8 mm", False),
         (Changes(height_mm=200.0), "aperture", "flat plates are mirrors", False),
@@ -144,6 +143,11 @@ def test_what_is_wrong_is_said_in_words(rig, changes, topic, words, refused):
     assert len(found) == 1, told
     assert found[0].refused is refused
     assert [w.refused for w in told] == sorted((w.refused for w in told), reverse=True)
+
+
+def test_rows_without_room_to_speed_up_are_refused_by_the_rig_files_own_rule(rig):
+    with pytest.raises(ConfigError, match=r"with 27 mm of run-up on either side.*narrow the grid"):
+        Changes(speed_mm_s=100.0, pulses=2, width_mm=760.0).apply(rig)
 
 
 def test_proposals_keep_the_time_and_nothing_refuses_them(rig):

@@ -15,9 +15,10 @@ from host.plan.measured import noise_of, row_overhead_of
 from host.plan.timing import row_motion_s, scan_time, turn_s, whole_packets
 from host.store.events import read_events
 from host.store.scanfolder import EVENTS, ScanFolder
-from shared.config import load_instrument, to_builtins
+from shared.config import load_instrument
 from shared.errors import DataError
 from shared.messages import Capture
+from shared.tables import to_builtins
 from simulators.scene import decode_scene
 from simulators.simulate import simulate
 

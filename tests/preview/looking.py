@@ -66,16 +66,16 @@ class GrowingScan:
 
 
 class Served:
-    """A live view on a port of loopback that is free."""
+    """A live view: on a port of loopback that is free, or where it is told to be."""
 
-    def __init__(self, watch: Watch, token: str, port: int = 0) -> None:
-        self._server = server(make_app(watch, token, loopback=True))
-        self._server.config.port = port
+    def __init__(self, watch: Watch, token: str, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._server = server(make_app(watch, token, loopback=host == "127.0.0.1"))
+        self._server.config.host, self._server.config.port = host, port
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
         wait_for(lambda: self._server.started, "the server serves")
         self.port = int(self._server.servers[0].sockets[0].getsockname()[1])
-        self.address = f"http://127.0.0.1:{self.port}"
+        self.address = f"http://{host}:{self.port}"
 
     def close(self) -> None:
         """End it."""
@@ -85,9 +85,9 @@ class Served:
 
 
 @contextmanager
-def served(watch: Watch, token: str = "", port: int = 0) -> Iterator[Served]:
+def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0) -> Iterator[Served]:
     """A server for the block."""
-    made = Served(watch, token, port)
+    made = Served(watch, token, host, port)
     try:
         yield made
     finally:

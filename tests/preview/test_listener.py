@@ -107,7 +107,7 @@ def test_without_keys_the_view_is_deaf_and_says_so(tmp_path):
     instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **elsewhere))
     listener = PiListener(instrument, "mine")
     wait_for(lambda: listener.heard.deaf, "why nothing is heard")
-    assert "polysight-pi keys" in listener.heard.deaf.do
+    assert str(tmp_path) in listener.heard.deaf.do, "where they belong"
     listener.close()
 
 

@@ -11,7 +11,10 @@ from looking import LIMIT_S, GrowingScan, served, wait_for
 
 from host.scan.control import ALIVE, CONTROL, ControlDesk
 from host.scan.stop import StopRequest
+from shared.config import load_instrument
+from simulators.loopback import on_free_subnet
 
+REPO = Path(__file__).resolve().parents[2]
 TOKEN = "0123456789"
 PICTURES = "[...document.querySelectorAll('.view img')]"
 pytestmark = pytest.mark.xdist_group("browser")
@@ -106,20 +109,22 @@ def test_a_wrong_token_is_said(browser, growing, watching):
 
 
 def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, watching):
+    """At an address of its own: a port of 127.0.0.1 that was free for a while may be somebody else's by then."""
+    rig = on_free_subnet(load_instrument(REPO / "instrument.toml"))
+    host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
     watch = watching(finished)
-    with served(watch) as view:
+    with served(watch, host=host, port=int(port)) as view:
         opened(browser, view)
-        port = view.port
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
     assert "lost" in browser.text("headline")
     time.sleep(0.5)  # some of its attempts to come back fail
-    with served(watch, port=port):
+    with served(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")
         browser.wait("document.getElementById('headline').innerText == 'The scan is finished'", "the state")
 
 
 def test_how_to_shows_pictures_that_are_there():
-    docs = Path(__file__).resolve().parents[2] / "docs"
+    docs = REPO / "docs"
     page = (docs / "how-to/live-view.md").read_text(encoding="utf-8")
     assert "../images/preview.png" in page
     assert (docs / "images/preview.png").exists()

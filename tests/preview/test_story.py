@@ -100,7 +100,7 @@ def test_rejected_then_committed_leaves_a_warning(begun):
     story, last = begun
     story.add_fact(
         {"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {},
-         "rejected_utc": UTC.format(2, 30)}
+         "faults": [{"kind": "no_data", "board": "RV"}], "rejected_utc": UTC.format(2, 30)}
     )  # fmt: skip
     assert story.marks[2] == "rejected"
     assert story.boards["RV"].retaken == 1
@@ -109,6 +109,13 @@ def test_rejected_then_committed_leaves_a_warning(begun):
     story.add_fact(last)
     assert story.marks[2] == "committed"
     assert len(story.notices) == 1
+
+
+def test_rejections_of_earlier_releases_are_told_without_a_cause(begun):
+    story, _ = begun
+    story.add_fact({"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}})
+    assert (story.marks[2], story.notices[-1].detail) == ("rejected", "RV: no data")
+    assert (story.notices[-1].why, story.boards["RV"].retaken) == ("", 0)
 
 
 def test_withdrawn_is_missing_until_taken_again(begun):

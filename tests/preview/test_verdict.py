@@ -22,6 +22,7 @@ FOLDER = Path("scans/one")
 LIVELY = Signs(alive=True, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)
 RUNNING = Heard(heard_s=1.0, state="running", row=1, take=1)
 REJECTED = {"fact": "row_rejected", "row": 1, "take": 1, "reasons": ["RV: no data"], "boards": {}}
+REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
 
 
 @pytest.fixture

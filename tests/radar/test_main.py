@@ -11,7 +11,7 @@ import tomli_w
 from host.radar.__main__ import main
 from host.radar.messages import decode
 from host.radar.program import program
-from shared.config import to_builtins
+from shared.tables import to_builtins
 
 
 @pytest.fixture

@@ -11,8 +11,9 @@ from host.radar.backends import radar_control
 from host.radar.interface import RadarState
 from host.radar.native import NativeRadars
 from host.store.manifest import decode_line, encode_line
-from shared.config import Instrument, NativeRadar, Radar, decode, to_builtins
+from shared.config import Instrument, NativeRadar, Radar
 from shared.errors import ConfigError, DeviceError
+from shared.tables import decode, to_builtins
 from simulators.radar_board import RadarBoard
 from simulators.radar_usb import UsbChip
 from tests.radar.conftest import BoardWords

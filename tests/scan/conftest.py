@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import random
 import socket
 import struct
 import threading
@@ -16,8 +15,10 @@ import pytest
 import zmq
 
 from shared import messages as m
-from shared.config import Board, Instrument, decode, load_instrument, to_builtins
+from shared.config import Board, Instrument, load_instrument
 from shared.raster import Row
+from shared.tables import decode, to_builtins
+from simulators.loopback import on_free_subnet
 
 REPO = Path(__file__).resolve().parents[2]
 FULL = 1456
@@ -48,6 +49,7 @@ class FakeCard:
         self.drop: dict[tuple[int, int], set[int]] = {}
         self.short: dict[tuple[int, int], int] = {}
         self.missed: dict[tuple[int, int], set[int]] = {}  # pulses, of rows that are sent at their pace
+        self.extra: dict[tuple[int, int], int] = {}  # before this pulse an edge nobody sent; frames are counted
         self._rest = b""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -69,7 +71,10 @@ class FakeCard:
 
     def send_frame(self, row: int, take: int, slot: int, frame_bytes: int) -> None:
         """The frame of one pulse, unless the radar missed it; packets leave as they fill."""
-        if slot not in self.missed.get((row, take), ()):
+        extra, last = self.extra.get((row, take)), slot == self.row_bytes // frame_bytes - 1
+        if slot == extra:
+            self._rest += bytes(frame_bytes)
+        if slot not in self.missed.get((row, take), ()) and not (last and extra is not None):
             data = payload_of(self.board.name, row, self.row_bytes)
             self._rest += data[slot * frame_bytes : (slot + 1) * frame_bytes]
         while len(self._rest) >= FULL:
@@ -117,12 +122,14 @@ class FakePi:
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
         self.rig, self.cards = rig, cards
         self.journal: dict[str, list[m.AnyEvent]] = {}
+        self.stage = rig.stage.placing  # what Hello tells; {}: nothing, as older releases
         self.homed = False
         self.run: m.BeginRun | None = None
         self.state: m.State = "idle"
         self.lose_events = 0  # leave out so many events of PUB
         self.lose_replies = 0
         self.fail_rows: dict[tuple[int, int], int] = {}  # (row, take): fault number
+        self.fault, self.latched = 0, ""  # what Status tells of the first fault: number and reason
         self.hang_at: set[int] = set()  # rows that never end; half of their data is sent
         self.paced = False  # frames are sent at the times of their pulses
         self.hang_after_captures = False  # such rows send their bursts before they hang
@@ -130,6 +137,7 @@ class FakePi:
         self.wanted_end = False  # the hanging row shall end well
         self.commands: list[m.AnyCommand] = []
         self.rows_run: list[tuple[int, int]] = []
+        self._ran: set[tuple[int, int]] = set()  # since the last BeginRun
         self.hanging: tuple[Row, int] | None = None
         self.context = zmq.Context()
         self.rep = self.context.socket(zmq.ROUTER)  # unlike REP it may leave a request without a reply
@@ -184,25 +192,30 @@ class FakePi:
         last = len(self.journal.get(scan, []))
         if isinstance(c, m.Hello):
             return m.HelloReply(
-                pi_release="t", firmware="t", backend="fake", state=self.state, scan_id=scan, last_seq=last
-            )
+                pi_release="t", firmware="t", backend="fake", state=self.state, scan_id=scan, last_seq=last,
+                stage=self.stage,
+            )  # fmt: skip
         if isinstance(c, m.Status):
             return m.StatusReply(
                 state=self.state, homed=self.homed, x_mm=0, y_mm=0, scan_id=scan, row_index=-1, take=0, points=0,
-                pulses=0, last_seq=last, fault=0, reason="",
+                pulses=0, last_seq=last, fault=self.fault, reason=self.latched,
             )  # fmt: skip
+        if isinstance(c, m.EndRun) and (self.hanging is not None or self.run is None):
+            return m.Refused(number=111, what="a row is running" if self.run else "no run is begun")
         if isinstance(c, m.BeginRun):
-            self.run = c
+            self.run, self._ran = c, set()
             self._emit(m.RunStarted, plan=c.plan, resumed=bool(self.journal.get(c.scan_id)))
         elif isinstance(c, m.EndRun):
             self._emit(m.RunStopped, exit_status=c.exit_status, reason=c.reason)
         elif isinstance(c, m.Home):
-            self.homed, self.state = True, "ready"
+            self.homed, self.state, self.fault, self.latched = True, "ready", 0, ""
         elif isinstance(c, m.Replay):
             events = self.journal.get(c.scan_id, [])
-            return m.ReplayReply(events=events[c.from_seq - 1 : c.from_seq - 1 + c.limit], last_seq=len(events))
+            few = events[c.from_seq - 1 :][: min(c.limit, 3)]  # never more than a few, as of a Pi whose row runs
+            return m.ReplayReply(events=few, last_seq=len(events))
         elif isinstance(c, m.RunRow):
-            if (c.row_index, c.take) not in self.rows_run:
+            if (c.row_index, c.take) not in self._ran:  # else a repeated request
+                self._ran.add((c.row_index, c.take))
                 self.rows_run.append((c.row_index, c.take))
                 self._todo = c
         elif isinstance(c, m.Abort) and self.hanging is not None:
@@ -236,6 +249,8 @@ class FakePi:
                 card.send_row(row.index, c.take)
         fault = self.fail_rows.get((c.row_index, c.take), 0)
         n = row.points
+        if fault in (101, 102, 107, 109):  # lasting ones
+            self.fault, self.state, self.homed = fault, "fault", fault in (107, 109)
         self._emit(
             m.RowFinished, row_index=row.index, take=c.take, status="fault" if fault else "done", points=n, edges=n,
             bursts=n, pulses=n * self.run.pulses, fault=fault, reason=self.notes.get((c.row_index, c.take), ""),
@@ -308,18 +323,13 @@ class FakeRig:
 
 
 def small_instrument(**limits: float) -> Instrument:
-    """The published rig with a grid of 3 x 4 points and 3 pulses, on a random loopback subnet."""
+    """The published rig with a grid of 3 x 4 points and 3 pulses, on a loopback subnet that is free."""
     raw = to_builtins(load_instrument(REPO / "instrument.toml"))
-    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
     raw["grid"] |= {"columns": 3, "rows": 4}
     raw["burst"] |= {"pulses": 3}
     raw["limits"] |= {"end_of_record_s": 0.25, "command_timeout_s": 1.5, "free_disk_bytes": 0, **limits}
     raw["card"]["receive_buffer_bytes"] = 1 << 20
-    for board in raw["boards"]:
-        board["host_address"] = f"{subnet}.30"
-        board["card_address"] = f"{subnet}.{board['card_address'].rpartition('.')[2]}"
-    raw["pi"] |= {"command_address": f"tcp://{subnet}.10:5601", "event_address": f"tcp://{subnet}.10:5602"}
-    return decode(raw, Instrument, "test")
+    return on_free_subnet(decode(raw, Instrument, "test"))
 
 
 @pytest.fixture

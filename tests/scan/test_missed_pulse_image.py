@@ -14,29 +14,12 @@ from host.store.source import RowData
 from shared.config import load_instrument
 from simulators.scene import load_scene
 from simulators.simulate import simulate
+from tests.small_scene import small_scene
 
 from .arrival_model import PAYLOAD, Load, pulse_times, receive
 
 REPO = Path(__file__).resolve().parents[2]
-SCENE = """name = "a metal plate"
-seed = 3
-[grid]
-columns = 24
-rows = 10
-step_x_mm = 5.0
-step_y_mm = 10.0
-[burst]
-pulses = 6
-[image]
-columns = 24
-rows = 24
-pixel_mm = 5.0
-[[plates]]
-name = "copper"
-centre_mm = [0.0, 0.0]
-size_mm = [60.0, 60.0]
-metal = true
-"""
+SCENE = small_scene(24, 10, step_mm=(5.0, 10.0), pulses=6, pixels=24, pixel_mm=5.0)
 
 
 class Missed:

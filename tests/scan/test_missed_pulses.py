@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import random
 import socket
 import struct
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 
 from host.capture.receiver import ReceiverProcess
 from host.capture.segment import read_index, write_index
-from host.scan.missed_pulses import PlacedFrames, place_frames
+from host.scan.missed_pulses import PlacedFrames, place_frames, slipped_frames
 from host.scan.slipped_row import describe, write_in_place
-from shared.config import Board
 
 from .arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
 
@@ -169,11 +168,24 @@ def _burn(stop) -> None:
 
 
 @pytest.mark.parametrize("burners", [0, 4])
-def test_real_sockets_on_this_machine_idle_and_overloaded(tmp_path, burners):
-    """Frames sent at their pulses' times, some left out, into a real receiver: right or masked, whatever the load."""
-    subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
-    board = Board("RH", "receive_h", f"{subnet}.181", f"{subnet}.30", 4200, 4201, ())
-    bursts, path = 8, tmp_path / "0000.part"
+def test_real_sockets_on_this_machine_idle_and_overloaded(make_instrument, tmp_path, burners):
+    """Frames sent at their pulses' times, some left out, into a real receiver: right or masked, whatever the load.
+
+    A machine too busy to tell masks the whole row; where nothing burns here, one of many rows is told.
+    """
+    tries, told = 1 if burners else 40, False
+    for number in range(tries):
+        (tmp_path / str(number)).mkdir()
+        told = _placed_or_masked(make_instrument, tmp_path / str(number), burners)
+        if told:
+            break
+    assert told or burners, f"not one of {tries} rows was told"
+
+
+def _placed_or_masked(make_instrument, folder: Path, burners: int) -> bool:
+    """Sends one row, and checks what is made of it; whether its frames were told apart."""
+    board = make_instrument().by_role("receive_h")
+    bursts, path = 8, folder / "0000.part"
     missed = [5, 37, 38, 100]
     stop = multiprocessing.Event()
     others = [multiprocessing.Process(target=_burn, args=(stop,), daemon=True) for _ in range(burners)]
@@ -198,14 +210,16 @@ def test_real_sockets_on_this_machine_idle_and_overloaded(tmp_path, burners):
     truth = np.delete(np.arange(bursts * PULSES), missed)
     check(result, truth, set(missed))
     assert result.slots.size == truth.size
-    if result.reason:
-        return  # too busy to tell; the row would be masked as a whole
+    if result.reason:  # too busy to tell
+        assert (result.slots == -1).all()
+        return False
     moved = write_in_place(path, row, result, FRAME)
     got = np.fromfile(path, dtype="<u4").reshape(-1, FRAME // 4)[:, 0]
     sure = result.slots[result.slots >= 0]
     np.testing.assert_array_equal(got[sure], sure + 1)
     assert moved.missing_bytes == (bursts * PULSES - sure.size) * FRAME
     json.dumps(moved.missing)
+    return True
 
 
 def _play(out: socket.socket, to: tuple[str, int], pulses: np.ndarray, missed: list[int]) -> np.ndarray:
@@ -224,3 +238,53 @@ def _play(out: socket.socket, to: tuple[str, int], pulses: np.ndarray, missed: l
             told.append(time.monotonic_ns())
     out.sendto(struct.pack("<IIH", sequence, sent & 0xFFFFFFFF, sent >> 32) + rest, to)
     return np.array(told, dtype=np.int64)
+
+
+def arrivals_of(edges: np.ndarray, pulses: np.ndarray, load: Load, seed: int, drift: float = 0.0):
+    """Arrivals and event times of a row whose radar takes these edges (int64, Pi's clock) for its pulses."""
+    counted = edges[: pulses.size].reshape(pulses.shape)
+    rng = np.random.default_rng(seed)
+    arrivals, _ = receive(counted, [], FRAME, rng, load, drift)
+    rng = np.random.default_rng(seed)  # the same offset
+    _, told = receive(pulses, [], FRAME, rng, load, drift)
+    return arrivals, told
+
+
+@settings(max_examples=40, derandomize=True)
+@given(loads, st.integers(0, 2**32), st.sampled_from([0.0, 50e-6, -50e-6]))
+def test_whole_row_is_never_taken_for_a_slipped_one(load, seed, drift):
+    pulses = pulse_times(BURSTS)
+    arrivals, told = arrivals_of(pulses.reshape(-1), pulses, load, seed, drift)
+    assert slipped_frames(pulses, told, arrivals, FRAME, PAYLOAD) is None
+
+
+@settings(max_examples=40, derandomize=True)
+@given(
+    st.integers(0, BURSTS - 3), st.integers(2, 60), st.integers(0, 2**32), st.sampled_from([0.0, 50e-6, -50e-6]),
+    st.booleans(),
+)  # fmt: skip
+def test_one_edge_too_many_is_found_and_frames_are_at_their_pulses_or_masked(burst, ms, seed, drift, missed):
+    """In a burst or the pause behind it; alone, or after a pulse that was missed two bursts before."""
+    pulses = pulse_times(BURSTS)
+    extra = pulses[burst, 0] + ms * MS + 300 * US
+    edges = pulses.reshape(-1)
+    truth = np.arange(ALL)
+    if missed and burst >= 3:
+        gone = (burst - 3) * PULSES + 5
+        edges, truth = np.delete(edges, gone), np.delete(truth, gone)
+    at = int(np.searchsorted(edges, extra))
+    edges, truth = np.insert(edges, at, extra)[:ALL], np.insert(truth, at, -2)[:ALL]
+    arrivals, told = arrivals_of(edges, pulses, QUIET, seed, drift)
+    result = slipped_frames(pulses, told, arrivals, FRAME, PAYLOAD)
+    assert result is not None
+    sure = result.slots >= 0
+    np.testing.assert_array_equal(result.slots[sure], truth[sure])
+    assert result.uncertain <= 3 * PULSES + 3
+    assert "SYNC_IN" in describe(result, PULSES)
+
+
+def test_slip_is_not_looked_for_where_times_do_not_tell():
+    pulses = pulse_times(BURSTS)
+    arrivals, told = arrivals_of(pulses.reshape(-1), pulses, QUIET, 1)
+    assert slipped_frames(pulses * 40, told, arrivals, FRAME, PAYLOAD) is None
+    assert slipped_frames(pulses[:1], told[:1], arrivals[:20], FRAME, PAYLOAD) is None

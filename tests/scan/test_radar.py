@@ -17,8 +17,9 @@ from host.radar.interface import BoardState, RadarControl, RadarState
 from host.radar.line_server import LINE, LineServers
 from host.scan.run import run_scan
 from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, Radar, decode, to_builtins
+from shared.config import Instrument, Radar
 from shared.errors import ConfigError, DeviceError, ScanError
+from shared.tables import decode, to_builtins
 from simulators.card_faults import Faults
 from simulators.line_server import LineServer
 

@@ -23,8 +23,8 @@ from host.scan.running import takes_so_far
 from host.scan.stop import StopRequest
 from host.store.scanfolder import ScanFolder
 from host.store.validate import validate
-from shared.config import to_builtins
 from shared.errors import DeviceError, ScanError
+from shared.tables import to_builtins
 
 
 def digests(scan: ScanFolder) -> dict[str, str]:

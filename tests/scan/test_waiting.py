@@ -9,11 +9,13 @@ import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
+import zmq
 
-from host.scan import ready, row
+from host.scan import ready, row, running
 from host.scan.processing import NICE
 from host.scan.run import resume_scan, run_scan
 from host.scan.stop import StopRequest
@@ -188,7 +190,7 @@ def test_row_held_so_long_that_the_cards_ended_their_records_is_taken_again(rig,
 
 
 def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
-    monkeypatch.setattr(row, "row_limit_s", lambda *_: 0.3)
+    monkeypatch.setattr(row, "row_limit_s", lambda *_: 3.0)  # of every row
     rig.pi.hang_at = {1}
     told = []
 
@@ -197,7 +199,7 @@ def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
             rig.pi.state = "held"
         if p.phase == "held":
             told.append(time.monotonic())
-            threading.Timer(1.0, end).start()
+            threading.Timer(4.0, end).start()
 
     def end() -> None:
         rig.pi.hang_at = set()
@@ -210,29 +212,29 @@ def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
 
 
 def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
-    """From the second request to Abort: no more than one turn of the loop, and no other command."""
+    """Asked for while the loop sleeps: it does not sleep again before Abort, and no other command goes out."""
     rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
-    stop, turns, seen = StopRequest(), [], []
-    turn = row.RowTaker._turn
+    stop, points, asked, aborted = StopRequest(), [], [], []
+    sleeps: list[float] = []  # of the loop, in ms; None would be for ever
 
-    def counted(self, take) -> None:
-        turns.append(stop.now)
-        turn(self, take)
+    class Poller(zmq.Poller):
+        def poll(self, timeout=None):
+            if any(points) and not stop.now:
+                stop.request()
+                stop.request()
+                asked.append((len(sleeps), len(rig.pi.commands)))
+            sleeps.append(timeout)
+            return super().poll(timeout)
 
-    monkeypatch.setattr(row.RowTaker, "_turn", counted)
-
-    def progress(p) -> None:
-        if p.points and not stop.now:
-            stop.request()
-            stop.request()
-            seen.append(len(rig.pi.commands))
-
-    result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
+    abort = row.PiClient.abort
+    monkeypatch.setattr(row, "zmq", SimpleNamespace(Poller=Poller, POLLIN=zmq.POLLIN))
+    monkeypatch.setattr(row.PiClient, "abort", lambda *words: aborted.append(len(sleeps)) or abort(*words))
+    result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=lambda p: points.append(p.points))
     assert result.exit_status == "abort"
-    after = rig.pi.commands[seen[0] :]
-    assert isinstance(after[0], m.Abort)
-    assert turns.count(True) <= 2, "one may be in hand; the next one waits for the end of the row"
-    assert row._TURN_MS <= 100
+    (first, commands), until = asked[0], aborted[0]
+    assert until - first == 1, "the turn in hand is the last one"
+    assert 0 <= max(sleeps[:until]) <= 100, "ms: a request is seen though nothing comes"
+    assert isinstance(rig.pi.commands[commands], m.Abort)
     ended = result.folder.facts("scan_ended")[0]
     assert (ended["exit_status"], ended["reason"]) == ("abort", "stopped on request, 4 of 4 rows are missing")
 
@@ -253,18 +255,20 @@ def test_stop_now_before_the_row_begins_moves_nothing(rig, tmp_path, state):
     assert resume_scan(tmp_path / "s").exit_status == "success"
 
 
-def test_every_end_is_written_down(rig, tmp_path):
+def test_every_end_is_written_down(rig, tmp_path, monkeypatch):
     """An error that is no fault of the rig is an end with a reason, too."""
 
     class BugError(Exception):
         pass
 
-    def progress(p) -> None:
-        if p.phase == "committed" and p.row == 1:
+    def no_place_for_row_2(*_: object) -> None:
+        if len(rig.pi.rows_run) == 2:
             raise BugError("oops")
 
+    monkeypatch.setattr(running, "check_disk", no_place_for_row_2)
     with pytest.raises(BugError):
-        run_scan(rig.instrument, tmp_path / "s", progress=progress)
+        run_scan(rig.instrument, tmp_path / "s")
+    monkeypatch.undo()
     ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")
     assert [(f["exit_status"], f["reason"]) for f in ended] == [("fail", "BugError: oops")]
     assert resume_scan(tmp_path / "s").exit_status == "success"

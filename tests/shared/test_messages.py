@@ -71,7 +71,17 @@ commands = st.one_of(
     st.builds(m.Replay, scan_id=text, from_seq=small, limit=st.integers(1, 10000), **v),
 )
 replies = st.one_of(
-    st.builds(m.HelloReply, pi_release=text, firmware=text, backend=text, state=states, scan_id=text, last_seq=n, **v),
+    st.builds(
+        m.HelloReply,
+        pi_release=text,
+        firmware=text,
+        backend=text,
+        state=states,
+        scan_id=text,
+        last_seq=n,
+        stage=st.dictionaries(text, x, max_size=5),
+        **v,
+    ),
     st.builds(m.Accepted, state=states, **v),
     st.builds(m.Refused, number=n, what=text, why=text, remedy=text, **v),
     st.builds(

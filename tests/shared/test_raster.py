@@ -27,8 +27,9 @@ def test_every_position_is_met_exactly_once(grid: Grid):
 def test_a_column_has_one_x_whatever_the_direction(grid: Grid):
     x = {}
     for row in plan_raster(grid):
-        for i in range(row.points):
-            assert row.x_mm(i) == pytest.approx(x.setdefault(row.column(i), row.x_mm(i)), abs=1e-9)
+        assert len(row.x_mm) == row.points
+        for i, x_mm in enumerate(row.x_mm):
+            assert x_mm == pytest.approx(x.setdefault(row.column(i), x_mm), abs=1e-9)
 
 
 @given(grids)
@@ -36,7 +37,7 @@ def test_the_grid_is_centred_and_rows_alternate(grid: Grid):
     rows = list(plan_raster(grid))
     assert sum(row.y_mm for row in rows) == pytest.approx(0, abs=1e-6)
     assert all(row.direction == (1 if row.index % 2 == 0 else -1) for row in rows)
-    assert all(row.x_mm(0) == pytest.approx(-row.x_mm(row.points - 1), abs=1e-9) for row in rows)
+    assert all(row.x_mm[0] == pytest.approx(-row.x_mm[-1], abs=1e-9) for row in rows)
 
 
 def test_a_burst_longer_than_the_step_is_refused():

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
+from shared.tables import to_builtins
 from shared.wires import WireClient, WireEdge, WireMotion
 from simulators.card_faults import Faults
 from simulators.card_sender import ReceiveQueue, bound_udp

@@ -17,10 +17,10 @@ from shared.config import load_instrument
 from simulators.card_sender import bound_udp
 from simulators.rig import card_groups, derive
 from simulators.scene import load_scene
+from tests.small_scene import small_scene
 
 ROOT = Path(__file__).parents[2]
-SCENE = 'name = "one plate"\n[grid]\ncolumns = 10\nrows = 4\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\n'
-SCENE += "size_mm = [20.0, 20.0]\nmetal = true\n"
+SCENE = small_scene(10, 4)
 Launch = Callable[..., subprocess.Popen[str]]
 
 

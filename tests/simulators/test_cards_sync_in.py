@@ -15,6 +15,9 @@ from shared.config import Instrument, load_instrument
 from shared.errors import ConfigError
 from shared.raster import plan_raster
 from shared.wires import WireMotion
+from simulators.radar import SimulatedRig
+from simulators.scene import decode_scene
+from simulators.simulate import row_offsets_mm
 from simulators.sync_in import Pulse, StageTrack, SyncInput, sync_line
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
@@ -85,6 +88,21 @@ def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
     assert np.ptp(x) == pytest.approx(0.45)
     assert np.ptp(held) == 0.0
     assert held[0] == pytest.approx(np.mean(x))
+
+
+@pytest.mark.parametrize("disturbed", [{}, {"backlash_mm": 0.3}, {"backlash_mm": -2.5, "burst_motion": False}])
+def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, object]) -> None:
+    radar = SimulatedRig(RIG, decode_scene({"name": "t"}, "t").with_disturbances(**disturbed))
+    d = radar.scene.disturbances
+    for index in (10, 11):
+        row, track = plan_raster(RIG.grid).row(index), StageTrack(RIG, d.burst_motion, d.backlash_mm)
+        bursts = [at_point(track, index, row.column(i), 10**9 + i * 10**8) for i in range(row.points)]
+        sent = [pulse for burst in bursts for pulse in burst]
+        at = track.offsets_mm([pulse.t_ns for pulse in sent])
+        for told, true in zip(at, row_offsets_mm(radar, row), strict=True):
+            np.testing.assert_allclose(told, true, atol=1e-3)
+        first = index * row.points * RIG.burst.pulses
+        assert [p.number for p in track.places(sent)] == list(range(first, first + len(sent)))
 
 
 def test_every_board_hangs_on_the_fan_out_or_on_its_own_line() -> None:

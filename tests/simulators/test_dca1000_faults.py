@@ -126,3 +126,18 @@ def test_a_fault_file_holds_faults_only(tmp_path: Path) -> None:
     path.write_text("loss = 0.1\n")
     with pytest.raises(ConfigError, match="holds"):
         read_faults(path, [], ("RH",))
+
+
+@pytest.mark.parametrize(
+    ("fault", "control"),
+    [
+        ("retrigger_fails=[1]", "line_server"),
+        ("retrigger_resets=[0]", "line_server"),
+        ("radar_fault_pulses=[7]", "native"),
+    ],
+)
+def test_a_fault_that_cannot_happen_with_the_rigs_radars_is_refused(fault: str, control: str) -> None:
+    assert read_faults(None, [fault], ("RH",), control=control)["RH"] != Faults()
+    for other in {"endless", "line_server", "native"} - {control}:
+        with pytest.raises(ConfigError, match=f"{fault.partition('=')[0]}.*{other}"):
+            read_faults(None, [fault], ("RH",), control=other)

@@ -1,11 +1,16 @@
 """Laws of reflection: limits, energy, and the paper's Eq. 3 as the inverse of Eq. 2."""
 
+from pathlib import Path
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shared.config import load_instrument
+from shared.units import SPEED_OF_LIGHT_M_S
 from simulators.fresnel import half_space, layered, plate_reflection, slab
-from simulators.scene import Layer, Plate
+from simulators.optics import board_reflectivity
+from simulators.scene import Layer, Plate, Scene
 
 permittivities = st.builds(lambda e, loss: complex(e, -loss), st.floats(1.1, 20.0), st.floats(0.0, 20.0))
 angles = st.floats(0.01, 1.5)
@@ -95,3 +100,19 @@ def test_stacks_are_what_they_are_made_of():
     )
     opaque = Layer((6.0, 9.0), 50.0)
     np.testing.assert_allclose(layered([opaque, water], F, theta), half_space(6 - 9j, theta), rtol=1e-9)
+
+
+def test_the_back_of_a_thick_sheet_answers_after_its_front() -> None:
+    """Samples of a path tau have phase +2 pi f tau; so must those of the way through the sheet and back."""
+    rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+    theta, thick_m, eps = np.radians(55.0), 0.1, 4.0
+    sheet = Plate("sheet", (0.0, 0.0), (45.0, 45.0), permittivity=(eps, 0.02), thickness_mm=1e3 * thick_m)
+    f = np.linspace(76.3e9, 79.75e9, 400)
+    path_m = np.linspace(-1.0, 1.0, 2001)
+    later = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m, f)) * np.hanning(f.size)
+    inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)  # Snell
+    for board in rig.receivers:
+        reflect = board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))
+        seen = np.abs(later @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))
+        back = np.where(np.abs(path_m) > 0.15, seen, 0)
+        assert abs(path_m[np.argmax(back)] - inside_m) < 0.01

@@ -6,7 +6,6 @@ The byte sequences are those that public DCA1000 clients send, wrong bodies incl
 from __future__ import annotations
 
 import json
-import random
 import signal
 import socket
 import struct
@@ -20,10 +19,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shared.config import load_instrument
 from simulators.card_endpoint import CardEndpoint
 from simulators.card_faults import Faults
 from simulators.card_sender import Pace, bound_udp
 from simulators.dca1000 import Network
+from simulators.loopback import on_free_subnet
 from simulators.replay import Player, Recording, scan_rows
 from simulators.simulated_card import MAC
 
@@ -47,6 +48,7 @@ CLIENTS = {
     ],
     "no configuration at all": [],
 }
+REPO = Path(__file__).resolve().parents[2]
 Play = Callable[..., "Client"]
 
 
@@ -78,6 +80,11 @@ class Client:
         return got
 
 
+def free_subnet() -> str:
+    """Loopback addresses 127.x.y.* that nobody else uses."""
+    return on_free_subnet(load_instrument(REPO / "instrument.toml")).boards[0].card_address.rpartition(".")[0]
+
+
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     path = tmp_path / "recording.bin"
@@ -91,7 +98,7 @@ def play() -> Iterator[Play]:
         players: list[subprocess.Popen[str]] = []
 
         def begin(source: Path, *arguments: str) -> Client:
-            subnet = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}"
+            subnet = free_subnet()
             addresses = ("--card-address", f"{subnet}.180", "--host-address", f"{subnet}.30")
             command = [sys.executable, "-m", "simulators.replay", str(source), *addresses, *arguments]
             player = sockets.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
@@ -156,7 +163,7 @@ def test_frames_end_the_record_and_faults_are_counted(play: Play, recording: Pat
 def test_it_plays_at_the_rate_that_was_set(recording: Path, bytes_per_s: float) -> None:
     """By a clock of the test's own, so that it says the same on any machine."""
     now_s = 50.0
-    subnet = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}"
+    subnet = free_subnet()
     network = Network(f"{subnet}.30", f"{subnet}.180", MAC, 4096, 4098)
     with closing(CardEndpoint("card", network, Faults(), 0, 1.0, lambda: now_s, Pace(), lanes=None)) as endpoint:
         player = Player(endpoint, repeat(Recording(recording, loop=True)), bytes_per_s, lambda: now_s)
@@ -205,6 +212,7 @@ def test_rows_of_a_scan_folder_are_those_committed_last(tmp_path: Path) -> None:
         (["{file}", "--row", "3"], "--row without", 2),
         (["{file}", "--rate-mbit", "0"], "--rate-mbit 0", 2),
         (["{file}", "--fault", "overflow=0.1"], "no SYNC_IN pulses", 2),
+        (["{file}", "--fault", "radar_fault_pulses=[1]"], "no radar", 2),
         (["{file}", "--card-address", "203.0.113.9"], "cannot take", 5),
     ],
 )

@@ -152,11 +152,18 @@ def test_logs_name_the_packets_that_came(tmp_path: Path, zero_filling: bool) -> 
     assert log[0, 2] >= 100.0
 
 
+def test_a_row_with_backlash_is_within_the_aperture() -> None:
+    radar = SimulatedRig(RIG, SCENE.with_disturbances(backlash_mm=-3.0))
+    for row in plan_raster(radar.rig.grid):
+        radar.chirps("RH", *row_offsets_mm(radar, row))
+    assert radar.outside["RH"] == 0
+
+
 def test_a_full_folder_and_a_burst_that_does_not_fit_are_refused(tmp_path: Path) -> None:
     (tmp_path / "note").write_text("mine")
     with pytest.raises(DataError, match="not empty"):
         simulate(RIG, SCENE, tmp_path)
-    fast = decode_scene({**RAW, "stage": {"speed_mm_s": 600.0}}, "t")
+    fast = decode_scene({**RAW, "stage": {"speed_mm_s": 600.0, "accel_mm_s2": 20000.0}}, "t")
     with pytest.raises(ConfigError, match="burst"):
         simulate(RIG, fast, tmp_path / "fast")
 
@@ -170,6 +177,11 @@ def test_the_command_says_where_it_wrote_and_fails_in_words(tmp_path: Path, caps
     assert answer["simulated"] is True
     assert Path(answer["folder"], "truth.json").exists()
     assert main(["simulate", str(scene), *common]) == 3
+    for of_the_authors in ("--columns", "--absent"):
+        assert main(["simulate", str(scene), *common, of_the_authors]) == 2
+        assert f"{of_the_authors} with --layout own" in capsys.readouterr().err
+    assert main(["simulate", str(scene), *common[:-1], str(scene)]) == 5
+    assert f"{scene}: " in capsys.readouterr().err.splitlines()[-3], "a file where a folder belongs is no trace"
     scene.write_text('name = "s"\nplate = 1\n')
     assert main(["simulate", str(scene), *common]) == 2
     assert "plate" in capsys.readouterr().err

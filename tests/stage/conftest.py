@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import ModuleType
 
@@ -30,6 +31,7 @@ def _module(name: str) -> ModuleType:
 
 drivers, conversations, uno_hosts = _module("drivers"), _module("conversation"), _module("uno_host")
 Driver, FirmwareDriver, PythonDriver = drivers.Driver, drivers.FirmwareDriver, drivers.PythonDriver
+ROOT = Path(__file__).parents[2]
 _SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
 
 
@@ -132,12 +134,35 @@ def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
     elif kind == "uno":
         driver = drivers.UnoDriver(*request.getfixturevalue("uno_programs"), tmp_path)
     else:
-        port = request.config.getoption("--stage-port")
-        if not port:
-            pytest.skip("no real stage: pytest tests/stage --stage-port /dev/ttyACM0 (it homes and moves)")
-        driver = drivers.PortDriver(port)
+        real, dialogue = request.config.getoption("--stage-port"), request.node.callspec.params.get("path")
+        if real:
+            driver = drivers.PortDriver(real)
+        elif dialogue is not None or request.config.getoption("--long"):
+            # Three times real time, but a heartbeat is one of the wall clock, however fast the motion runs.
+            speed = 1.0 if dialogue is not None and dialogue.stem == "heartbeat" else 3.0
+            driver = drivers.PortDriver(request.getfixturevalue("simulated_port")(speed), speed)
+        else:
+            pytest.skip("minutes at a port: --long, or a real stage: --stage-port /dev/ttyACM0 (it homes and moves)")
     yield driver
     driver.close()
+
+
+@pytest.fixture
+def simulated_port(tmp_path: Path) -> Iterator[Callable[[float], str]]:
+    """Starts a simulated stage at so many times real time; its serial port."""
+    with ExitStack() as started:
+
+        def start(time_scale: float) -> str:
+            port = str(tmp_path / "ttySTAGE")
+            command = [sys.executable, "-m", "simulators.stage", "--config", str(ROOT / "instrument.toml")]
+            command += ["--link", port, "--time-scale", repr(time_scale)]
+            stage = started.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT))
+            started.callback(stage.terminate)
+            assert stage.stdout is not None
+            assert stage.stdout.readline().startswith("ready")
+            return port
+
+        yield start
 
 
 @pytest.fixture(params=["firmware", "python"])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from shared.errors import ProtocolError
 from shared.stage_line import Command, Immediate, crc16, unseal
 
 PRESSED = {"X": 1, "Y": 2, "E": 4, "nothing": 0}
@@ -20,30 +21,32 @@ class Conversation:
         self.by_verb: dict[str, int] = {}
         self.last = b""
 
-    def send(self, text: str) -> None:
-        if text == "again":
-            self.stage.rx(self.last)
-        elif text.startswith("<"):
-            self.stage.rx(bytes([Immediate[text.strip("<>")]]))
-        elif text.startswith("sealed "):
+    def send(self, texts: list[str]) -> None:
+        self.stage.rx(b"".join([self._bytes(text) for text in texts]))
+
+    def _bytes(self, text: str) -> bytes:
+        if text.startswith("<"):
+            return bytes([Immediate[text.strip("<>")]])
+        if text.startswith("sealed "):
             body = ast.literal_eval("b" + text.removeprefix("sealed "))
-            self.stage.rx(body + b"*%04X\n" % crc16(body))
-        elif text.startswith('"'):
-            self.stage.rx(ast.literal_eval("b" + text))
-        else:
+            return body + b"*%04X\n" % crc16(body)
+        if text.startswith('"'):
+            return ast.literal_eval("b" + text)
+        if text != "again":
             words = text.split()
             self.sequence = int(words.pop(0)[1:]) if re.fullmatch(r"N\d+", words[0]) else self.sequence + 1
             verb, args = words[0], tuple(map(int, words[1:]))
             self.by_verb[verb] = self.sequence
             self.last = Command(self.sequence, verb, args).encode()
-            self.stage.rx(self.last)
+        return self.last
 
     def expect(self, text: str) -> None:
         if text == "silence":
+            self.stage.linger()
             assert self.stage.received == b""
             return
+        self.stage.until(lambda: b"\n" in self.stage.received)
         line, newline, self.stage.received = self.stage.received.partition(b"\n")
-        assert newline, f"expected {text!r}, nothing came"
         text = re.sub(r"#([A-Z]+)", lambda m: str(self.by_verb[m[1]]), text).replace("#", str(self.sequence))
         assert re.fullmatch(re.escape(text).replace(r"\?", r"[-+.:A-Za-z0-9]+"), unseal(line + newline)), (
             f"expected {text!r}, got {line!r}"
@@ -68,13 +71,30 @@ class Conversation:
 def play(stage, path: Path) -> None:
     """Every line of the file in turn; fails at the first that does not hold."""
     talk = Conversation(stage)
-    steps = {"->": talk.send, "<-": talk.expect, "..": talk.act}
+    for number, sign, texts in _steps(path):
+        try:
+            if sign == "->":
+                talk.send(texts)
+            elif sign == "<-":
+                talk.expect(texts[0])
+            else:
+                talk.act(texts[0])
+        except (AssertionError, ProtocolError) as e:
+            pytest.fail(f"{path.name}:{number}: {sign} {texts[-1]}: {e}")
+    stage.linger()
+    assert stage.received == b"", f"{path.name}: not expected"
+
+
+def _steps(path: Path) -> list[tuple[int, str, list[str]]]:
+    """Line number, sign and text of every step; what is sent in one go is one step."""
+    steps: list[tuple[int, str, list[str]]] = []
     for number, line in enumerate(path.read_text(encoding="ascii").splitlines(), 1):
         line = line.partition(" //")[0].strip()
         if not line or line.startswith("//"):
             continue
-        try:
-            steps[line[:2]](line[3:].strip())
-        except AssertionError as e:
-            pytest.fail(f"{path.name}:{number}: {line}: {e}")
-    assert stage.received == b"", f"{path.name}: not expected"
+        sign, text = line[:2], line[3:].strip()
+        if sign == "->" and steps and steps[-1][1] == sign:
+            steps[-1][2].append(text)
+        else:
+            steps.append((number, sign, [text]))
+    return steps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from simulators.stage_motion import NS_PER_TICK, TICK_HZ
 from simulators.stage_python import PythonStage, Rig
 from simulators.uno import HZ, EmulatedUno
 
+LIMIT_S = 60.0
 LIMIT_TICKS = 600 * TICK_HZ
 TICKS_PER_MS = TICK_HZ // 1000
 
@@ -50,6 +52,13 @@ class Driver:
     def close(self) -> None:
         return
 
+    def until(self, there: Callable[[], bool]) -> None:
+        """Go on when this holds of what was received. In virtual time it holds by now or never."""
+        assert there(), f"received {self.received!r}"
+
+    def linger(self) -> None:
+        """Let come what may have been under way. In virtual time it is there."""
+
     def still(self) -> bool:
         """Whether nothing has moved and no trigger was given since the last call."""
         quiet = not self.wires
@@ -82,10 +91,21 @@ class Driver:
         return last, list(self.wires)
 
     def status(self) -> Reply:
+        """Ask for the status; everything else that was received is kept."""
+        kept, self.received = self.received, b""
         self.rx(bytes([Immediate.STATUS]))
-        *_, last = self.replies()
-        assert last.kind == "status"
-        return last
+        self.until(lambda: b"status " in self.received)
+        told = next(line for line in self.received.splitlines(keepends=True) if line.startswith(b"status "))
+        self.received = kept + self.received.replace(told, b"", 1)
+        return Reply.decode(told)
+
+    def resync(self) -> None:
+        """Get an answer to a new greeting, after whatever was sent before; all that came until then is dropped."""
+        self.sequence = (self.sequence + 1) % 65536
+        answer = b"ok N%d " % self.sequence
+        self.rx(b"\n" + Command(self.sequence, "HELLO").encode())
+        self.until(lambda: answer in self.received)
+        *_, self.received = self.received.partition(answer)[2].partition(b"\n")
 
     def ready(self, heartbeat_ms: int = 60_000) -> Driver:
         """Greeted, switched on and homed."""
@@ -256,17 +276,18 @@ class PortDriver(Driver):
     """A stage behind a real serial port, in its own time.
 
     `speed`: how many times the wall clock the stage's time runs; 1 for a real one. What needs hands on switches is
-    skipped. The heartbeat is kept up only as far as the conversation does it.
+    skipped. What has to come is waited for, however long this machine takes; only what must not come has a time. The
+    heartbeat is kept up only as far as the conversation does it.
     """
 
     def __init__(self, port: str, speed: float = 1.0) -> None:
         super().__init__()
         self._speed = speed
         self._port = serial.Serial(port, 115200, timeout=0.02)
-        self._partial = b""
+        self._partial = self._sent = b""
         self._listen_for_banner()
 
-    def _listen(self, seconds: float) -> None:
+    def _listen(self, seconds: float = 0.0) -> None:
         limit = time.monotonic() + seconds
         while True:
             self._partial += self._port.read(256)
@@ -275,42 +296,40 @@ class PortDriver(Driver):
             if time.monotonic() >= limit:
                 return
 
-    def _listen_for_banner(self, seconds: float = 10.0) -> None:
+    def _listen_for_banner(self) -> None:
         """Opening resets the board; what it was saying meanwhile is dropped."""
-        limit = time.monotonic() + seconds
-        while time.monotonic() < limit:
-            self._listen(0)
-            _, banner, rest = self.received.partition(b"polysight-stage")
-            if banner:
-                self.received = banner + rest
-                return
-        raise ProtocolError(f"no banner within {seconds} s; received {self.received!r}")
+        self.until(lambda: b"polysight-stage" in self.received)
+        self.received = self.received[self.received.index(b"polysight-stage") :]
+
+    def until(self, there: Callable[[], bool]) -> None:
+        limit = time.monotonic() + LIMIT_S
+        while not there():
+            if time.monotonic() > limit:
+                raise ProtocolError(f"not within {LIMIT_S:g} s; received {self.received!r}")
+            self._listen()
+
+    def linger(self) -> None:
+        self._listen(0.2)
 
     def rx(self, data: bytes) -> None:
-        """A line or a STATUS byte has an answer; what else comes, comes soon after."""
+        """Every line has an answer, and so has a STATUS byte by itself; what else comes, comes later."""
+        *lines, self._sent = (self._sent + data).split(b"\n")
+        answers = sum(bool(line.translate(None, bytes(Immediate))) for line in lines)
+        answers += data == bytes([Immediate.STATUS])
         complete = self.received.count(b"\n")
         self._port.write(data)
-        limit = time.monotonic() + 3.0
-        answered = data.strip(b"\n") and (data.endswith(b"\n") or data == bytes([Immediate.STATUS]))
-        while answered and self.received.count(b"\n") == complete and time.monotonic() < limit:
-            self._listen(0)
-        self._listen(0.15 / self._speed)
+        self.until(lambda: self.received.count(b"\n") >= complete + answers)
 
     def run(self, ticks: int) -> None:
         self._listen(ticks / TICK_HZ / self._speed)
 
     def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
         """Ask for the status until it is not one of motion; those answers are not part of the conversation."""
-        limit = time.monotonic() + min(limit_ticks / TICK_HZ / self._speed, 100.0)
+        limit = time.monotonic() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
         while time.monotonic() < limit:
-            before, self.received = self.received, b""
-            self._port.write(bytes([Immediate.STATUS]))
-            self._listen(0.15 / self._speed)
-            lines = self.received.splitlines(keepends=True)
-            states = [Reply.decode(line).fields["state"] for line in lines if line.startswith(b"status")]
-            self.received = before + b"".join(line for line in lines if not line.startswith(b"status"))
-            if states and states[-1] in ("idle", "alarm", "hold"):
+            if self.status().fields["state"] in ("idle", "alarm", "hold"):
                 return
+            self._listen(0.1 / self._speed)
         raise ProtocolError("the stage does not come to rest")
 
     def press(self, mask: int) -> None:
@@ -320,10 +339,10 @@ class PortDriver(Driver):
         pytest.skip(f"a hand on the motors is needed ({dx}, {dy} steps)")
 
     def reset(self) -> None:
-        self.received = b""
-        self._port.dtr = False
-        self._listen(0.1)
-        self._port.dtr = True
+        """Opening the port anew does it (a board by DTR, a pseudo terminal by itself)."""
+        self._port.close()
+        self.received = self._partial = self._sent = b""
+        self._port.open()
         self._listen_for_banner()
 
     def close(self) -> None:

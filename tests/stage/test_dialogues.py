@@ -9,6 +9,9 @@
 `<- REPLY`           the next reply; # is the number of the last command, #ROW that of the last ROW, ? any value
 `<- silence`         nothing has come
 `.. 100 ms`          let time go on; also `rest`, `press X|Y|E|nothing`, `slip DX DY`, `reset`
+
+Lines `->` that follow each other are sent in one go. A real stage does not wait while this machine is busy: so what
+must be sent before something happens there goes in one go, or it has seconds to spare.
 """
 
 from __future__ import annotations

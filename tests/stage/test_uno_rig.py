@@ -13,7 +13,8 @@ import pytest
 import tomli_w
 
 from host.store.scanfolder import ScanFolder
-from shared.config import load_instrument, to_builtins
+from shared.config import load_instrument
+from shared.tables import to_builtins
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 200

@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,33 +26,17 @@ from host.store.scanfolder import MANIFEST, PART, ScanFolder
 from pi_controller.journal import JournalFolder, JournalFullError
 from pi_controller.ledger import Ledger
 from shared import messages as m
-from shared.config import Instrument, decode, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
 from shared.errors import PolysightError
 from shared.raster import plan_raster
+from shared.tables import decode, to_builtins
 from simulators.radar import SimulatedRig
 from simulators.scene import load_scene
 from simulators.simulate import row_offsets_mm
+from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]
-SCENE = """name = "a metal plate"
-seed = 3
-[grid]
-columns = 3
-rows = 3
-step_x_mm = 20.0
-step_y_mm = 20.0
-[burst]
-pulses = 2
-[image]
-columns = 12
-rows = 12
-pixel_mm = 8.0
-[[plates]]
-name = "copper"
-centre_mm = [0.0, 0.0]
-size_mm = [60.0, 60.0]
-metal = true
-"""
+SCENE = small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
 
 
 class Samples:
@@ -156,6 +139,9 @@ class SmallPi:
     def home(self) -> None:
         self.state, self.fault, self._ledger.broken = "ready", "", False
 
+    def come_to_rest(self, reason: str) -> None:
+        """Nothing moves."""
+
     def abort(self, reason: str) -> None:
         raise AssertionError(f"nothing asks for an abort here: {reason}")
 
@@ -229,7 +215,7 @@ class SmallScan:
             stack.callback(pi.lose)
             rig = SmallRig(self._samples)
             stack.callback(rig.close)
-            hello = SimpleNamespace(pi_release="t", firmware="t", backend="wires")
+            hello = m.HelloReply(pi_release="t", firmware="t", backend="wires", state="homed", scan_id="", last_seq=0)
             patch = stack.enter_context(pytest.MonkeyPatch.context())
             patch.setattr(host_run, "_connect", lambda *_: (pi, rig, hello))
             yield

@@ -191,7 +191,7 @@ def test_units_of_tis_tools_are_understood_too(write, base):
 
 
 @pytest.mark.parametrize("zero_filling", [True, False])
-@pytest.mark.parametrize("first_sequence", [1, 5000])
+@pytest.mark.parametrize("first_sequence", [0, 1, 5000])
 @pytest.mark.parametrize("lost", [{3}, {0}, {4, 5}, {78}])
 def test_lost_packets_are_masked_where_they_were(write, base, zero_filling, first_sequence, lost):
     folder, truth = write({("RV", 2): lost}, zero_filling=zero_filling, first_sequence=first_sequence)

@@ -19,22 +19,11 @@ from host.store.raw import drop, droppable, dropped_files, require_raw
 from host.store.scanfolder import MANIFEST, ScanFolder
 from host.store.validate import damaged_rows, validate
 from shared.errors import ConfigError, DataError, DeviceError, ScanError
+from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]
 ROWS, BOARDS = 4, 2
-SCENE = f"""name = "nothing"
-[grid]
-columns = 8
-rows = {ROWS}
-step_x_mm = 10.0
-step_y_mm = 10.0
-[burst]
-pulses = 2
-[image]
-columns = 20
-rows = 20
-pixel_mm = 8.0
-"""
+SCENE = small_scene(8, ROWS, metal=False)
 
 
 def polysight(*words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
@@ -78,6 +67,12 @@ def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
     done = polysight("drop-raw", scan, typed="drop\n")
     assert done.returncode == 0, done.stderr
     assert not payloads(scan)
+    said = json.loads(products.pop("quality.json"))
+    kept = contents(scan / "products")
+    dropped = json.loads(kept.pop("quality.json"))
+    assert dropped.pop("raw_dropped")["scan_id"] == ScanFolder.load(scan).scan_id
+    assert (kept, dropped) == (products, said)
+    products = contents(scan / "products")
     assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)  # arrivals and gaps stay, where there were any
     facts = ScanFolder.load(scan).facts("raw_dropped")
     assert [f["row"] for f in facts] == list(range(ROWS))

@@ -27,10 +27,31 @@ def same(one, other):
         np.testing.assert_allclose(a, b, rtol=0, atol=2e-6 * max(1.0, float(np.abs(b).max())))
 
 
-@pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243)])
+@pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 24)])
 def test_matches_agree(words, linear):
     reference = np.array([0, 5, 2, 1, 3])
     same(*(by.match(words, reference, linear) for by in (compiled, plain)))
+
+
+@pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
+def test_they_agree_on_any_number_of_samples(words, samples, linear):
+    """Nothing depends on whole vectors, or on blocks that fill a chirp."""
+    rng, reference = np.random.default_rng(2), np.array([0, 5, 2, 1, 3])
+    words = np.ascontiguousarray(words[:, :, :samples])
+    matches = plain.match(words, reference, linear)
+    same(compiled.match(words, reference, linear), matches)
+    frequency = matches[2][:, None] + matches[0]
+    weights = ([0.1, 1, 0.2j] + 0.1 * rng.standard_normal((5, 6, 3))).astype(np.complex64)
+    good = rng.uniform(size=(5, 6)) < 0.8
+    same(*(by.against_others(words, frequency, weights, good, linear)[:-1] for by in (compiled, plain)))
+    same(*(by.average(words, frequency, weights, good, linear) for by in (compiled, plain)))
+
+
+def test_more_chirps_than_are_transformed_at_once_agree(words):
+    many = np.concatenate([words] * 3, axis=1)
+    assert many.shape[1] > 16
+    reference = np.array([0, 17, 2, 9, 3])
+    same(*(by.match(many, reference, (0, 192)) for by in (compiled, plain)))
 
 
 @pytest.mark.parametrize("taps", [1, 3])

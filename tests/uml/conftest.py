@@ -15,7 +15,8 @@ import msgspec
 import pytest
 import tomli_w
 
-from shared.config import Instrument, load_instrument, to_builtins
+from shared.config import Instrument, load_instrument
+from shared.tables import to_builtins
 from simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 HERE = Path(__file__).parent

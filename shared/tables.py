@@ -1,0 +1,76 @@
+"""TOML and JSON tables checked against a typed declaration, and back.
+
+Unknown keys, wrong types and broken rules are refused with the file, the key, the value and the rule.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from shared.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file. Raises ConfigError when it is absent, unreadable or not TOML."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file", "the path is wrong", "give the path of a TOML file") from None
+    except (OSError, UnicodeDecodeError) as e:
+        raise ConfigError(f"{path}: cannot be read: {e}", "not a readable text file", "check the path") from None
+    except tomllib.TOMLDecodeError as e:
+        raise ConfigError(f"{path}: not valid TOML: {e}", "a typing error", "correct that line") from None
+
+
+def decode(raw: dict[str, Any], kind: type[T], source: str) -> T:
+    """Check a parsed TOML or JSON table against a typed declaration.
+
+    Raises
+    ------
+    ConfigError
+        naming `source`, the key, its value and the rule that is broken.
+    """
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as e:
+        rule, _, path = str(e).partition(" - at `")
+        path = path.rstrip("`") or "$"
+        value = _lookup(raw, path)
+        key = path.removeprefix("$").lstrip(".") or "(top level)"
+        raise ConfigError(
+            f"{source}: {key}{' = ' + value if value else ''}: {rule}",
+            "the file does not follow its declaration",
+            f"correct {key} in {source}; instrument.toml in the repository shows every key with its meaning",
+        ) from None
+
+
+def to_builtins(config: Any) -> dict[str, Any]:
+    """A configuration as plain dicts and lists, None left out, for JSON, TOML or msgpack."""
+    return _without_none(msgspec.to_builtins(config))
+
+
+def _lookup(data: Any, path: str) -> str:
+    """The value a msgspec error path such as `$.boards[0].name` points at, for the message; '' when absent."""
+    node = data
+    for part in path.removeprefix("$").replace("[", ".[").split("."):
+        if not part:
+            continue
+        try:
+            node = node[int(part[1:-1])] if part.startswith("[") else node[part]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return ""
+    return "" if isinstance(node, dict | list) else repr(node)
+
+
+def _without_none(node: Any) -> Any:
+    if isinstance(node, dict):
+        return {k: _without_none(v) for k, v in node.items() if v is not None}
+    if isinstance(node, list | tuple):
+        return [_without_none(v) for v in node]
+    return node

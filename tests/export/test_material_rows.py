@@ -1,0 +1,93 @@
+"""The table of materials, number by number: what a patch of materials.json becomes in every format."""
+
+from __future__ import annotations
+
+import csv
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from host.cli import main
+from host.report import write_image, write_json
+
+PATCH = {
+    "label": 4, "name": "PET", "confidence": 0.75, "metal_reference": False, "metal_like": True,
+    "box_mm": [10.0, -20.0, 50.0, 40.0], "outline_mm": [], "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5,
+    "ratio": {"real": 0.0, "imag": 10.0}, "inverse_ratio_std": 0.004,
+    "permittivity": {"real": 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125},
+    "truth": {"name": "vinyl", "permittivity": {"real": 3.75, "imag": -0.5}},
+}  # fmt: skip
+METAL = {
+    "label": 5, "name": None, "confidence": None, "metal_reference": True, "metal_like": False,
+    "box_mm": [-8.0, 2.0, -4.0, 4.0], "outline_mm": [], "pixels": 9, "interior_pixels": 7, "incidence_deg": 55.0,
+    "ratio": None, "inverse_ratio_std": None, "permittivity": None, "truth": None,
+}  # fmt: skip
+EXPECTED = {
+    "patch": [4, 5],
+    "name": ["PET", None],
+    "confidence": [0.75, None],
+    "metal_reference": [False, True],
+    "metal_like": [True, False],
+    "centre_x_mm": [30.0, -6.0],
+    "centre_y_mm": [10.0, 3.0],
+    "width_mm": [40.0, 4.0],
+    "height_mm": [60.0, 2.0],
+    "pixels": [77, 7],
+    "incidence_deg": [54.5, 55.0],
+    "permittivity_real": [3.5, None],
+    "permittivity_real_standard_error": [0.0625, None],
+    "permittivity_loss": [0.25, None],
+    "permittivity_loss_standard_error": [0.125, None],
+    "p_real": [0.0, None],
+    "p_imag": [10.0, None],
+    "p_abs_db": [20.0, None],
+    "p_phase_deg": [90.0, None],
+    "inverse_p_standard_error": [0.004, None],
+    "true_name": ["vinyl", None],
+    "true_permittivity_real": [3.75, None],
+    "true_permittivity_loss": [0.5, None],
+}
+
+
+@pytest.fixture
+def exported(tmp_path):
+    """The folder of exports of products that hold these two patches."""
+    products, ones = tmp_path / "products", np.ones((2, 3), np.complex64)
+    axes = (np.array([-0.1, 0.0, 0.1]), np.array([0.0, 0.1]))
+    write_image(products / "image.npz", ones, ones, ones, *axes, np.ones((2, 3), bool))
+    write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
+    assert main(["export", str(products), "--csv", "--hdf5", "--mat", "--out", str(tmp_path / "out")]) == 0
+    return tmp_path / "out"
+
+
+def test_csv(exported):
+    with (exported / "materials.csv").open(newline="", encoding="utf-8") as f:
+        header, *rows = csv.reader(f)
+    assert dict(zip(header, map(list, zip(*rows, strict=True)), strict=True)) == {
+        name: ["" if value is None else str(value) for value in values] for name, values in EXPECTED.items()
+    }
+
+
+def same(values, expected) -> bool:
+    """Whether a column holds these; nan and an empty word stand for what is not known."""
+    if any(isinstance(e, str) for e in expected):
+        return ["" if np.size(v) == 0 else v for v in values] == ["" if e is None else e for e in expected]
+    return np.array_equal(np.asarray(values, float), [np.nan if e is None else e for e in expected], equal_nan=True)
+
+
+def test_hdf5(exported):
+    with h5py.File(exported / "image.h5") as f:
+        found = {name: f[f"materials/{name}"][()] for name in f["materials"]}
+    assert set(found) == set(EXPECTED)
+    for name, expected in EXPECTED.items():
+        values = [v.decode() if isinstance(v, bytes) else v for v in found[name]]
+        assert same(values, expected), name
+
+
+def test_matlab(exported):
+    found = scipy.io.loadmat(exported / "image.mat", simplify_cells=True)["materials"]
+    assert set(found) == set(EXPECTED)
+    for name, expected in EXPECTED.items():
+        assert same(found[name], expected), name

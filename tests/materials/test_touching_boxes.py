@@ -1,0 +1,57 @@
+"""Boxes drawn by hand may touch, and may lie where nothing was imaged."""
+
+import numpy as np
+
+from host.materials.analyse import analyse, smooth_inside
+from host.materials.labels import patches_from_labels, patches_from_plates
+from host.materials.truth import TruthPlate
+from host.polarimetry import fresnel
+
+X_M, Y_M = np.arange(60) * 2e-3, np.arange(40) * 2e-3
+THETA = np.radians(55.0)
+LEFT, RIGHT = 4 - 0.4j, 9 - 2j
+
+
+def _scene():
+    """Metal below, two materials side by side above it; channels as complex64 [ny, nx], and boxes in pixels."""
+    h, v = np.full((40, 60), -1, np.complex64), np.full((40, 60), -1, np.complex64)
+    for eps, columns in ((LEFT, slice(0, 30)), (RIGHT, slice(30, 60))):
+        h[20:, columns], v[20:, columns] = fresnel(eps, THETA)
+    boxes = {"metal": (0, 0, 60, 18), "left": (2, 20, 30, 40), "right": (30, 20, 58, 40), "nowhere": (58, 20, 60, 40)}
+    found, names = patches_from_labels(boxes, X_M, Y_M, unit="pixel")
+    return h, v, found, {name: label for label, name in names.items()}
+
+
+def test_each_box_is_filtered_by_itself():
+    h, _, found, labels = _scene()
+    smoothed = smooth_inside(h, found, 2.0)
+    for name, eps in (("left", LEFT), ("right", RIGHT)):
+        at = next(p for p in found.patches if p.label == labels[name]).interior
+        np.testing.assert_allclose(smoothed[at], fresnel(eps, THETA)[0], atol=1e-6)
+    outside = ~np.logical_or.reduce([p.interior for p in found.patches])
+    assert np.isnan(smoothed[outside]).all()
+
+
+def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
+    h, v, found, labels = _scene()
+    valid = np.ones(h.shape, bool)
+    valid[:, :12] = valid[:, 58:] = False
+    h[~valid] = v[~valid] = 0  # as images have it
+    result = analyse(
+        h, v, X_M, Y_M, valid, theta_rad=THETA, metal_label=labels["metal"], segmentation=found, smooth_px=1.0
+    )
+    rows = {r["label"]: r for r in result.rows()}
+    left, nowhere = rows[labels["left"]], rows[labels["nowhere"]]
+    assert abs(left["amplitude_h"] - abs(complex(fresnel(LEFT, THETA)[0]))) < 1e-5
+    assert abs(complex(left["permittivity"]["real"], left["permittivity"]["imag"]) - LEFT) < 1e-3
+    assert nowhere["interior_pixels"] == 0
+    assert not nowhere["metal_like"]
+    assert nowhere["permittivity"] is None
+
+
+def test_plates_of_one_name_are_patches_each():
+    plates = [TruthPlate("acrylic", box, 4 - 0.4j) for box in ((-50, -30, -20, 0), (10, -30, 40, 0))]
+    found, names = patches_from_plates(plates, X_M, Y_M, 0.0)
+    assert list(names.values()) == ["acrylic", "acrylic"]
+    assert [p.label for p in found.patches] == list(names)
+    assert not (found.patches[0].mask & found.patches[1].mask).any()

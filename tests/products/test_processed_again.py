@@ -1,0 +1,199 @@
+"""Processing again: what is given is read before anything is touched, and a failure costs nothing that was there."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tomli_w
+
+from host.cli import main
+from host.materials import Library
+from host.options import LIBRARY
+from host.store import manifest
+from host.store.scanfolder import MANIFEST, ScanFolder
+from shared.config import load_instrument
+from shared.tables import to_builtins
+from simulators.scene import load_scene
+from simulators.simulate import simulate
+
+REPO = Path(__file__).resolve().parents[2]
+RIG = REPO / "instrument.toml"
+SCENE = """name = "two plates"
+[grid]
+columns = 14
+rows = 10
+step_x_mm = 14.0
+step_y_mm = 12.0
+[burst]
+pulses = 2
+[image]
+columns = 40
+rows = 30
+pixel_mm = 4.0
+[[plates]]
+name = "copper"
+centre_mm = [-40.0, 0.0]
+size_mm = [50.0, 60.0]
+metal = true
+[[plates]]
+name = "mine"
+centre_mm = [40.0, 0.0]
+size_mm = [50.0, 60.0]
+permittivity = [4.0, 0.4]
+"""
+METAL = ["--metal", "-40,0,30,40"]  # as the pages write it: the minus does not make it an option
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """A simulated scan, and its products."""
+    folder = tmp_path_factory.mktemp("recorded")
+    (folder / "scene.toml").write_text(SCENE)
+    simulate(load_instrument(RIG), load_scene(folder / "scene.toml"), folder / "scan")
+    assert main(["process", str(folder / "scan"), "--out", str(folder / "out"), *METAL]) == 0
+    return folder
+
+
+@pytest.fixture
+def made(recorded, tmp_path) -> Path:
+    """A copy of both, in `scan` and `out`."""
+    return Path(shutil.copytree(recorded, tmp_path / "lab"))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def process(made: Path, *more: object) -> int:
+    return main(["process", str(made / "scan"), "--out", str(made / "out"), *map(str, more)])
+
+
+def boxes(made: Path, labels: dict[str, list[float]]) -> Path:
+    (made / "mine.json").write_text(json.dumps({"labels": labels}))
+    return made / "mine.json"
+
+
+def test_labels_among_the_products_that_they_replace(made):
+    """The file is read before its folder is replaced; its two boxes are the new products' patches, by name."""
+    labels = made / "out" / "labels.json"
+    labels.write_text(json.dumps({"labels": {"metal": [7, 10, 12, 20], "drawn": [27, 10, 32, 20]}}))
+    assert process(made, "--labels", labels, "--model", "none") == 0
+    assert set(json.loads(labels.read_text())["labels"]) == {"metal", "drawn"}
+    assert (made / "out" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--labels", "{made}/no.json"], "no such label file"),
+        (["--labels", "{made}/scan/manifest.jsonl"], "not a label file"),
+        (["--labels", "{outside}"], "holds no pixel"),
+        (["--library", "{made}/no.npz"], "no.npz"),
+        (["--reference", "{made}/no"], "no"),
+    ],
+)
+def test_what_cannot_be_used_costs_nothing(made, given, said, capsys):
+    before, outside = contents(made), boxes(made, {"far": [4000, 0, 4010, 10]})
+    before["mine.json"] = outside.read_bytes()
+    assert process(made, *(g.format(made=made, outside=outside) for g in given)) == 3
+    assert said in capsys.readouterr().err
+    assert contents(made) == before
+
+
+def test_a_report_is_not_replaced_by_images_without_one(made, capsys):
+    before = contents(made / "out")
+    assert process(made, "--metal", "900,900,10,10") == 3
+    assert "holds the earlier products" in capsys.readouterr().err
+    assert contents(made / "out") == before
+    shutil.rmtree(made / "out")
+    assert process(made, "--metal", "900,900,10,10") == 3
+    assert f"the images are written: {made / 'out' / 'image.npz'}" in capsys.readouterr().err
+    assert (made / "out" / "image.npz").exists()
+
+
+def test_products_whose_raw_rows_were_dropped_stay(made, capsys):
+    assert main(["drop-raw", str(made / "scan"), "--products", str(made / "out"), "--yes"]) == 0
+    before = contents(made / "out")
+    (made / "other.toml").write_text(SCENE.replace("two plates", "another"))
+    other = simulate(load_instrument(RIG), load_scene(made / "other.toml"), made / "other")
+    for command in ("process", "image"):
+        assert main([command, str(other), "--out", str(made / "out")]) == 2
+        said = capsys.readouterr().err
+        assert ScanFolder.load(made / "scan").scan_id in said
+        assert "raw rows were dropped" in said
+    assert contents(made / "out") == before
+
+
+# --- a rig that looks from another angle than the library -------------------------------------------------------------
+
+
+@pytest.fixture
+def other_angle(made) -> Path:
+    """The simulated library as if it had been trained two degrees off."""
+    library = Library.load(LIBRARY)
+    moved = (replace(e, incidence_deg=e.incidence_deg + 2) for e in library.entries)
+    Library(tuple(moved), library.fit, library.note).save(made / "other.npz")
+    return made / "other.npz"
+
+
+def test_off_the_librarys_angle_there_is_a_report_without_names(made, other_angle, capsys):
+    assert process(made, *METAL, "--library", other_angle) == 0
+    told = capsys.readouterr()
+    assert "Nothing will be named: the scan looks at 5" in told.err
+    assert "Nothing was named: the scan looks at 5" in told.out
+    materials = json.loads((made / "out" / "materials.json").read_text())
+    assert materials["library"].startswith("Nothing was named: ")
+    assert materials["model"] is None
+    other = next(s for s in materials["segments"] if not s["metal_reference"])
+    assert other["name"] is None
+    assert other["permittivity"] is not None
+    page = (made / "out" / "report.html").read_text()
+    assert "and other.npz holds" in page
+    assert "plates named right" not in page
+
+
+@pytest.fixture
+def no_pi(made) -> Path:
+    """A rig file where nobody answers."""
+    table = to_builtins(load_instrument(RIG))
+    table["pi"] |= {"command_address": "tcp://127.0.0.1:1", "event_address": "tcp://127.0.0.1:2"}
+    table["limits"] |= {"command_timeout_s": 0.2}
+    (made / "rig.toml").write_text(tomli_w.dumps(table))
+    return made / "rig.toml"
+
+
+def test_a_scan_that_nothing_will_be_named_of_says_so_before_the_rig_is_touched(made, other_angle, no_pi, capsys):
+    scan = ["scan", "--config", str(no_pi), "--out", str(made / "new")]
+    assert main([*scan, "--library", str(other_angle)]) == 5
+    said = capsys.readouterr().err
+    assert 0 < said.index("Nothing will be named") < said.index("did not answer")
+    for given in (["--labels", made / "no.json"], ["--labels", boxes(made, {"far": [4000, 0, 4010, 10]})],
+                  ["--library", made / "no.npz"], ["--truth", no_pi]):  # fmt: skip
+        assert main([*scan, *map(str, given)]) == 3
+        assert "did not answer" not in capsys.readouterr().err
+    assert not (made / "new").exists()
+
+
+# --- what became of the rows ------------------------------------------------------------------------------------------
+
+
+def test_retaken_and_incomplete_rows_of_every_run_are_told(made):
+    """They are the manifest's, whoever wrote it and however often the scan was taken up."""
+    scan = ScanFolder.load(made / "scan")
+    rows = {f["row"]: f for f in scan.facts("row_committed")}
+    with scan.writer() as writer:
+        for row, take in ((2, 1), (2, 2), (5, 1)):
+            writer.append({"fact": "row_rejected", "row": row, "take": take, "reasons": ["x"], "boards": {}})
+        writer.append({**rows[2], "take": 3, "kept_incomplete": ["RH: a gap"]})
+        writer.append({**rows[7], "take": 1, "kept_incomplete": ["RH: a gap"]})
+        writer.append({"fact": "row_withdrawn", "row": 7, "take": 1, "reasons": ["short"]})
+        writer.append({**rows[7], "take": 2})
+    assert manifest.read(made / "scan" / MANIFEST).length
+    assert process(made, *METAL, "--model", "none") == 0
+    quality = json.loads((made / "out" / "quality.json").read_text())
+    assert (quality["rows_retaken"], quality["rows_incomplete"]) == (3, [2])
+    assert "rows retaken" in (made / "out" / "report.html").read_text()

@@ -1,0 +1,168 @@
+"""A folder of products is replaced as a whole: whatever happens, it holds the earlier products or the new ones."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from host import products_folder
+from host.products_folder import check_products_folder, making_products
+from host.report import write_json
+from shared.errors import ConfigError, DataError, DeviceError
+
+OLD = {"image.npz": b"old", "report.html": b"old page", "figures/h.png": b"old h", "figures/p.png": b"old p"}
+NEW = {"image.npz": b"new", "quality.json": b"{}", "figures/h.png": b"new h"}
+
+
+def write(folder: Path, files: dict[str, bytes]) -> None:
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+
+
+def read(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def replace(out: Path) -> None:
+    with making_products(out, "s") as new:
+        write(new, NEW)
+
+
+@pytest.fixture
+def out(tmp_path) -> Path:
+    write(tmp_path / "one", OLD)
+    return tmp_path / "one"
+
+
+@pytest.fixture(params=["one step", "two steps"])
+def exchange(request, monkeypatch):
+    """File systems that swap two folders in one step, and those that cannot."""
+    if request.param == "two steps":
+        monkeypatch.setattr(products_folder, "_exchange", lambda *_: False)
+    return request.param
+
+
+@pytest.mark.usefixtures("exchange")
+def test_the_new_products_are_there_alone(out):
+    replace(out)
+    assert read(out) == NEW
+    assert list(out.parent.iterdir()) == [out]
+    replace(out.parent / "deeper" / "two")
+    assert read(out.parent / "deeper" / "two") == NEW
+
+
+@pytest.mark.parametrize("error", [DataError("x"), OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_an_error_leaves_the_earlier_ones(out, error):
+    def fail(new: Path) -> None:
+        write(new, NEW)
+        raise error
+
+    with pytest.raises(type(error)), making_products(out, "s") as new:
+        fail(new)
+    assert read(out) == OLD
+    assert list(out.parent.iterdir()) == [out]
+
+
+class Killed(BaseException):
+    """The program ends here: nothing that it would still do is done."""
+
+
+@pytest.mark.parametrize("step", range(20))
+def test_killed_at_any_step_the_next_run_finds_the_old_or_the_new(out, exchange, step, monkeypatch):
+    """Where the file system swaps in one step, it is so at every moment; else from the next run's beginning on."""
+    done = iter(range(step, -1, -1))
+
+    def dies(call):
+        def dying(*args, **kwargs):
+            if next(done, 0) == 0:
+                raise Killed
+            return call(*args, **kwargs)
+
+        return dying
+
+    with monkeypatch.context() as patched, suppress(Killed):
+        for owner, name in (
+            (Path, "mkdir"), (Path, "rename"), (Path, "write_bytes"), (Path, "unlink"), (shutil, "rmtree"),
+            (products_folder, "_exchange"), (products_folder, "sync_folder"), (fcntl, "flock"),
+        ):  # fmt: skip
+            patched.setattr(owner, name, dies(getattr(owner, name)))
+        replace(out)
+    if exchange == "one step":
+        assert read(out) in (OLD, NEW)
+    found = {}
+    with suppress(DataError), making_products(out, "s"):
+        found = read(out)
+        raise DataError("nothing")
+    assert found in (OLD, NEW)
+    replace(out)
+    assert read(out) == NEW
+    assert list(out.parent.iterdir()) == [out]
+
+
+@pytest.mark.usefixtures("exchange")
+def test_hidden_files_of_others_are_kept_and_our_mark_is_not(out):
+    write(out, {".gitignore": b"*", ".finished.json": b"{}", ".image.npz.part": b"torn"})
+    replace(out)
+    assert read(out) == {**NEW, ".gitignore": b"*"}
+
+
+def test_a_second_program_is_refused(out):
+    with making_products(out, "s") as new:
+        write(new, NEW)
+        with pytest.raises(ConfigError, match="another program"):
+            replace(out)
+    assert read(out) == NEW
+
+
+def test_a_link_stays_a_link(out):
+    link = out.with_name("latest")
+    link.symlink_to("one")
+    replace(link)
+    assert link.is_symlink()
+    assert read(out) == NEW
+
+
+def test_what_cannot_be_replaced_is_said_at_once(out, monkeypatch):
+    write(out.parent / "thesis", {"thesis.tex": b"precious"})
+    with pytest.raises(ConfigError, match=r"it holds thesis\.tex"):
+        check_products_folder(out.parent / "thesis", "s")
+    for path in (out / "image.npz", out / "image.npz" / "deeper"):
+        with pytest.raises(ConfigError, match="no folder for products"):
+            check_products_folder(path, "s")
+    with monkeypatch.context() as mounted:
+        mounted.setattr(Path, "is_mount", lambda path: path == out)
+        with pytest.raises(ConfigError, match="a mount point"):
+            check_products_folder(out, "s")
+    monkeypatch.chdir(out)
+    with pytest.raises(ConfigError, match="the folder you are in"):
+        check_products_folder(Path(), "s")
+
+
+def test_the_only_products_of_a_scan_are_not_replaced_by_those_of_another(out):
+    write_json(out / "quality.json", {"raw_dropped": {"scan_id": "first", "dropped_utc": "2026-01-02T03:04:05"}})
+    before = read(out)
+    with pytest.raises(ConfigError, match="all that is left of scan first") as e, making_products(out, "second"):
+        pytest.fail("it began")
+    assert "2026-01-02" in e.value.why
+    assert read(out) == before
+    with making_products(out, "first") as new:  # from a copy that has its raw rows
+        write(new, NEW)
+    assert read(out) == NEW
+
+
+def test_products_that_cannot_take_their_place_are_kept_and_named(out, monkeypatch):
+    def busy(*_):
+        raise OSError(16, os.strerror(16))
+
+    monkeypatch.setattr(products_folder, "_exchange", busy)
+    with pytest.raises(DeviceError) as e:
+        replace(out)
+    kept = out.with_name(".one.new")
+    assert str(kept) in e.value.remedy
+    assert (read(kept), read(out)) == (NEW, OLD)

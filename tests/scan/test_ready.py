@@ -1,0 +1,90 @@
+"""Before a row: the Pi's own reason is what is told of a stage that does not home, and the room is that of the rows."""
+
+from __future__ import annotations
+
+import shutil
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from host.doctor.check_disk import check_time
+from host.plan.forecast import forecast
+from host.scan import ready
+from host.scan.ready import check_disk, make_ready
+from host.scan.stop import StopRequest
+from shared.errors import ScanError
+from shared.faults import PiFault
+from shared.stage_line import HOMING_LIMIT_S
+
+
+class HomingPi:
+    """Homes for ever; gives up after `limit_s` with a reason, as the Pi does."""
+
+    def __init__(self, limit_s: float) -> None:
+        self.now, self._limit_s = 0.0, limit_s
+        self._began: float | None = None
+        self.event_socket = SimpleNamespace(poll=self._poll)
+
+    def _poll(self, _: int) -> None:
+        self.now += 1.0  # a Pi answers late, too: whole seconds pass between two looks
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def home(self) -> None:
+        self._began = self.now + 10.0  # accepted, and begun once the stage has been found
+
+    def status(self) -> SimpleNamespace:
+        told = {"homed": False, "scan_id": "", "fault": 0, "reason": ""}
+        if self._began is None:
+            return SimpleNamespace(**told | {"state": "idle"})
+        if self.now > self._began + self._limit_s:
+            lost = {"fault": int(PiFault.STAGE_LOST), "reason": f"not homed after {self._limit_s} s"}
+            return SimpleNamespace(**told | {"state": "fault"} | lost)
+        return SimpleNamespace(**told | {"state": "homing"})
+
+    def events(self) -> list:
+        return []
+
+
+def homing_error(monkeypatch, limit_s: float) -> ScanError:
+    pi: Any = HomingPi(limit_s)
+    monkeypatch.setattr(ready, "time", pi)
+    with pytest.raises(ScanError) as e:
+        make_ready(pi, StopRequest(), lambda *_: None)
+    return e.value
+
+
+def test_the_pi_s_reason_is_told_when_homing_fails(monkeypatch):
+    assert "not homed after" in homing_error(monkeypatch, HOMING_LIMIT_S).what
+
+
+def test_a_pi_that_never_ends_homing_is_not_waited_for_for_ever(monkeypatch):
+    assert "'homing'" in homing_error(monkeypatch, 1e9).what
+
+
+def test_the_machine_and_the_host_wait_by_the_same_limit():
+    from pi_controller import bringup, machine
+
+    assert machine.HOMING_LIMIT_S == bringup.MOTION_LIMIT_S == HOMING_LIMIT_S < ready._HOMING_LIMIT_S
+
+
+@pytest.mark.parametrize("rows", [1, 3, 4])
+def test_room_is_asked_for_what_is_written(make_instrument, tmp_path, monkeypatch, rows):
+    """The law of sizes: rows x boards that are recorded x what one board sends; the same in plan, doctor and scan."""
+    rig = make_instrument(free_disk_bytes=1000)
+    assert len(rig.recorded) == 2
+    need = rows * 2 * rig.grid.columns * rig.burst.pulses * rig.frame_bytes
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 1000))
+    check_disk(tmp_path, rig, rows)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 999))
+    with pytest.raises(ScanError, match=f"needed for {rows} rows"):
+        check_disk(tmp_path, rig, rows)
+
+
+def test_plan_and_doctor_tell_the_size_of_a_scan(make_instrument):
+    rig = make_instrument()
+    assert forecast(rig).raw_bytes == rig.scan_bytes == rig.grid.rows * rig.recorded_row_bytes
+    bench: Any = SimpleNamespace(rig=rig)
+    assert check_time(bench).facts["bytes"] == rig.scan_bytes

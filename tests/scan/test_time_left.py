@@ -1,0 +1,86 @@
+"""Time left: what the rows took, whatever was waited for between them; the same in the terminal and in the page."""
+
+from __future__ import annotations
+
+import statistics
+
+import pytest
+
+from host.preview.snapshot import remaining
+from host.preview.story import Story, seconds
+from host.scan import running
+from host.scan.run import run_scan
+from host.scan.stop import StopRequest
+from host.scan.time_left import time_left, usual_row_s
+
+ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
+
+
+def test_time_left_is_rows_times_their_time_less_what_has_passed_of_one():
+    assert time_left(10, ROW_S) == 10 * ROW_S
+    assert time_left(0, ROW_S, 5.0) == 0
+    for elapsed in (0.0, 1.0, ROW_S):
+        assert time_left(10, ROW_S, elapsed) == 10 * ROW_S - elapsed
+    assert time_left(10, ROW_S, 1e6) == 9 * ROW_S, "an overdue row ends now, the others still take their time"
+    assert time_left(10, ROW_S, -3.0) == 10 * ROW_S
+
+
+def test_a_row_that_took_long_does_not_change_what_rows_usually_take():
+    usual = [11.0, 12.0, 13.0] * 20
+    assert usual_row_s([*usual, 900.0]) == statistics.median(usual)
+    assert usual_row_s([*usual, *[6.0] * 25]) == 6.0, "a rig that was sped up is believed after 25 rows"
+
+
+class Clock:
+    """Stands for `time`: it goes only when it is told to; whoever sleeps through a pause sleeps long."""
+
+    def __init__(self, stop: StopRequest) -> None:
+        self.now, self._stop = 1000.0, stop
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, _: float) -> None:
+        self.now += PAUSE_S
+        self._stop.paused = False
+
+
+def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
+    """Rows of 12 s, the first after homing, the third after a pause of two hours."""
+    stop, told = StopRequest(), []
+    clock = Clock(stop)
+    monkeypatch.setattr(running, "time", clock)
+
+    def progress(p) -> None:
+        if p.phase == "home":
+            clock.now += HOMING_S
+        if p.state == "checking" and p.phase == "state":
+            clock.now += ROW_S
+        if p.phase == "committed":
+            told.append((p.committed, p.remaining_s))
+            stop.paused = p.committed == 2
+        if p.phase == "wait":
+            told.append((p.message, p.remaining_s))
+
+    result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
+    assert result.exit_status == "success"
+    assert [f["fact"] for f in result.folder.facts("scan_paused")] == ["scan_paused"]
+    assert [t for t in told if isinstance(t[0], int)] == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
+    assert [left for word, left in told if isinstance(word, str)] == [2 * ROW_S] * 2, "before the pause and after it"
+
+
+def test_the_page_says_the_same(rig, tmp_path):
+    """The facts of a scan with times of our own: rows a minute apart, a pause of a day before the last."""
+    run_scan(rig.instrument, tmp_path / "s")
+    utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
+    story: Story | None = None
+    for fact in running.ScanFolder.load(tmp_path / "s").content.facts:
+        if story is None:
+            story = Story(fact | {"started_utc": utc.format(1, 0)})
+        elif fact["fact"] == "row_committed" and fact["row"] < 3:
+            story.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
+    assert story is not None
+    story.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
+    story.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
+    left, _ = remaining(story, seconds(utc.format(2, 3)) + 20)
+    assert left == pytest.approx(time_left(1, 60.0, 20.0))

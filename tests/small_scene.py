@@ -1,0 +1,31 @@
+"""Scene files small enough for a test: few positions, and a metal plate in the middle or nothing at all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import tomli_w
+
+
+def small_scene(
+    columns: int,
+    rows: int,
+    step_mm: tuple[float, float] = (10.0, 10.0),
+    pulses: int = 2,
+    pixels: int = 20,
+    pixel_mm: float = 8.0,
+    metal: bool = True,
+    seed: int = 3,
+) -> str:
+    """Text of a scene file: grid, burst and a square image; with `metal` a plate of 60 mm in its middle."""
+    scene: dict[str, Any] = {
+        "name": "a metal plate" if metal else "nothing",
+        "seed": seed,
+        "grid": {"columns": columns, "rows": rows, "step_x_mm": step_mm[0], "step_y_mm": step_mm[1]},
+        "burst": {"pulses": pulses},
+        "image": {"columns": pixels, "rows": pixels, "pixel_mm": pixel_mm},
+    }
+    if metal:
+        plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}
+        scene["plates"] = [plate]
+    return tomli_w.dumps(scene)

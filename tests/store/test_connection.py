@@ -1,0 +1,118 @@
+"""A scan goes on with a rig file that says otherwise how the rig is reached, and with nothing else otherwise."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+
+from host.cli import main
+from host.preview.story import Story
+from host.scan.run import resume_scan
+from host.store.connection import ADDRESSES, check_same_scan, connection_of, reconnected
+from host.store.scanfolder import ScanFolder
+from shared.config import Instrument, load_instrument
+from shared.errors import ConfigError
+from shared.tables import decode, to_builtins
+
+REPO = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def begun() -> Instrument:
+    table = to_builtins(load_instrument(REPO / "instrument.toml"))
+    table["radar"] |= {"servers": {b["name"]: f"192.168.33.1:{70 + k}" for k, b in enumerate(table["boards"])}}
+    return decode(table, Instrument, "begun")
+
+
+def leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    items = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else None
+    if items is None:
+        yield path, node
+    for key, value in items or ():
+        yield from leaves(value, (*path, key))
+
+
+def other(value: Any) -> Any:
+    return not value if isinstance(value, bool) else value + (1 if isinstance(value, int | float) else "1")
+
+
+def may_change(path: tuple[str | int, ...]) -> bool:
+    board = path[0] == "boards" and path[2] in ADDRESSES
+    return board or path[0] in ("pi", "limits") or path[:2] == ("radar", "servers")
+
+
+def test_every_key_is_taken_up_or_refused_by_name(begun):
+    """Each number, text and switch of the rig file, changed alone."""
+    taken, refused = 0, 0
+    for path, value in leaves(to_builtins(begun)):
+        table = copy.deepcopy(to_builtins(begun))
+        node: Any = table
+        for key in path[:-1]:
+            node = node[key]
+        node[path[-1]] = other(value)
+        try:
+            given = decode(table, Instrument, "given")
+        except ConfigError:
+            continue  # no rig file says this
+        assert given != begun
+        if may_change(path):
+            check_same_scan(begun, given, "mine.toml")
+            assert reconnected(begun, connection_of(given)) == given
+            taken += 1
+        else:
+            name = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
+            with pytest.raises(ConfigError) as e:
+                check_same_scan(begun, given, "mine.toml")
+            assert f"{name} is {value!r} in the scan and {other(value)!r} there" in e.value.what
+            refused += 1
+    assert taken > 20
+    assert refused > 40
+
+
+def moved(rig: Instrument) -> Instrument:
+    table = to_builtins(rig)
+    table["pi"] |= {"command_address": "tcp://10.1.2.3:4", "event_address": "tcp://10.1.2.3:5"}
+    table["boards"][1] |= {"card_address": "10.1.2.9"}
+    table["limits"] |= {"row_retakes": 7}
+    return decode(table, Instrument, "moved")
+
+
+def test_what_was_taken_up_holds_from_then_on(undisturbed, tmp_path):
+    """For every reader, and for a later resume that says nothing; what the scan was begun with is still there."""
+    small = undisturbed.copy(tmp_path / "moved")
+    scan = ScanFolder.load(small.path)
+    begun, now = scan.instrument, moved(scan.instrument)
+    with small._connected():
+        assert resume_scan(small.path, rig_now=now).folder.instrument == now
+        assert resume_scan(small.path).folder.instrument == now
+    scan = ScanFolder.load(small.path)
+    assert scan.instrument == now
+    started, (first, second) = scan.facts("scan_started")[0], scan.facts("scan_resumed")
+    assert decode(started["instrument"], Instrument, "begun") == begun
+    assert (first["rig"], "rig" in second) == (connection_of(now), False)
+    story = Story(started)
+    for fact in (first, second):
+        story.add_fact(fact)
+    assert story.instrument == now
+    assert small.rows() == undisturbed.digests
+    assert small.image() == undisturbed.final_image
+
+
+def test_another_rig_is_refused_before_anything_is_written(undisturbed, tmp_path, capsys):
+    small = undisturbed.copy(tmp_path / "other")
+    before = (small.path / "manifest.jsonl").read_bytes()
+    table = to_builtins(moved(ScanFolder.load(small.path).instrument))
+    table["grid"] |= {"columns": 5}
+    table["chirp"] |= {"samples": table["chirp"]["samples"] - 1}
+    (tmp_path / "rig.toml").write_text(tomli_w.dumps(table))
+    assert main(["resume", str(small.path), "--config", str(tmp_path / "rig.toml")]) == 2
+    said = capsys.readouterr().err
+    assert "grid.columns is 3 in the scan and 5 there" in said
+    assert "chirp.samples" in said
+    assert "pi." not in said.partition("why:")[0]
+    assert (small.path / "manifest.jsonl").read_bytes() == before

@@ -1,0 +1,61 @@
+"""A disk that does not answer is an error; only what it says wrongly is taken again, and only a scan is 'in use'."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from host.store import appending, validate
+from host.store.manifest import ManifestWriter
+from host.store.scanfolder import ScanFolder
+from shared.errors import DeviceError
+
+
+def test_lock_that_another_program_holds_is_told_from_a_disk_without_locks(tmp_path, monkeypatch):
+    path = tmp_path / "manifest.jsonl"
+    with ManifestWriter(path, create=True), pytest.raises(DeviceError, match="another program"):
+        ManifestWriter(path, create=False)
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(appending.fcntl, "flock", no_locks)
+    with pytest.raises(DeviceError, match="cannot be locked: No locks") as e:
+        ManifestWriter(path, create=False)
+    assert "another program" not in str(e.value)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".idx"])
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE])
+def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed, monkeypatch, suffix, number):
+    scan = ScanFolder.load(undisturbed.path)
+    bad = (undisturbed.path / next(iter(scan.committed()[0].boards.values())).file).with_suffix(suffix)
+
+    def fails(path: Path) -> None:
+        if path == bad:
+            raise OSError(number, os.strerror(number))
+
+    opened, read = Path.open, Path.read_bytes
+    monkeypatch.setattr(Path, "open", lambda path, *how, **more: fails(path) or opened(path, *how, **more))
+    monkeypatch.setattr(Path, "read_bytes", lambda path: fails(path) or read(path))
+    with pytest.raises(DeviceError, match=os.strerror(number)) as e:
+        validate.damaged_rows(scan)
+    assert f"polysight resume {undisturbed.path}" in e.value.remedy
+    assert [f.where for f in validate.validate(undisturbed.path)] == [str(bad.relative_to(undisturbed.path))]
+
+
+def test_row_whose_file_is_gone_is_taken_again(undisturbed, monkeypatch):
+    scan = ScanFolder.load(undisturbed.path)
+    gone = undisturbed.path / next(iter(scan.committed()[1].boards.values())).file
+    opened = Path.open
+
+    def absent(path: Path, *how, **more):
+        if path == gone:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+        return opened(path, *how, **more)
+
+    monkeypatch.setattr(Path, "open", absent)
+    assert list(validate.damaged_rows(scan)) == [1]

@@ -35,7 +35,7 @@ def _line(row: dict[str, Any]) -> str:
     name = row["name"] or "not named"
     sure = f"{100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
     e = row.get("permittivity")
-    told = "metal-like" if e is None else f"{e['real']:6.2f} - j{-e['imag']:5.2f}"
+    told = ("metal-like" if row.get("metal_like") else "-") if e is None else f"{e['real']:6.2f} - j{-e['imag']:5.2f}"
     if e is not None and e.get("real_std") is not None:
         told += f"  +- {e['real_std']:.2f}"
     return f"{row['label']:>3}  {name:24s} {sure:>5s}  {told}\n"

@@ -101,7 +101,11 @@ def _check_options(options: Options, rig: Instrument, calibration: Calibration) 
     """Refuse what could not be used when the scan is over, before the rig is touched. Raises PolysightError."""
     placed = calibration.rig(rig)
     grid = image_grid(placed)
-    check_options(options, placed, (grid.x_m, grid.y_m))
+    metal = check_options(options, placed, (grid.x_m, grid.y_m))
+    reference = calibration.reference()
+    if reference is not None and options.metal_box_mm is None and metal is None:
+        reference.check_rig(calibration.imaged_with(placed), calibration.name_of("metal"))
+        reference.check_axes(grid.x_m, grid.y_m)
 
 
 def _check_new(folder: Path) -> None:
@@ -132,10 +136,14 @@ def scan(config: Path, folder: Path, truth: Path | None, options: Options, keep_
     def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
         def told(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
-                shutil.copyfile(truth, folder / TRUTH)
+                with suppress(OSError):  # said below: a row is worth more
+                    shutil.copyfile(truth, folder / TRUTH)
             tell(progress)
 
-        return run_scan(rig, folder, on_row=on_row, progress=told, keep_incomplete=keep_incomplete, stop=stop)
+        result = run_scan(rig, folder, on_row=on_row, progress=told, keep_incomplete=keep_incomplete, stop=stop)
+        if truth is not None and not (folder / TRUTH).exists():
+            sys.stderr.write(f"note: {truth} was not copied into {folder}; a report does without\n")
+        return result
 
     return _run(folder, options, process, take)
 

@@ -107,7 +107,8 @@ def _absolute(value: Any) -> Any:
     return value.absolute() if isinstance(value, Path) else value
 
 
-NOT_DATA = ("products", ".products.new", "products-export", "control")  # folders of a scan
+_MEANING = 2  # counts changes of what products of the same data hold
+NOT_DATA = ("products", ".products.new", ".products.old", "products-export", "control")  # folders of a scan
 
 
 def made_with(data: Path, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -115,7 +116,8 @@ def made_with(data: Path, options: Mapping[str, Any]) -> dict[str, Any]:
     told = {key: _told(value) for key, value in sorted(options.items())}
     files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
     listing = [f"{p.relative_to(data)} {s.st_size} {s.st_mtime_ns}" for p in files for s in (p.stat(),)]
-    return {"versions": versions(), "options": told, "data": hashlib.sha256("\n".join(listing).encode()).hexdigest()}
+    digest = hashlib.sha256("\n".join(listing).encode()).hexdigest()
+    return {"versions": versions(), "products": _MEANING, "options": told, "data": digest}
 
 
 def _told(value: Any) -> Any:

@@ -44,11 +44,7 @@ def check_products_folder(out: Path, scan_id: str) -> None:
     except FileNotFoundError:
         return
     except OSError as e:
-        raise ConfigError(
-            f"{out}: no folder for products: {e.strerror}",
-            "a file is in the way, or you may not write there",
-            "give another --out",
-        ) from None
+        raise _no_folder(out, e) from None
     if strangers:
         raise ConfigError(
             f"{out} is not empty: it holds {strangers[0]}",
@@ -97,11 +93,7 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
             f"{out}: another program is writing products there", "it was started twice", "give another --out, or wait"
         ) from None
     except OSError as e:
-        raise ConfigError(
-            f"{out}: no folder for products: {e.strerror}",
-            "a file is in the way, or you may not write there",
-            "give another --out",
-        ) from None
+        raise _no_folder(out, e) from None
     keep = False
     try:
         yield new
@@ -118,6 +110,14 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
         os.close(lock)
         if not keep:
             shutil.rmtree(new, ignore_errors=True)
+
+
+def _no_folder(out: Path, e: OSError) -> ConfigError:
+    return ConfigError(
+        f"{out}: no folder for products: {e.strerror}",
+        "a file is in the way, or you may not write there",
+        "give another --out",
+    )
 
 
 def _check_writable(folder: Path) -> None:

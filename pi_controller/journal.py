@@ -272,10 +272,12 @@ class JournalFolder:
         """The journal of a scan, made when absent."""
         return Journal(self.path_of(scan_id))
 
-    def check_room(self, positions: int) -> None:
-        """Refuse a scan for whose journal the disk has no room. Raises JournalFullError."""
-        needed = positions * CAPTURE_BYTES + SPARE_BYTES
+    def check_room(self, scan_id: str, positions: int) -> None:
+        """Refuse a scan for whose journal, or the rest of it, the disk has no room. Raises JournalFullError."""
+        path = self.path_of(scan_id)
         try:
+            there = path.stat().st_size if path.exists() else 0
+            needed = max(0, positions * CAPTURE_BYTES - there) + SPARE_BYTES
             free = shutil.disk_usage(self.path).free
         except OSError as e:
             raise _full(self.path, e) from None

@@ -68,7 +68,7 @@ class Ledger:
         """
         self.broken = False
         self.commit()
-        self._folder.check_room(plan.positions)
+        self._folder.check_room(scan_id, plan.positions)
         journal = self._journal
         if journal is None or self.scan_id != scan_id:
             journal = self._folder.open(scan_id)

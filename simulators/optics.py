@@ -96,7 +96,7 @@ def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
     """Constant before the plates' integral: object_gain d / (j lambda), so that an endless mirror gives -gain d / R.
 
     Kirchhoff's integral (Goodman, Introduction to Fourier Optics, section 3.5), which has phase +2 pi f tau as well:
-    field = (1 / j lambda) integral r(theta) obliquity exp(+j 2 pi f (r1 + r2) / c) / (r1 r2) dA.
+    field = (1 / j lambda) integral conj(r(theta)) obliquity exp(+j 2 pi f (r1 + r2) / c) / (r1 r2) dA.
     """
     return complex(scene.object_gain * ant.direct_m[0] * frequency_hz / SPEED_OF_LIGHT_M_S / 1j)
 

@@ -67,7 +67,7 @@ class Calibration:
         programmed = [khz for khz in (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) if khz]
         for board in rig.receivers if self.filters is not None else ():
             found = self.filters.boards.get(board.name) if self.filters else None
-            if found is None or [float(khz) for khz in found.programmed_khz] != programmed:
+            if found is None or [float(khz) for khz in found.programmed_khz if khz] != programmed:
                 what = "is not in it" if found is None else f"was measured with {found.programmed_khz} kHz programmed"
                 raise ConfigError(
                     f"{self._path('hpf')}: {board.name} {what}, the rig file says {programmed}",

@@ -53,6 +53,7 @@ class Placement:
         self._full = 0  # payload of the largest packet
         self._last_sequence = 0
         self._last_size = 0
+        self.forgotten = False  # what came first was of the record before
 
     @property
     def complete(self) -> bool:
@@ -129,6 +130,7 @@ class Placement:
             self.counts.placed, self.counts.leftover = 0, self.counts.leftover + 1
             self.start, self._base, self._certain, self._full = behind, None, False, 0
             self.received = self.extent = self._last_size = 0
+            self.forgotten = True
 
     def _find_base(self, sequence: int, byte_count: int, size: int) -> int:
         """The base from the first packet seen, which need not be the first of the record."""

@@ -56,6 +56,8 @@ class _Row:
 
         Before it, when the socket was last found empty: these packets came later than that.
         """
+        if self.placement.forgotten:
+            self._noted, self.placement.forgotten = 0, False
         if self._noted + 2 > len(self._arrivals):
             self._arrivals = np.concatenate([self._arrivals, np.zeros_like(self._arrivals)])
         if self._quiet_ns and self._noted:

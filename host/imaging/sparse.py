@@ -31,7 +31,8 @@ class Reconstruction:
     Attributes
     ----------
     image
-        complex64 [ny, nx]: reflectivity of each pixel; a point's own amplitude, where the matched filter spreads it.
+        complex64 [ny, nx]: reflectivity of each pixel as the samples have it, the conjugate of what `ChannelImages.h`
+        and `v` hold; a point's own amplitude, where the matched filter spreads it.
     residual
         float64 [iteration]: `|W (G A x - y)| / |W y|`, what the image does not explain.
     """

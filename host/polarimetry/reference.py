@@ -104,7 +104,8 @@ class PlaneReference:
             raise DataError(
                 f"{name} is of another rig: {'; '.join(found)}",
                 "the rig or its file was changed after the metal plate was scanned, and the gains with it",
-                "scan the metal plate again with the rig as it is, and calibrate with it; or put the rig file back",
+                "empty calibration.metal, scan the metal plate again with the rig as it is, and calibrate with it; or"
+                " put the rig file back",
             )
 
     def check_bands(self, count: int, name: str = "the metal reference") -> None:

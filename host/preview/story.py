@@ -131,7 +131,8 @@ class Story:
         self.marks[row] = "rejected"
         self.rows_since_trouble = 0
         for name in self._rejected:
-            self._rejected[name] += any(f.get("board") == name for f in faults)
+            told = any(f.get("board") == name for f in faults)
+            self._rejected[name] += told if faults else any(r.startswith(f"{name}:") for r in reasons)  # older scans
         self.notices.append(of_rejection(row, int(fact["take"]), reasons, faults, fact.get("rejected_utc", "")))
 
     def _row_withdrawn(self, fact: Fact) -> None:

@@ -102,8 +102,9 @@ class CaptureRig:
         """Stop the records and take the rows: their files are durable when this returns. Raises DeviceError."""
         self.stop_records()
         deadline = time.monotonic() + _COMPLETED_LIMIT_S
-        for card in self.cards.values():
-            card.wait_completed(max(0.0, deadline - time.monotonic()))
+        for name, receiver in self.receivers.items():
+            if not receiver.poll().complete:  # of a complete row nothing can follow
+                self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()
         return {name: receiver.end_row(statuses[name]) for name, receiver in self.receivers.items()}
 

@@ -19,7 +19,7 @@ def differences(stage: Stage, hello: HelloReply) -> list[str]:
     """Each placing key of `[stage]` that the Pi has otherwise, with both values; [] for a Pi that does not tell."""
     own = stage.placing
     return [
-        f"stage.{key} is {own[key]:g} here and {hello.stage[key]:g} on the Pi"
+        f"stage.{key} is {own[key]:.10g} here and {hello.stage[key]:.10g} on the Pi"
         for key in own
         if hello.stage.get(key, own[key]) != own[key]
     ]

@@ -16,7 +16,7 @@ from host.radar.backends import radar_control
 from host.radar.interface import RadarControl
 from host.scan.capture_rig import CaptureRig
 from host.scan.pi_client import PiClient
-from host.scan.pi_stage import check_same_stage, pi_fact
+from host.scan.pi_stage import check_same_stage, differences, pi_fact
 from host.scan.processing import OnRow
 from host.scan.result import OnProgress, ScanProgress, ScanResult
 from host.scan.running import RunningScan
@@ -125,7 +125,10 @@ def resume_scan(
                 "simulated and measured rows must never be mixed in one scan",
                 "start the Pi with the backend the scan was begun with, or make a new scan",
             )
-        untold = check_same_stage(scan.instrument.stage, hello, f"{folder}")
+        if any(fact.get("pi", {}).get("stage") for fact in scan.facts("scan_started")):
+            untold = check_same_stage(scan.instrument.stage, hello, f"{folder}")
+        else:  # its rows lie where that Pi had them, whatever the host's rig file says
+            untold = [f"when the scan began nobody compared: {d}" for d in differences(scan.instrument.stage, hello)]
         missing = scan.plan.rows - len(scan.committed())
         fact = {"fact": "scan_resumed", "resumed_utc": utc_now(), "rows_missing": missing, "pi": pi_fact(hello)}
         told = {} if rig_now is None else {"rig": connection_of(rig_now)}

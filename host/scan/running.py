@@ -283,9 +283,15 @@ class RunningScan:
         )
         waiting = f"; {self._queue.left} rows wait to be processed" if self._queue.left else ""
         self._say("end", reason + waiting)
-        if begun:
+        if not begun:
+            return
+        try:
             self._pi.end_run(self._scan.scan_id, status, reason)
             self._pi.drain()
+        except PolysightError as e:
+            if status != "success":
+                raise
+            self.result.warnings.append(f"the Pi could not be told that the scan ended: {e.what}")
 
     def _point(self, points: int) -> None:
         if self._stop.after_row and not self._stop.now and not self._told_stop:

@@ -93,7 +93,10 @@ def rig_of(s: Collection, base: Instrument, path: Path) -> Rig:
     """The base rig with a scan's own settings; what the JSON does not tell stays the base's. Raises ConfigError."""
     c = s.chirp_configs[0]
     grid = {"columns": s.total_x, "rows": s.total_y, "step_x_mm": s.dx, "step_y_mm": s.dy}
-    travel = max(base.stage.travel_x_mm, s.total_x * s.dx), max(base.stage.travel_y_mm, s.total_y * s.dy)
+    travel = (  # their stage had the room
+        max(base.stage.travel_x_mm, s.total_x * s.dx + 2 * base.stage.run_up_mm(s.dx)),
+        max(base.stage.travel_y_mm, s.total_y * s.dy + 2 * base.stage.run_up_mm(s.dy)),
+    )
     table = msgspec.to_builtins(base)
     table["grid"] = grid
     table["stage"] |= {"travel_x_mm": travel[0], "travel_y_mm": travel[1]}

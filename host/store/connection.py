@@ -17,6 +17,10 @@ ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
 """Of each board; `radar.servers` holds the addresses of their control servers."""
 
 
+SERIAL = ("port", "baud")
+"""Of the stage: the Pi has its own. Calibration is not compared either: a scan keeps copies of its files."""
+
+
 def connection_of(rig: Instrument) -> dict[str, Any]:
     """That part of a rig file, as `scan_resumed` records it."""
     table = to_builtins(rig)
@@ -40,8 +44,10 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
     ConfigError
         naming every key in which it does.
     """
-    table = to_builtins(begun)
-    found = list(_differences(table, _with(to_builtins(given), connection_of(begun)), ""))
+    table, other = to_builtins(begun), _with(to_builtins(given), connection_of(begun))
+    other["stage"] = {**other["stage"], **{key: table["stage"][key] for key in SERIAL}}
+    other["calibration"] = table["calibration"]
+    found = list(_differences(table, other, ""))
     if found:
         raise ConfigError(
             f"{name} is not the rig file of this scan: {'; '.join(found)}",

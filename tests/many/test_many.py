@@ -228,7 +228,7 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     assert "plate   done" in told
     assert (tmp_path / "out" / "plate" / "report.html").exists()
     mark = json.loads((tmp_path / "out" / "plate" / MARK).read_text())
-    assert {"versions", "options", "data"} == set(mark["made_with"])
+    assert {"versions", "products", "options", "data"} == set(mark["made_with"])
     assert len(mark["made_with"]["options"]["config"]) == 64  # digest of the rig file
     (broken / "data_collection_cfg.json").unlink()
     assert main(command) == 0

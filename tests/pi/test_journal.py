@@ -221,10 +221,10 @@ def test_a_damaged_journal_is_a_line_of_the_log(tmp_path):
 
 def test_no_scan_begins_without_room_for_its_journal(tmp_path, monkeypatch):
     folder = JournalFolder(tmp_path)
-    folder.check_room(70_000)
+    folder.check_room("scan", 70_000)
     free = SPARE_BYTES + 70_000 * CAPTURE_BYTES
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
-    folder.check_room(70_000)
+    folder.check_room("scan", 70_000)
     with pytest.raises(JournalFullError, match=r"26\.6 MB free, 26\.6 MB needed for 70001 positions"):
-        folder.check_room(70_001)
+        folder.check_room("scan", 70_001)
     folder.close()

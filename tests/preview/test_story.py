@@ -115,7 +115,7 @@ def test_rejections_of_earlier_releases_are_told_without_a_cause(begun):
     story, _ = begun
     story.add_fact({"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}})
     assert (story.marks[2], story.notices[-1].detail) == ("rejected", "RV: no data")
-    assert (story.notices[-1].why, story.boards["RV"].retaken) == ("", 0)
+    assert (story.notices[-1].why, story.boards["RV"].retaken) == ("", 1)
 
 
 def test_withdrawn_is_missing_until_taken_again(begun):

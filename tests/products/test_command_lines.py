@@ -17,7 +17,7 @@ from host.report import write_json
 REPO = Path(__file__).resolve().parents[2]
 E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}
 SEGMENTS = [
-    {"label": 1, "name": "copper", "confidence": None, "metal_reference": True, "permittivity": None},
+    {"label": 1, "name": "copper", "confidence": None, "metal_like": True, "permittivity": None},
     {"label": 2, "name": "PET", "confidence": 0.62, "metal_reference": False, "permittivity": E},
     {"label": 3, "name": None, "confidence": None, "metal_reference": False, "permittivity": E | {"real_std": None}},
 ]

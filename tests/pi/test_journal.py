@@ -228,3 +228,14 @@ def test_no_scan_begins_without_room_for_its_journal(tmp_path, monkeypatch):
     with pytest.raises(JournalFullError, match=r"26\.6 MB free, 26\.6 MB needed for 70001 positions"):
         folder.check_room("scan", 70_001)
     folder.close()
+
+
+def test_a_scan_that_goes_on_needs_room_for_the_rest_only(tmp_path, monkeypatch):
+    folder = JournalFolder(tmp_path)
+    folder.path_of("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
+    free = SPARE_BYTES + 1_000 * CAPTURE_BYTES
+    monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    folder.check_room("there", 70_000)
+    with pytest.raises(JournalFullError):
+        folder.check_room("another", 70_000)
+    folder.close()

@@ -53,3 +53,14 @@ def test_what_does_not_place_rows_may_differ(rig):
     stage = rig.instrument.stage
     same = msgspec.structs.replace(stage, port="elsewhere", speed_mm_s=stage.speed_mm_s / 2, heartbeat_ms=2000)
     assert same.placing == stage.placing
+
+
+def test_a_scan_begun_when_nobody_compared_goes_on_with_its_pi_and_says_so(rig, tmp_path):
+    """Its rows lie where that Pi had them; refusing it would have them put elsewhere."""
+    stop, right = StopRequest(), rig.pi.stage
+    rig.pi.stage = {}
+    run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
+    rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
+    result = resume_scan(tmp_path / "s")
+    assert result.folder.complete
+    assert any("nobody compared" in w and "centre_x_mm" in w for w in result.warnings)

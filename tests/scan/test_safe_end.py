@@ -19,6 +19,7 @@ import tomli_w
 from host import live, progress
 from host.options import Options
 from host.scan import running
+from host.scan.pi_client import PiClient
 from host.scan.ready import make_ready
 from host.scan.run import resume_scan, run_scan
 from host.scan.stop import StopRequest, hangups_pass
@@ -268,3 +269,16 @@ def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_pa
         live.scan(config, tmp_path / "s", None, Options(), False, True)
     assert "every row is committed" in capsys.readouterr().out
     assert f"polysight process {tmp_path / 's'}" in e.value.remedy
+
+
+def test_a_whole_scan_does_not_fail_because_the_pi_could_not_be_told(rig, tmp_path, monkeypatch):
+    """Its disk is full, say: every row is committed, and what follows has all it needs."""
+
+    def refused(*_):
+        raise DeviceError("the Pi did not write it down", "its disk is full", "remove old journals")
+
+    monkeypatch.setattr(PiClient, "end_run", refused)
+    result = run_scan(rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.folder.complete) == ("success", True)
+    assert any("could not be told" in w for w in result.warnings)
+    assert [f["exit_status"] for f in result.folder.facts("scan_ended")] == ["success"]

@@ -107,6 +107,16 @@ def test_complete_rows_come_back_byte_for_byte(write, base):
         _whole(scan.read_row(board, row), full)
 
 
+@pytest.mark.parametrize("columns", [400, 450])
+def test_a_grid_wider_than_the_base_rigs_travel_had_room_there(write, base, columns):
+    folder, _ = write(total_x=columns)
+    for file in folder.glob("R?/*_[1-9]*"):
+        file.unlink()  # they begin where a narrower grid ends
+    rig = open_scan(folder, base).instrument
+    assert rig.grid.columns == columns
+    assert rig.stage.travel_x_mm > columns * 2
+
+
 def test_settings_make_the_rig(write, base):
     folder, _ = write(board_dist=1.6)
     scan = open_scan(folder, base)

@@ -125,7 +125,7 @@ def resume_scan(
                 "simulated and measured rows must never be mixed in one scan",
                 "start the Pi with the backend the scan was begun with, or make a new scan",
             )
-        if any(fact.get("pi", {}).get("stage") for fact in scan.facts("scan_started")):
+        if not hello.stage or any(fact.get("pi", {}).get("stage") for fact in scan.facts("scan_started")):
             untold = check_same_stage(scan.instrument.stage, hello, f"{folder}")
         else:  # its rows lie where that Pi had them, whatever the host's rig file says
             untold = [f"when the scan began nobody compared: {d}" for d in differences(scan.instrument.stage, hello)]

@@ -60,6 +60,8 @@ def test_a_scan_begun_when_nobody_compared_goes_on_with_its_pi_and_says_so(rig, 
     stop, right = StopRequest(), rig.pi.stage
     rig.pi.stage = {}
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
+    again = StopRequest()
+    assert UNTOLD in resume_scan(tmp_path / "s", on_row=lambda _: again.request(), stop=again).warnings
     rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
     result = resume_scan(tmp_path / "s")
     assert result.folder.complete

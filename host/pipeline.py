@@ -1,4 +1,4 @@
-"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> polarimetry -> materials -> report."""
+"""The whole flow in one file: recorded rows -> synchronised rows -> images -> polarimetry -> materials -> report."""
 
 from __future__ import annotations
 

@@ -12,12 +12,12 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-$(VENV)/installed: pyproject.toml shared/pyproject.toml pi_controller/pyproject.toml host/pyproject.toml simulators/pyproject.toml
+$(VENV)/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 2; }
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	@echo "installing the instrument and its tools into $(VENV)"
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -e ./shared -e ./pi_controller -e ./host -e ./simulators --group dev
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -e . --group dev
 	@touch $@
 
 demo: $(VENV)/installed  ## the whole rig, simulated: scan nine materials, end with a report (OUT=out)
@@ -65,7 +65,7 @@ pi-install: $(VENV)/installed  ## install or update the Pi half on a Pi: make pi
 	@test -n "$(HOST)" || { echo "make pi-install HOST=user@address"; exit 2; }
 	rm -rf $(OUT)/pi && mkdir -p $(OUT)/pi/sources
 	tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=build shared pi_controller | tar -x -C $(OUT)/pi/sources
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/shared $(OUT)/pi/sources/pi_controller
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/pi_controller
 	cp pi_controller/install.sh pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
 	tar -c -C $(OUT)/pi/copied . | ssh $(HOST) 'rm -rf $(ON_PI) && mkdir -p $(ON_PI) && tar -x -C $(ON_PI)'
 	ssh -t $(HOST) sudo $(ON_PI)/install.sh

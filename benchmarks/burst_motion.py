@@ -18,14 +18,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.data import ROOT
-from host.imaging import ImageBuilder
-from host.imaging.grid import row_offsets_m
-from host.sync import BoardSetup, synchronise_row
-from shared.config import Instrument, load_instrument
-from shared.raster import mean_burst_travel_mm, plan_raster
-from simulators.radar import SimulatedRig
-from simulators.scene import Point, Scene, apply_scene
-from simulators.simulate import row_offsets_mm
+from polysight.host.imaging import ImageBuilder
+from polysight.host.imaging.grid import row_offsets_m
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.raster import mean_burst_travel_mm, plan_raster
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import Point, Scene, apply_scene
+from polysight.simulators.simulate import row_offsets_mm
 
 Images = dict[str, NDArray[np.complex64]]
 TREATMENTS = {

@@ -16,17 +16,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from host.imaging.grid import Antennas, image_grid, row_offsets_m
-from host.imaging.reduce import scene_gate_m
-from host.store.source import RowData
-from host.sync.chain import SyncedRow
-from shared.config import Board, Instrument, load_instrument
-from shared.raster import RasterPlan, Row, plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.layouts import OwnLayout
-from simulators.radar import SimulatedRig
-from simulators.scene import Scene, apply_scene, load_scene
-from simulators.simulate import row_offsets_mm
+from polysight.host.imaging.grid import Antennas, image_grid, row_offsets_m
+from polysight.host.imaging.reduce import scene_gate_m
+from polysight.host.store.source import RowData
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.raster import RasterPlan, Row, plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.layouts import OwnLayout
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import Scene, apply_scene, load_scene
+from polysight.simulators.simulate import row_offsets_mm
 
 ROOT = Path(__file__).parents[1]
 RIG = ROOT / "instrument.toml"

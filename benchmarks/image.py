@@ -16,14 +16,14 @@ from benchmarks.data import as_synced, published, temporary, write_point_cube
 from benchmarks.measure import Seconds, one_core
 from benchmarks.published.image import SETTINGS, form_image
 from benchmarks.table import Line, add_arguments, show, write
-from host.imaging import ImageBuilder, kernels
-from host.imaging.aperture import Aperture, row_starts_m
-from host.imaging.grid import Antennas, image_grid, scan_offsets_m
-from host.imaging.imager import choose_imager
-from host.imaging.incremental import IncrementalImager
-from host.imaging.reduce import reduction, scene_gate_m
-from shared.config import Board, Instrument
-from shared.raster import plan_raster
+from polysight.host.imaging import ImageBuilder, kernels
+from polysight.host.imaging.aperture import Aperture, row_starts_m
+from polysight.host.imaging.grid import Antennas, image_grid, scan_offsets_m
+from polysight.host.imaging.imager import choose_imager
+from polysight.host.imaging.incremental import IncrementalImager
+from polysight.host.imaging.reduce import reduction, scene_gate_m
+from polysight.shared.config import Board, Instrument
+from polysight.shared.raster import plan_raster
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 5

@@ -20,13 +20,13 @@ from benchmarks.data import temporary
 from benchmarks.measure import machine
 from benchmarks.table import add_arguments as add_common
 from benchmarks.table import write
-from host.scan.pi_client import PiClient
-from shared.config import Instrument, load_instrument
-from shared.messages import BeginRun, Capture, RowFinished
-from shared.raster import plan_raster
-from shared.tables import to_builtins
-from shared.wires import WireClient, WireEdge
-from simulators import gpio
+from polysight.host.scan.pi_client import PiClient
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.messages import BeginRun, Capture, RowFinished
+from polysight.shared.raster import plan_raster
+from polysight.shared.tables import to_builtins
+from polysight.shared.wires import WireClient, WireEdge
+from polysight.simulators import gpio
 
 RIG = Path(__file__).parents[1] / "instrument.toml"
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
@@ -81,10 +81,10 @@ def _start(stack: ExitStack, module: str, *args: object, **environment: str) -> 
 def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> dict[str, Any]:
     config, hub = folder / "rig.toml", folder / "wires"
     config.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
-    _start(stack, "simulators.wires", "--socket", hub)
-    _start(stack, "simulators.stage", "--config", config, "--wires", hub, "--link", rig.stage.port)
+    _start(stack, "polysight.simulators.wires", "--socket", hub)
+    _start(stack, "polysight.simulators.stage", "--config", config, "--wires", hub, "--link", rig.stage.port)
     environment = gpio.environment(Path(rig.pi.gpio_chip), hub)
-    process, command_address = _start(stack, "pi_controller", "run", "--config", config, **environment)
+    process, command_address = _start(stack, "polysight.pi_controller", "run", "--config", config, **environment)
     event_address = process.stdout.readline().split()[1] if process.stdout else ""
     wires = WireClient(hub, listen=rig.pi.sync_out)
     stack.callback(wires.close)

@@ -25,19 +25,27 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from benchmarks.sparse_scans import predicted
-from host.capture.decode import row_words
-from host.imaging import ChannelImages, ImageBuilder
-from host.imaging.sparse import reconstruct
-from host.materials import Classifier, Library, MaterialsResult, TruthPlate, analyse, pixel_accuracy, truth_plates
-from host.options import LIBRARY
-from host.plan import Changes, scan_time
-from host.polarimetry import incidence_map
-from host.sync import BoardSetup, synchronise_row
-from shared.config import Instrument, load_instrument
-from shared.raster import plan_raster
-from simulators.radar import SimulatedRig
-from simulators.scene import Scene, load_scene
-from simulators.simulate import row_offsets_mm, truth
+from polysight.host.capture.decode import row_words
+from polysight.host.imaging import ChannelImages, ImageBuilder
+from polysight.host.imaging.sparse import reconstruct
+from polysight.host.materials import (
+    Classifier,
+    Library,
+    MaterialsResult,
+    TruthPlate,
+    analyse,
+    pixel_accuracy,
+    truth_plates,
+)
+from polysight.host.options import LIBRARY
+from polysight.host.plan import Changes, scan_time
+from polysight.host.polarimetry import incidence_map
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.raster import plan_raster
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import Scene, load_scene
+from polysight.simulators.simulate import row_offsets_mm, truth
 
 ROOT = Path(__file__).parents[1]
 ITERATIONS = 40

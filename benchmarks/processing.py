@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from host.capture.decode import decode_row
-from host.sync.chain import BoardSetup, synchronise_row
-from shared.config import load_instrument
+from polysight.host.capture.decode import decode_row
+from polysight.host.sync.chain import BoardSetup, synchronise_row
+from polysight.shared.config import load_instrument
 
 
 def main(argv: list[str]) -> int:

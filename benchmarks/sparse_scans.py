@@ -17,14 +17,14 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from host.imaging.imager import choose_imager
-from host.imaging.samples import BoardSamples
-from host.imaging.sparse import reconstruct
-from host.pipeline import Pipeline
-from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, load_instrument
-from simulators.scene import load_scene
-from simulators.simulate import simulate
+from polysight.host.imaging.imager import choose_imager
+from polysight.host.imaging.samples import BoardSamples
+from polysight.host.imaging.sparse import reconstruct
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import Instrument, load_instrument
+from polysight.simulators.scene import load_scene
+from polysight.simulators.simulate import simulate
 
 ROOT = Path(__file__).parents[1]
 SCENES = ("point-targets", "nine-materials")

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from host.report.sync_report import SyncReport, write_sync_report
-from host.sync import BoardSetup, synchronise_row
-from shared.config import load_instrument
-from simulators.radar import SimulatedRig
-from simulators.scene import decode_scene
+from polysight.host.report.sync_report import SyncReport, write_sync_report
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.shared.config import load_instrument
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import decode_scene
 
 SNR_DB = 7.2
 SCENE = {

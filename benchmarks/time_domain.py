@@ -14,8 +14,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from host.imaging.grid import Antennas, ImageGrid
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.grid import Antennas, ImageGrid
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 OVERSAMPLING = 32
 BLOCK = 128  # positions at a time: their profiles stay in the second-level cache

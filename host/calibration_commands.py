@@ -12,11 +12,11 @@ from pathlib import Path
 
 import msgspec
 
-from host.calibration.files import CalibrationFile, FilterFile, StartFile, head, write
-from host.calibration.rows import facts_of, open_raw
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError, DataError
-from shared.tables import to_builtins
+from polysight.host.calibration.files import CalibrationFile, FilterFile, StartFile, head, write
+from polysight.host.calibration.rows import facts_of, open_raw
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.tables import to_builtins
 
 
 def _tell(path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool) -> int:
@@ -49,8 +49,8 @@ def _key(kind: str, path: Path) -> list[str]:
 
 def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
     """Places of boards and plane from a scan of known points. Raises PolysightError."""
-    from host.calibration.in_force import of_scan
-    from host.calibration.places import Prior, fit_places, look, places_file, read_target
+    from polysight.host.calibration.in_force import of_scan
+    from polysight.host.calibration.places import Prior, fit_places, look, places_file, read_target
 
     points = read_target(target)
     given = None if config is None else load_instrument(config)
@@ -85,7 +85,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
 
 def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
     """The receivers' filters from scans at several start frequencies. Raises PolysightError."""
-    from host.calibration.filters import fit_filter
+    from polysight.host.calibration.filters import fit_filter
 
     rig = None if config is None else load_instrument(config)
     sources = [open_raw(folder, rig) for folder in scans]
@@ -113,10 +113,10 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
 
 def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
     """Gains at every pixel from a scan of a metal plate over the plane, in sub-bands too. Raises PolysightError."""
-    from host.calibration.files import MetalFile, read
-    from host.calibration.metal import write_metal
-    from host.imaging.subbands import sub_bands
-    from host.metal_scans import load_reference
+    from polysight.host.calibration.files import MetalFile, read
+    from polysight.host.calibration.metal import write_metal
+    from polysight.host.imaging.subbands import sub_bands
+    from polysight.host.metal_scans import load_reference
 
     source = open_raw(scan, None if config is None else load_instrument(config))
     parts = sub_bands(source.instrument.chirp, bands) if bands > 1 else ()
@@ -139,7 +139,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
 
 def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
     """Start offsets that put the direct paths in the middle of the band. Raises PolysightError."""
-    from host.calibration.start_frequency import fit_start
+    from polysight.host.calibration.start_frequency import fit_start
 
     source = open_raw(scan, None if config is None else load_instrument(config))
     boards = {b.name: fit_start(source, b.name) for b in source.instrument.receivers}

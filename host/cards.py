@@ -9,12 +9,12 @@ from pathlib import Path
 
 import msgspec
 
-from host.capture.card import CardClient
-from host.capture.eeprom import EepromSettings, program_eeprom
-from host.capture.survey import CardSurvey, HopFinding, survey_cards
-from host.confirm import typed
-from shared.config import Board, Instrument, load_instrument
-from shared.errors import ConfigError, DeviceError
+from polysight.host.capture.card import CardClient
+from polysight.host.capture.eeprom import EepromSettings, program_eeprom
+from polysight.host.capture.survey import CardSurvey, HopFinding, survey_cards
+from polysight.host.confirm import typed
+from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.errors import ConfigError, DeviceError
 
 _ASK_S = 1.5  # limit of one question to a card that is perhaps just starting, all attempts together
 _PAUSE_S = 0.2

@@ -7,14 +7,14 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from host.capture.inspect import Known, inspect_bin
-from host.capture.inspect_pcap import inspect_pcap
-from host.capture.inspect_text import main_text
-from host.capture.pcap import is_pcap
-from host.store.scanfolder import MANIFEST, ScanFolder
-from host.store.validate import to_json, validate
-from shared.config import load_instrument
-from shared.errors import DataError, PolysightError
+from polysight.host.capture.inspect import Known, inspect_bin
+from polysight.host.capture.inspect_pcap import inspect_pcap
+from polysight.host.capture.inspect_text import main_text
+from polysight.host.capture.pcap import is_pcap
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.validate import to_json, validate
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError, PolysightError
 
 
 def validate_folder(folder: Path, as_json: bool) -> int:
@@ -70,13 +70,13 @@ def inspect_file(file: Path, config: Path | None, plot: Path | None, card_addres
     report = inspect_pcap(file, known, card_address) if pcap else inspect_bin(file, known)
     report.simulated = scan is not None and scan.simulated
     if as_json:
-        from host.report import plain
+        from polysight.host.report import plain
 
         sys.stdout.write(json.dumps(plain(asdict(report)), indent=1) + "\n")
     else:
         sys.stdout.write(main_text(report))
     if plot is not None:
-        from host.capture.plot import plot_profile
+        from polysight.host.capture.plot import plot_profile
 
         plot_profile(report, plot)
         sys.stderr.write(f"range profile: {plot}\n")

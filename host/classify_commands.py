@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials import Classifier, Library, Verdict
-from host.materials.authors import read_materials
-from host.materials.patches import PATCHES, MatchedPatch, match_patches
-from host.options import LIBRARY
-from host.report.assemble import classifier_sentence
-from host.report.read import SavedProducts, find_products
-from shared.errors import ConfigError, DataError
+from polysight.host.materials import Classifier, Library, Verdict
+from polysight.host.materials.authors import read_materials
+from polysight.host.materials.patches import PATCHES, MatchedPatch, match_patches
+from polysight.host.options import LIBRARY
+from polysight.host.report.assemble import classifier_sentence
+from polysight.host.report.read import SavedProducts, find_products
+from polysight.shared.errors import ConfigError, DataError
 
 
 def classify(data: Sequence[Path], library: Path | None, model: str | None, as_json: bool) -> int:
@@ -61,9 +61,9 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
 
 
 def _judge(data: Path, as_json: bool) -> int:
-    from host.materials.judge import score
-    from host.materials.models import MODELS
-    from host.materials.samples import Samples
+    from polysight.host.materials.judge import score
+    from polysight.host.materials.models import MODELS
+    from polysight.host.materials.samples import Samples
 
     library = read_materials(data) if data.is_dir() else Library.load(data)
     if len(library.angles_deg) > 1:

@@ -9,32 +9,32 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from host.cli_calibrate import add_calibrate_command
-from host.cli_card import add_card_arguments, card_status
-from host.cli_doctor import add_doctor_command
-from host.cli_export import add_export_command
-from host.cli_materials import add_material_commands
-from host.cli_numbers import positive
-from host.cli_options import RIG, add_config_option, add_material_options, joined, options_of, rig_file
-from host.cli_plan import add_plan_command
-from host.cli_polarimetry import add_leakage_command, add_polarimetry_options, with_polarimetry
-from host.cli_preview import add_preview_command
-from host.cli_process import add_data_arguments, process_scans
-from host.cli_reproduce import add_reproduce_command
-from host.cli_scan import add_scan_commands
-from shared.errors import ConfigError, PolysightError, os_error
+from polysight.host.cli_calibrate import add_calibrate_command
+from polysight.host.cli_card import add_card_arguments, card_status
+from polysight.host.cli_doctor import add_doctor_command
+from polysight.host.cli_export import add_export_command
+from polysight.host.cli_materials import add_material_commands
+from polysight.host.cli_numbers import positive
+from polysight.host.cli_options import RIG, add_config_option, add_material_options, joined, options_of, rig_file
+from polysight.host.cli_plan import add_plan_command
+from polysight.host.cli_polarimetry import add_leakage_command, add_polarimetry_options, with_polarimetry
+from polysight.host.cli_preview import add_preview_command
+from polysight.host.cli_process import add_data_arguments, process_scans
+from polysight.host.cli_reproduce import add_reproduce_command
+from polysight.host.cli_scan import add_scan_commands
+from polysight.shared.errors import ConfigError, PolysightError, os_error
 
 Run = Callable[[argparse.Namespace], int]
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from host.demo import run_demo
+    from polysight.host.demo import run_demo
 
     return run_demo(args.scene, args.config, args.out, args.time_scale)
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from host.demo import run_simulator
+    from polysight.host.demo import run_simulator
 
     command = ["simulate", str(args.scene), "--config", str(args.config), "--out", str(args.out)]
     command += ["--layout", args.layout]
@@ -49,26 +49,26 @@ def _process(args: argparse.Namespace) -> int:
 
 def process_one(args: argparse.Namespace) -> int:
     """`polysight process` of one scan."""
-    from host.offline import process
+    from polysight.host.offline import process
 
     config = rig_file(args)
     return process(args.data, args.out, config, with_polarimetry(options_of(args), args, config))
 
 
 def _image(args: argparse.Namespace) -> int:
-    from host.offline import image
+    from polysight.host.offline import image
 
     return image(args.data, args.out, rig_file(args))
 
 
 def _focus(args: argparse.Namespace) -> int:
-    from host.offline import focus
+    from polysight.host.offline import focus
 
     return focus(args.data, args.out, rig_file(args), args.depth)
 
 
 def _sync_report(args: argparse.Namespace) -> int:
-    from host.offline import sync_report
+    from polysight.host.offline import sync_report
 
     return sync_report(args.data, args.out, rig_file(args))
 
@@ -81,16 +81,16 @@ def _train(args: argparse.Namespace) -> int:
             "give one of them",
         )
     if args.authors is not None:
-        from host.reproduce.authors_library import train_authors
+        from polysight.host.reproduce.authors_library import train_authors
 
         return train_authors(args.authors, args.config, args.out)
-    from host.offline import train
+    from polysight.host.offline import train
 
     return train(args.simulate, args.data, args.config, args.out)
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from host.checks import inspect_file
+    from polysight.host.checks import inspect_file
 
     return inspect_file(args.file, args.config, args.plot, args.card, args.json)
 

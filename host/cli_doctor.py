@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from host.cli_materials import Add
-from host.cli_numbers import number
-from shared.errors import ConfigError
+from polysight.host.cli_materials import Add
+from polysight.host.cli_numbers import number
+from polysight.shared.errors import ConfigError
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from host.doctor.bench import Wanted
-    from host.doctor.command import doctor
+    from polysight.host.doctor.bench import Wanted
+    from polysight.host.doctor.command import doctor
 
     if args.move and not args.pulse:
         raise ConfigError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from host.cli_materials import Add
+from polysight.host.cli_materials import Add
 
 _FORMATS = {
     "hdf5": "image.h5: arrays with axes as dimension scales, units, config, versions (needs h5py)",
@@ -16,7 +16,7 @@ _FORMATS = {
 
 
 def _export(args: argparse.Namespace) -> int:
-    from host.export.command import export
+    from polysight.host.export.command import export
 
     return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
 

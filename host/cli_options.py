@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from host.cli_materials import add_model_option
-from shared.errors import ConfigError
+from polysight.host.cli_materials import add_model_option
+from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
-    from host.options import Options
+    from polysight.host.options import Options
 
 RIG = Path("instrument.toml")
 
@@ -27,8 +27,8 @@ def options_of(args: argparse.Namespace) -> Options:
     DataError
         when the label file is none.
     """
-    from host.materials.labels import read_labels
-    from host.options import Options
+    from polysight.host.materials.labels import read_labels
+    from polysight.host.options import Options
 
     given = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
     asked = [name for name, value in given.items() if value is not None]

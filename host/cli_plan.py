@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from host.cli_materials import Add
-from host.cli_numbers import count, positive
+from polysight.host.cli_materials import Add
+from polysight.host.cli_numbers import count, positive
 
 _NUMBERS = (
     ("--speed-mm-s", positive, "stage speed in a row"),
@@ -24,8 +24,8 @@ _NUMBERS = (
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from host.plan.changes import Changes
-    from host.plan.command import Wanted, plan
+    from polysight.host.plan.changes import Changes
+    from polysight.host.plan.command import Wanted, plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     wanted = Wanted(args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json)

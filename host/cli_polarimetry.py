@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from host.cli_numbers import count
-from shared.errors import ConfigError
+from polysight.host.cli_numbers import count
+from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
-    from host.cli_materials import Add
-    from host.options import Options
+    from polysight.host.cli_materials import Add
+    from polysight.host.options import Options
 
 
 def add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
@@ -55,14 +55,14 @@ def with_polarimetry(options: Options, args: argparse.Namespace, config: Path | 
         )
     if args.reference is None:
         return options
-    from host.metal_scans import load_reference
+    from polysight.host.metal_scans import load_reference
 
     by_position = args.reference_by != "mean"
     return replace(options, reference=load_reference(args.reference, config, by_position, args.bands))
 
 
 def _leakage(args: argparse.Namespace) -> int:
-    from host.metal_scans import leakage
+    from polysight.host.metal_scans import leakage
 
     return leakage(args.plate, args.strips, args.config, args.json)
 

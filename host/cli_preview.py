@@ -6,8 +6,8 @@ import argparse
 import importlib.util
 from pathlib import Path
 
-from host.cli_materials import Add
-from shared.errors import ConfigError
+from polysight.host.cli_materials import Add
+from polysight.shared.errors import ConfigError
 
 
 def _preview(args: argparse.Namespace) -> int:
@@ -15,11 +15,11 @@ def _preview(args: argparse.Namespace) -> int:
         raise ConfigError(
             "starlette and uvicorn are not installed",
             "the live view is an extra of the host half",
-            "pip install './host[preview]', from the repository",
+            "pip install '.[preview]', from the repository",
         )
     if args.folder.exists() and not args.folder.is_dir():
         raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
-    from host.preview.serve import preview
+    from polysight.host.preview.serve import preview
 
     return preview(args.folder, args.host, args.port, args.control)
 

@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from host.cli_numbers import count
-from shared.errors import ConfigError, PolysightError
+from polysight.host.cli_numbers import count
+from polysight.shared.errors import ConfigError, PolysightError
 
 if TYPE_CHECKING:
-    from host.many import Job, Outcome
+    from polysight.host.many import Job, Outcome
 
 
 def add_data_arguments(sub: argparse.ArgumentParser, several: bool) -> None:
@@ -62,7 +62,7 @@ def process_scans(
     PolysightError
         as processing one scan does; with several only when none can be begun.
     """
-    from host.many import at_once, cores, free_memory_bytes, jobs_of, process_many, scans_of
+    from polysight.host.many import at_once, cores, free_memory_bytes, jobs_of, process_many, scans_of
 
     scans = scans_of(args.data)
     one = argparse.Namespace(**{k: v for k, v in vars(args).items() if k not in ("jobs", "again", "dask")})
@@ -85,8 +85,8 @@ def process_scans(
 
 def _positions(data: Path) -> int:
     """Positions of a scan, or of the published grid where its files do not say it at a glance."""
-    from host.store.authors_settings import COLLECTION
-    from host.store.scanfolder import ScanFolder
+    from polysight.host.store.authors_settings import COLLECTION
+    from polysight.host.store.scanfolder import ScanFolder
 
     try:
         if (data / COLLECTION).exists():
@@ -99,7 +99,7 @@ def _positions(data: Path) -> int:
 
 def table(outcomes: Sequence[Outcome], out: Path) -> str:
     """What became of every scan, and the counts."""
-    from host.many import SUMMARY
+    from polysight.host.many import SUMMARY
 
     rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
     for o in outcomes:
@@ -121,7 +121,7 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
 
 def _found(products: Path) -> tuple[str, str]:
     """Share of positions that are masked, and number of patches, as the products say."""
-    from host.report.read import SavedProducts
+    from polysight.host.report.read import SavedProducts
 
     saved = SavedProducts(products)
     try:
@@ -137,9 +137,9 @@ def main() -> int:
     import pickle
     import resource
 
-    from host.cli import process_one
-    from host.many import MARK
-    from host.report import write_json
+    from polysight.host.cli import process_one
+    from polysight.host.many import MARK
+    from polysight.host.report import write_json
 
     job: Job = pickle.loads(sys.stdin.buffer.read())  # from the program that started this one
 

@@ -5,23 +5,23 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from host.cli_materials import Add
-from host.cli_options import RIG
-from shared.config import load_instrument
-from shared.errors import ConfigError
+from polysight.host.cli_materials import Add
+from polysight.host.cli_options import RIG
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError
 
 
 def _reproduce(args: argparse.Namespace) -> int:
     if args.config != RIG:
         load_instrument(args.config)  # a wrong one is told now, not with the first item that needs it
     if args.authors is not None:
-        from host.reproduce.authors import reproduce_authors
+        from polysight.host.reproduce.authors import reproduce_authors
 
         return reproduce_authors(args.authors, args.out, args.config, args.items, args.images, args.names)
     if args.images is not None or args.names is not None:
         raise ConfigError("--images and --names say how to read the published files", "no --authors was given")
-    from host.reproduce.item import Run
-    from host.reproduce.run import reproduce
+    from polysight.host.reproduce.item import Run
+    from polysight.host.reproduce.run import reproduce
 
     return reproduce(args.out, args.items, Run(args.quick, args.config))
 

@@ -5,30 +5,30 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from host.cli_materials import Add
-from host.cli_options import add_config_option, add_material_options, options_of
+from polysight.host.cli_materials import Add
+from polysight.host.cli_options import add_config_option, add_material_options, options_of
 
 
 def _scan(args: argparse.Namespace) -> int:
-    from host.live import scan
+    from polysight.host.live import scan
 
     return scan(args.config, args.out, args.truth, options_of(args), args.keep_incomplete, not args.no_process)
 
 
 def _resume(args: argparse.Namespace) -> int:
-    from host.live import resume
+    from polysight.host.live import resume
 
     return resume(args.folder, options_of(args), args.keep_incomplete, not args.no_process, args.config)
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from host.checks import validate_folder
+    from polysight.host.checks import validate_folder
 
     return validate_folder(args.folder, args.json)
 
 
 def _drop_raw(args: argparse.Namespace) -> int:
-    from host.dropping import drop_raw
+    from polysight.host.dropping import drop_raw
 
     return drop_raw(args.folder, args.products, args.yes)
 

@@ -16,8 +16,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from shared.config import load_instrument
-from shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 
 _MARK = ".polysight-demo"
 _START_LIMIT_S = 60.0
@@ -27,9 +27,9 @@ TIME_SCALE = 40.0
 
 
 def run_simulator(arguments: Sequence[str]) -> int:
-    """Run `python -m simulators ...` and return its exit status. Raises ConfigError when it is not installed."""
+    """Run `python -m polysight.simulators ...` and return its exit status. Raises ConfigError when it is not installed."""
     _require_simulators()
-    return subprocess.run([sys.executable, "-m", "simulators", *arguments], check=False).returncode
+    return subprocess.run([sys.executable, "-m", "polysight.simulators", *arguments], check=False).returncode
 
 
 def check_scenes(scenes: Iterable[Path], config: Path) -> None:
@@ -41,7 +41,7 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
         naming the file, the key and the rule that is broken; or when the simulators are not installed.
     """
     _require_simulators()
-    command = [sys.executable, "-m", "simulators", "check", *map(str, scenes), "--config", str(config)]
+    command = [sys.executable, "-m", "polysight.simulators", "check", *map(str, scenes), "--config", str(config)]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     if checked.returncode != 0:
         raise _error_of(checked.returncode, checked.stderr)
@@ -54,7 +54,7 @@ def _error_of(status: int, said: str) -> PolysightError:
 
 
 def _require_simulators() -> None:
-    if importlib.util.find_spec("simulators") is None:
+    if importlib.util.find_spec("polysight.simulators") is None:
         raise ConfigError(
             "the simulators are not installed",
             "only the host half was installed",
@@ -90,7 +90,7 @@ def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) ->
         when it does not start, as it said itself; its logs are in `folder`/logs.
     """
     _require_simulators()
-    command = [sys.executable, "-m", "simulators.rig", "--config", str(config), "--scene", str(scene)]
+    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(config), "--scene", str(scene)]
     command += ["--dir", str(folder), "--time-scale", str(time_scale), "--with-pi", "--native"]
     rig = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     try:
@@ -144,7 +144,16 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
     _fresh_folder(out)
     sys.stderr.write(f"simulated rig: no hardware is involved. Scene {scene}\n")
     with simulated_rig(config, scene, out / "rig", time_scale or TIME_SCALE) as rig_file:
-        scan = [sys.executable, "-m", "host.cli", "scan", "--config", str(rig_file), "--out", str(out / "scan")]
+        scan = [
+            sys.executable,
+            "-m",
+            "polysight.host.cli",
+            "scan",
+            "--config",
+            str(rig_file),
+            "--out",
+            str(out / "scan"),
+        ]
         scan += ["--truth", str(rig_file.parent / "truth.json")]
         status = _run_to_its_end(scan)
     if status == 0:

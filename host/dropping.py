@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from host.confirm import typed
-from host.products_folder import RAW_DROPPED
-from host.report import write_json
-from host.report.read import QUALITY, read_products
-from host.store.raw import Digests, drop, droppable
-from host.store.scanfolder import ScanFolder, utc_now
-from shared.errors import ConfigError, DataError
+from polysight.host.confirm import typed
+from polysight.host.products_folder import RAW_DROPPED
+from polysight.host.report import write_json
+from polysight.host.report.read import QUALITY, read_products
+from polysight.host.store.raw import Digests, drop, droppable
+from polysight.host.store.scanfolder import ScanFolder, utc_now
+from polysight.shared.errors import ConfigError, DataError
 
 WORD = "drop"
 

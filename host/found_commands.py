@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from host.report.read import MATERIALS, find_products, read_products
+from polysight.host.report.read import MATERIALS, find_products, read_products
 
 REPORT = "report.html"
 
@@ -51,8 +51,8 @@ def report(folder: Path) -> int:
     """
     found = find_products(folder, REPORT)
     if found is None:
-        from host.offline import process
-        from host.options import Options
+        from polysight.host.offline import process
+        from polysight.host.options import Options
 
         return process(folder, folder / "products", None, Options())
     sys.stdout.write(f"report:   {found.folder / REPORT}\n")

@@ -9,24 +9,24 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from host.calibration.in_force import Calibration, of_rig, of_scan
-from host.imaging.grid import image_grid
-from host.materials import read_truth
-from host.offline import TRUTH, check_options, make_products, truth_of
-from host.options import Options
-from host.pipeline import Pipeline
-from host.products_folder import check_products_folder
-from host.progress import ScanBar
-from host.scan.control import ControlDesk
-from host.scan.result import OnProgress
-from host.scan.run import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
-from host.scan.stop import StopRequest, hangups_pass
-from host.store import manifest
-from host.store.connection import check_same_scan
-from host.store.raw import require_raw
-from host.store.scanfolder import MANIFEST, ScanFolder
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError, PolysightError, ScanError, advice
+from polysight.host.calibration.in_force import Calibration, of_rig, of_scan
+from polysight.host.imaging.grid import image_grid
+from polysight.host.materials import read_truth
+from polysight.host.offline import TRUTH, check_options, make_products, truth_of
+from polysight.host.options import Options
+from polysight.host.pipeline import Pipeline
+from polysight.host.products_folder import check_products_folder
+from polysight.host.progress import ScanBar
+from polysight.host.scan.control import ControlDesk
+from polysight.host.scan.result import OnProgress
+from polysight.host.scan.run import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
+from polysight.host.scan.stop import StopRequest, hangups_pass
+from polysight.host.store import manifest
+from polysight.host.store.connection import check_same_scan
+from polysight.host.store.raw import require_raw
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, PolysightError, ScanError, advice
 
 PRODUCTS = "products"
 

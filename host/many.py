@@ -21,17 +21,17 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Literal
 
-from host.report import write_json
-from host.store.authors_settings import COLLECTION
-from host.store.scanfolder import MANIFEST, versions
-from shared.errors import ConfigError
+from polysight.host.report import write_json
+from polysight.host.store.authors_settings import COLLECTION
+from polysight.host.store.scanfolder import MANIFEST, versions
+from polysight.shared.errors import ConfigError
 
 MARK = ".finished.json"
 SUMMARY = "processed.json"
 Status = Literal["done", "skipped", "failed", "stopped"]
 _PRODUCTS = ("image.npz", "quality.json")
 _CLI = ("data", "out", "run", "command", "jobs", "dask", "again")  # what does not change what comes out
-PROGRAM = (sys.executable, "-m", "host.cli_process")
+PROGRAM = (sys.executable, "-m", "polysight.host.cli_process")
 """Processes the one job on its standard input."""
 _FREE = 0.8  # of the free memory is used
 _POLL_S = 0.2
@@ -199,7 +199,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
         raise ConfigError(
             "Dask is not installed here",
             "it is needed for --dask alone, and not installed with the rest",
-            "pip install 'polysight-host[dask]' here and on the workers (in the repository: './host[dask]')",
+            "pip install 'polysight[dask]' here and on the workers (in the repository: '.[dask]')",
         ) from None
     try:
         client = Client(address, timeout=timeout)

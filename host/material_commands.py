@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from host.imaging.subbands import sub_bands
-from host.materials import Library
-from host.materials.authors import read_materials
-from host.materials.concentration import fit_concentration
-from host.materials.layers import Layer, LayerFit, fit_layer
-from host.materials.subbands import AMPLITUDE_ERROR, bands_of_row
-from host.report.read import MATERIALS, SavedProducts, read_products
-from host.report.scan_facts import SCAN
-from shared.config import Chirp, load_instrument
-from shared.errors import ConfigError, DataError
+from polysight.host.imaging.subbands import sub_bands
+from polysight.host.materials import Library
+from polysight.host.materials.authors import read_materials
+from polysight.host.materials.concentration import fit_concentration
+from polysight.host.materials.layers import Layer, LayerFit, fit_layer
+from polysight.host.materials.subbands import AMPLITUDE_ERROR, bands_of_row
+from polysight.host.report.read import MATERIALS, SavedProducts, read_products
+from polysight.host.report.scan_facts import SCAN
+from polysight.shared.config import Chirp, load_instrument
+from polysight.shared.errors import ConfigError, DataError
 
 LAST = "?"
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp

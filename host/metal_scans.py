@@ -11,11 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from host.imaging import ChannelImages
-from host.offline import imaged
-from host.pipeline import Pipeline
-from host.polarimetry import Leakage, PlaneReference, leakage_from_images, plane_reference, specular_incidence_rad
-from shared.errors import DataError
+from polysight.host.imaging import ChannelImages
+from polysight.host.offline import imaged
+from polysight.host.pipeline import Pipeline
+from polysight.host.polarimetry import (
+    Leakage,
+    PlaneReference,
+    leakage_from_images,
+    plane_reference,
+    specular_incidence_rad,
+)
+from polysight.shared.errors import DataError
 
 LEAST_PIXELS = 100
 

@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from host.calibration.in_force import of_scan
-from host.demo import check_scenes, run_simulator
-from host.imaging import ChannelImages
-from host.imaging.focus import focus_sweep
-from host.materials import TrainingScan, TruthPlate, make_library, patches_from_plates, read_truth
-from host.options import Options
-from host.pipeline import Pipeline
-from host.products import Products, write_images, write_quality
-from host.products_folder import check_products_folder, making_products
-from host.report import write_json
-from host.report.focus import focus_figure
-from host.report.read import IMAGE
-from host.report.scan_facts import write_scan_facts
-from host.store.authors import AuthorsCube, open_scan
-from host.store.raw import require_raw
-from host.store.scanfolder import MANIFEST, ScanFolder, versions
-from host.store.source import ScanSource
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError, DataError, ScanError, advice
+from polysight.host.calibration.in_force import of_scan
+from polysight.host.demo import check_scenes, run_simulator
+from polysight.host.imaging import ChannelImages
+from polysight.host.imaging.focus import focus_sweep
+from polysight.host.materials import TrainingScan, TruthPlate, make_library, patches_from_plates, read_truth
+from polysight.host.options import Options
+from polysight.host.pipeline import Pipeline
+from polysight.host.products import Products, write_images, write_quality
+from polysight.host.products_folder import check_products_folder, making_products
+from polysight.host.report import write_json
+from polysight.host.report.focus import focus_figure
+from polysight.host.report.read import IMAGE
+from polysight.host.report.scan_facts import write_scan_facts
+from polysight.host.store.authors import AuthorsCube, open_scan
+from polysight.host.store.raw import require_raw
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder, versions
+from polysight.host.store.source import ScanSource
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, DataError, ScanError, advice
 
 TRUTH = "truth.json"
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -189,9 +189,9 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:
     """What synchronisation leaves of errors: figures, JSON, text; returns the exit status. Raises PolysightError."""
-    from host.capture.decode import row_words
-    from host.report.sync_report import SyncReport, write_sync_report
-    from host.sync import BoardSetup, synchronise_row
+    from polysight.host.capture.decode import row_words
+    from polysight.host.report.sync_report import SyncReport, write_sync_report
+    from polysight.host.sync import BoardSetup, synchronise_row
 
     source = _open(data, config)
     if isinstance(source, AuthorsCube):

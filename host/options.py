@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy.typing as npt
 
-from host.materials import Classifier, Library
-from host.materials.authors_labels import is_metal
-from host.materials.labels import patches_from_labels
-from host.materials.library import SAME_ANGLE_DEG
-from host.materials.segment import Box, Segmentation
-from host.polarimetry import Incidence, PlaneReference
-from shared.config import Instrument
-from shared.geometry import incidence_deg
+from polysight.host.materials import Classifier, Library
+from polysight.host.materials.authors_labels import is_metal
+from polysight.host.materials.labels import patches_from_labels
+from polysight.host.materials.library import SAME_ANGLE_DEG
+from polysight.host.materials.segment import Box, Segmentation
+from polysight.host.polarimetry import Incidence, PlaneReference
+from polysight.shared.config import Instrument
+from polysight.shared.geometry import incidence_deg
 
 LIBRARY = Path(__file__).parent / "materials" / "simulated-library.npz"
 

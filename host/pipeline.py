@@ -9,28 +9,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.calibration.in_force import of_scan
-from host.capture.decode import row_words
-from host.imaging import ChannelImages, ImageBuilder
-from host.imaging.facts import imaging_facts
-from host.imaging.imaged_with import ImagedWith
-from host.imaging.subbands import SubBandImages
-from host.materials import Classifier, MaterialsResult, TruthPlate, analyse, pixel_accuracy
-from host.materials.incidence import permittivity_change
-from host.materials.segment import Box, Segmentation
-from host.materials.subbands import band_rows
-from host.options import Options
-from host.polarimetry import Incidence, PlaneReference, incidence_choice
-from host.products import Products, write_images, write_materials, write_quality
-from host.quality import Quality
-from host.report.scan_facts import write_scan_facts
-from host.store.authors import AuthorsCube
-from host.store.authors_settings import mirrored
-from host.store.scanfolder import ScanFolder
-from host.store.source import RowData, ScanSource
-from host.sync.chain import BoardSetup, SyncedRow, synchronise_row
-from host.sync.cubes import CubeReader
-from shared.config import Instrument
+from polysight.host.calibration.in_force import of_scan
+from polysight.host.capture.decode import row_words
+from polysight.host.imaging import ChannelImages, ImageBuilder
+from polysight.host.imaging.facts import imaging_facts
+from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.imaging.subbands import SubBandImages
+from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, analyse, pixel_accuracy
+from polysight.host.materials.incidence import permittivity_change
+from polysight.host.materials.segment import Box, Segmentation
+from polysight.host.materials.subbands import band_rows
+from polysight.host.options import Options
+from polysight.host.polarimetry import Incidence, PlaneReference, incidence_choice
+from polysight.host.products import Products, write_images, write_materials, write_quality
+from polysight.host.quality import Quality
+from polysight.host.report.scan_facts import write_scan_facts
+from polysight.host.store.authors import AuthorsCube
+from polysight.host.store.authors_settings import mirrored
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.source import RowData, ScanSource
+from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from polysight.host.sync.cubes import CubeReader
+from polysight.shared.config import Instrument
 
 
 class Pipeline:

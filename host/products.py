@@ -7,19 +7,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from host.imaging import ChannelImages
-from host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
-from host.materials.labels import labels_of, write_labels
-from host.materials.patches import PATCHES, pack_patches
-from host.polarimetry import ratio
-from host.report import write_image, write_json, write_report
-from host.report.assemble import classifier_sentence, context_of
-from host.report.products import write_atomically
-from host.report.scan_facts import with_scan
-from host.store.scanfolder import versions
-from host.store.source import Scan
-from shared.config import Instrument
-from shared.geometry import incidence_deg
+from polysight.host.imaging import ChannelImages
+from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
+from polysight.host.materials.labels import labels_of, write_labels
+from polysight.host.materials.patches import PATCHES, pack_patches
+from polysight.host.polarimetry import ratio
+from polysight.host.report import write_image, write_json, write_report
+from polysight.host.report.assemble import classifier_sentence, context_of
+from polysight.host.report.products import write_atomically
+from polysight.host.report.scan_facts import with_scan
+from polysight.host.store.scanfolder import versions
+from polysight.host.store.source import Scan
+from polysight.shared.config import Instrument
+from polysight.shared.geometry import incidence_deg
 
 LABELS = "labels.json"
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."

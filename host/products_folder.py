@@ -15,13 +15,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from host.many import MARK
-from host.materials.patches import PATCHES
-from host.products import LABELS
-from host.report.read import IMAGE, MATERIALS, QUALITY, SavedProducts
-from host.report.scan_facts import SCAN
-from host.store.appending import sync_folder
-from shared.errors import ConfigError, DataError, DeviceError
+from polysight.host.many import MARK
+from polysight.host.materials.patches import PATCHES
+from polysight.host.products import LABELS
+from polysight.host.report.read import IMAGE, MATERIALS, QUALITY, SavedProducts
+from polysight.host.report.scan_facts import SCAN
+from polysight.host.store.appending import sync_folder
+from polysight.shared.errors import ConfigError, DataError, DeviceError
 
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, "report.html", "figures")
 RAW_DROPPED = "raw_dropped"

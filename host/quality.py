@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.store.source import RowData
-from host.sync.backlash import echo_of_row, estimate_backlash, object_filter
-from host.sync.chain import SyncedRow
-from shared.config import Board, Instrument
-from shared.raster import plan_raster
+from polysight.host.store.source import RowData
+from polysight.host.sync.backlash import echo_of_row, estimate_backlash, object_filter
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import Board, Instrument
+from polysight.shared.raster import plan_raster
 
 
 @dataclass

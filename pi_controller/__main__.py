@@ -1,7 +1,7 @@
-"""`python -m pi_controller` is `polysight-pi`."""
+"""`python -m polysight.pi_controller` is `polysight-pi`."""
 
 import sys
 
-from pi_controller.cli import main
+from polysight.pi_controller.cli import main
 
 sys.exit(main())

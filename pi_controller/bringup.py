@@ -8,14 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from pi_controller.burst import BurstRecord, BurstSpec, send_burst
-from pi_controller.stage_driver import StageDriver
-from pi_controller.stage_link import StageLost, StageLostError, StageNews
-from pi_controller.trigger_lines import TriggerLines
-from shared.config import Stage
-from shared.errors import DeviceError
-from shared.faults import explain
-from shared.stage_line import HOMING_LIMIT_S, Immediate
+from polysight.pi_controller.burst import BurstRecord, BurstSpec, send_burst
+from polysight.pi_controller.stage_driver import StageDriver
+from polysight.pi_controller.stage_link import StageLost, StageLostError, StageNews
+from polysight.pi_controller.trigger_lines import TriggerLines
+from polysight.shared.config import Stage
+from polysight.shared.errors import DeviceError
+from polysight.shared.faults import explain
+from polysight.shared.stage_line import HOMING_LIMIT_S, Immediate
 
 MOTION_LIMIT_S = HOMING_LIMIT_S  # no motion takes longer than homing
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from pi_controller.trigger_lines import TriggerLines
-from shared.config import Burst
-from shared.faults import PiFault
-from shared.raster import FIRST_PULSE_DELAY_S
-from shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS
-from shared.units import us_to_ns
+from polysight.pi_controller.trigger_lines import TriggerLines
+from polysight.shared.config import Burst
+from polysight.shared.faults import PiFault
+from polysight.shared.raster import FIRST_PULSE_DELAY_S
+from polysight.shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS
+from polysight.shared.units import us_to_ns
 
 # From edge to first pulse. A fixed delay longer than the usual wake-up keeps the pulses of all positions at the same
 # place behind their edges; 200 us are 4 um of travel at 20 mm/s.

@@ -11,16 +11,16 @@ from pathlib import Path
 
 import zmq
 
-from pi_controller.bringup import bench_stage
-from pi_controller.checks_lines import check_lines
-from pi_controller.finding import Finding, attempt
-from pi_controller.journal import JournalFolder
-from pi_controller.lines_wires import WireLines
-from pi_controller.wiring import read_model
-from shared.config import Instrument
-from shared.errors import DeviceError
-from shared.raster import check_burst_fits
-from shared.sockets import is_loopback, publisher, replier
+from polysight.pi_controller.bringup import bench_stage
+from polysight.pi_controller.checks_lines import check_lines
+from polysight.pi_controller.finding import Finding, attempt
+from polysight.pi_controller.journal import JournalFolder
+from polysight.pi_controller.lines_wires import WireLines
+from polysight.pi_controller.wiring import read_model
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DeviceError
+from polysight.shared.raster import check_burst_fits
+from polysight.shared.sockets import is_loopback, publisher, replier
 
 JOURNAL_BYTES = 100 << 20  # a scan of 70,000 positions journals about 20 MB
 

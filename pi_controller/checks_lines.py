@@ -5,12 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from pi_controller.finding import Finding, attempt
-from pi_controller.lines_gpiod import EVENT_BUFFER, find_chip, load_gpiod, output_settings, request, trigger_settings
-from pi_controller.lines_gpiomem import GpiomemLines
-from pi_controller.wiring import check_wiring, pi_generation
-from shared.config import Instrument, Pi
-from shared.errors import PolysightError
+from polysight.pi_controller.finding import Finding, attempt
+from polysight.pi_controller.lines_gpiod import (
+    EVENT_BUFFER,
+    find_chip,
+    load_gpiod,
+    output_settings,
+    request,
+    trigger_settings,
+)
+from polysight.pi_controller.lines_gpiomem import GpiomemLines
+from polysight.pi_controller.wiring import check_wiring, pi_generation
+from polysight.shared.config import Instrument, Pi
+from polysight.shared.errors import PolysightError
 
 MODULES = Path("/sys/module")
 STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and start the Pi again"

@@ -11,12 +11,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from pi_controller.finding import AS_THE_SERVICE
-from shared import __version__
-from shared.config import Instrument, load_instrument
-from shared.errors import PolysightError, os_error
-from shared.faults import explain
-from shared.sync_in import WIDTH_TEXT
+from polysight.pi_controller.finding import AS_THE_SERVICE
+from polysight.shared import __version__
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import PolysightError, os_error
+from polysight.shared.faults import explain
+from polysight.shared.sync_in import WIDTH_TEXT
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -31,15 +31,15 @@ def _port(args: argparse.Namespace, instrument: Instrument) -> str:
 
 
 def _run(args: argparse.Namespace) -> int:
-    from pi_controller.service import Options, run
+    from polysight.pi_controller.service import Options, run
 
     options = Options(args.wires, args.stage_port, args.journal, args.command_address, args.event_address)
     return run(load_instrument(args.config), options)
 
 
 def _check(args: argparse.Namespace) -> int:
-    from pi_controller.checks import check_all
-    from pi_controller.client import refuse_beside_service
+    from polysight.pi_controller.checks import check_all
+    from polysight.pi_controller.client import refuse_beside_service
 
     instrument = load_instrument(args.config)
     journal = args.journal or Path(instrument.pi.journal_dir)
@@ -56,11 +56,11 @@ def _check(args: argparse.Namespace) -> int:
 
 
 def _pulse(args: argparse.Namespace) -> int:
-    from pi_controller import realtime
-    from pi_controller.bringup import pulse
-    from pi_controller.burst import BurstSpec
-    from pi_controller.client import refuse_beside_service
-    from pi_controller.service import open_lines
+    from polysight.pi_controller import realtime
+    from polysight.pi_controller.bringup import pulse
+    from polysight.pi_controller.burst import BurstSpec
+    from polysight.pi_controller.client import refuse_beside_service
+    from polysight.pi_controller.service import open_lines
 
     instrument = load_instrument(args.config)
     refuse_beside_service(instrument)
@@ -89,8 +89,8 @@ def _pulse(args: argparse.Namespace) -> int:
 
 
 def _jog(args: argparse.Namespace) -> int:
-    from pi_controller.bringup import bench_stage
-    from pi_controller.client import refuse_beside_service
+    from polysight.pi_controller.bringup import bench_stage
+    from polysight.pi_controller.client import refuse_beside_service
 
     instrument = load_instrument(args.config)
     refuse_beside_service(instrument)
@@ -102,8 +102,8 @@ def _jog(args: argparse.Namespace) -> int:
 
 
 def _home(args: argparse.Namespace) -> int:
-    from pi_controller.bringup import bench_stage
-    from pi_controller.client import home_by_service
+    from polysight.pi_controller.bringup import bench_stage
+    from polysight.pi_controller.client import home_by_service
 
     instrument = load_instrument(args.config)
     status = home_by_service(instrument)
@@ -121,7 +121,7 @@ def _tell_position(args: argparse.Namespace, x_mm: float, y_mm: float) -> None:
 
 
 def _events(args: argparse.Namespace) -> int:
-    from pi_controller.client import follow_events, replay_events
+    from polysight.pi_controller.client import follow_events, replay_events
 
     instrument = load_instrument(args.config)
     if args.scan_id:
@@ -136,7 +136,7 @@ def _events(args: argparse.Namespace) -> int:
 
 
 def _keys(args: argparse.Namespace) -> int:
-    from pi_controller.keys import COPY, make_keys
+    from polysight.pi_controller.keys import COPY, make_keys
 
     folder = args.dir or Path(load_instrument(args.config).pi.key_dir)
     for path in make_keys(folder, args.replace):

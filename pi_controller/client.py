@@ -10,11 +10,11 @@ from typing import Any
 import msgspec
 import zmq
 
-from pi_controller.bringup import MOTION_LIMIT_S
-from shared import messages as m
-from shared.config import Instrument
-from shared.errors import DeviceError, PolysightError
-from shared.sockets import Socket, requester, subscriber
+from polysight.pi_controller.bringup import MOTION_LIMIT_S
+from polysight.shared import messages as m
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DeviceError, PolysightError
+from polysight.shared.sockets import Socket, requester, subscriber
 
 HELLO_LIMIT_MS = 500
 

@@ -11,22 +11,22 @@ import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from pi_controller.burst import BurstSpec
-from pi_controller.journal import JournalFullError
-from pi_controller.ledger import Ledger
-from pi_controller.machine import Machine
-from pi_controller.row_ending import Parts
-from pi_controller.rows import RefusedError, check_pulses, check_run, row_of
-from pi_controller.running_row import RunningRow
-from pi_controller.stage_driver import StageDriver
-from pi_controller.stage_link import StageLost, StageNews
-from pi_controller.states import MOVING
-from pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
-from shared import messages as m
-from shared.errors import DataError, ProtocolError
-from shared.faults import PiFault, explain
-from shared.stage_line import Reply
-from shared.units import us_to_ns
+from polysight.pi_controller.burst import BurstSpec
+from polysight.pi_controller.journal import JournalFullError
+from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.machine import Machine
+from polysight.pi_controller.row_ending import Parts
+from polysight.pi_controller.rows import RefusedError, check_pulses, check_run, row_of
+from polysight.pi_controller.running_row import RunningRow
+from polysight.pi_controller.stage_driver import StageDriver
+from polysight.pi_controller.stage_link import StageLost, StageNews
+from polysight.pi_controller.states import MOVING
+from polysight.pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
+from polysight.shared import messages as m
+from polysight.shared.errors import DataError, ProtocolError
+from polysight.shared.faults import PiFault, explain
+from polysight.shared.stage_line import Reply
+from polysight.shared.units import us_to_ns
 
 EVENTS_PER_TURN = 256
 REPLAYED_IN_A_ROW = 20  # events a reply while a row runs: many are long calls that keep the trigger thread waiting

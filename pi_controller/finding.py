@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from shared.errors import PolysightError, os_error
+from polysight.shared.errors import PolysightError, os_error
 
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"  # where install.sh puts it
 AS_THE_SERVICE = f"as the service's user: `sudo -u polysight {PROGRAM} ...`"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs or updates the Pi half on a Raspberry Pi: `make pi-install HOST=user@address` builds the two packages, copies
-# them with this file and runs it there with sudo. May be run again; the rig file and the keys that are there stay.
+# Installs or updates the Pi half on a Raspberry Pi: `make pi-install HOST=user@address` builds its wheel, copies
+# it with this file and runs it there with sudo. May be run again; the rig file and the keys that are there stay.
 # The first run fetches the libraries from the internet; later ones need none, unless a release needs another library.
 # Not run on hardware yet.
 set -euo pipefail

@@ -21,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from shared.errors import ConfigError, DataError, DeviceError
+from polysight.shared.errors import ConfigError, DataError, DeviceError
 
 MAGIC = b"PSJRNL1\n"
 MAX_RECORD_BYTES = 1 << 20

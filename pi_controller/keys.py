@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pi_controller.finding import PROGRAM
-from shared.errors import ConfigError
-from shared.sockets import HOST_KEYS
+from polysight.pi_controller.finding import PROGRAM
+from polysight.shared.errors import ConfigError
+from polysight.shared.sockets import HOST_KEYS
 
 PARTIES = ("pi", "host")
 COPY = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key_secret stays on the Pi"

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import msgspec
 
-from pi_controller.journal import Journal, JournalFolder, JournalFullError
-from shared.errors import DataError, ProtocolError
-from shared.messages import (
+from polysight.pi_controller.journal import Journal, JournalFolder, JournalFullError
+from polysight.shared.errors import DataError, ProtocolError
+from polysight.shared.messages import (
     JOURNALLED,
     AnyEvent,
     Capture,
@@ -20,7 +20,7 @@ from shared.messages import (
     pack,
     unpack_event,
 )
-from shared.raster import RasterPlan
+from polysight.shared.raster import RasterPlan
 
 
 class Ledger:

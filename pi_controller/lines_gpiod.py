@@ -13,11 +13,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from pi_controller.trigger_lines import Clock, Edge
-from shared.backends import GPIOD
-from shared.config import Pi
-from shared.errors import ConfigError, DeviceError
-from shared.faults import PiFault
+from polysight.pi_controller.trigger_lines import Clock, Edge
+from polysight.shared.backends import GPIOD
+from polysight.shared.config import Pi
+from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.faults import PiFault
 
 # The kernel keeps 16 events a line unless asked for more; a starved process would lose edges.
 EVENT_BUFFER = 1024

@@ -10,11 +10,11 @@ import mmap
 import os
 from typing import Any
 
-from pi_controller.lines_gpiod import GpiodLines
-from pi_controller.trigger_lines import Clock
-from shared.backends import GPIOMEM
-from shared.config import Pi
-from shared.errors import DeviceError
+from polysight.pi_controller.lines_gpiod import GpiodLines
+from polysight.pi_controller.trigger_lines import Clock
+from polysight.shared.backends import GPIOMEM
+from polysight.shared.config import Pi
+from polysight.shared.errors import DeviceError
 
 GPFSEL0, GPSET0, GPCLR0 = 0x00, 0x1C, 0x28  # bytes from the start of the block
 FUNCTION_OUTPUT = 0b001

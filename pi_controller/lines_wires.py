@@ -9,10 +9,10 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from pi_controller.trigger_lines import Edge
-from shared.backends import WIRES
-from shared.config import Pi
-from shared.wires import WireClient, WireEdge
+from polysight.pi_controller.trigger_lines import Edge
+from polysight.shared.backends import WIRES
+from polysight.shared.config import Pi
+from polysight.shared.wires import WireClient, WireEdge
 
 
 class WireLines:

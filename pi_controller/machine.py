@@ -6,19 +6,19 @@ the next row). Everything that waits has a limit. Used by the executor's thread 
 
 from __future__ import annotations
 
-from pi_controller.burst import BurstSpec
-from pi_controller.row_ending import Parts, RowEnding
-from pi_controller.rows import RefusedError, row_duration_s, stage_row
-from pi_controller.running_row import RunningRow
-from pi_controller.stage_link import StageLostError, StageRefusedError
-from pi_controller.states import MOVING
-from pi_controller.supervision import RestWatch, TriggerWatch
-from pi_controller.trigger_loop import BurstSent, LoopFault, RowJob
-from shared import messages as m
-from shared.errors import ProtocolError
-from shared.faults import PiFault, StageError, explain
-from shared.raster import Row
-from shared.stage_line import HOMING_LIMIT_S, Immediate, Reply
+from polysight.pi_controller.burst import BurstSpec
+from polysight.pi_controller.row_ending import Parts, RowEnding
+from polysight.pi_controller.rows import RefusedError, row_duration_s, stage_row
+from polysight.pi_controller.running_row import RunningRow
+from polysight.pi_controller.stage_link import StageLostError, StageRefusedError
+from polysight.pi_controller.states import MOVING
+from polysight.pi_controller.supervision import RestWatch, TriggerWatch
+from polysight.pi_controller.trigger_loop import BurstSent, LoopFault, RowJob
+from polysight.shared import messages as m
+from polysight.shared.errors import ProtocolError
+from polysight.shared.faults import PiFault, StageError, explain
+from polysight.shared.raster import Row
+from polysight.shared.stage_line import HOMING_LIMIT_S, Immediate, Reply
 
 END_LIMIT_S = 0.5  # from STOP to standstill when this program is told to end
 LAST_EDGE_LIMIT_S = 1.0  # from the stage's `done` to the last burst

@@ -9,16 +9,16 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from pi_controller.ledger import Ledger
-from pi_controller.running_row import RunningRow
-from pi_controller.stage_driver import STOP_LIMIT_S, StageDriver
-from pi_controller.stage_link import StageLostError
-from pi_controller.states import States
-from pi_controller.supervision import HostWatch, Limit
-from pi_controller.trigger_loop import TriggerLoop
-from shared import messages as m
-from shared.faults import PiFault, explain
-from shared.stage_line import Immediate
+from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.running_row import RunningRow
+from polysight.pi_controller.stage_driver import STOP_LIMIT_S, StageDriver
+from polysight.pi_controller.stage_link import StageLostError
+from polysight.pi_controller.states import States
+from polysight.pi_controller.supervision import HostWatch, Limit
+from polysight.pi_controller.trigger_loop import TriggerLoop
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault, explain
+from polysight.shared.stage_line import Immediate
 
 
 class Parts(NamedTuple):

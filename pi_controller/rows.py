@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from pi_controller.burst import BurstSpec
-from shared.config import Stage
-from shared.errors import PolysightError
-from shared.faults import PiFault, explain
-from shared.messages import BeginRun
-from shared.raster import RasterPlan, Row
-from shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT
-from shared.units import us_to_ns
+from polysight.pi_controller.burst import BurstSpec
+from polysight.shared.config import Stage
+from polysight.shared.errors import PolysightError
+from polysight.shared.faults import PiFault, explain
+from polysight.shared.messages import BeginRun
+from polysight.shared.raster import RasterPlan, Row
+from polysight.shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT
+from polysight.shared.units import us_to_ns
 
 
 class RefusedError(PolysightError):

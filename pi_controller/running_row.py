@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from pi_controller.trigger_loop import Counts, RowJob
-from shared import messages as m
-from shared.faults import PiFault
-from shared.raster import Row
+from polysight.pi_controller.trigger_loop import Counts, RowJob
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault
+from polysight.shared.raster import Row
 
 
 @dataclass

@@ -15,12 +15,12 @@ from typing import Protocol
 
 import zmq
 
-from pi_controller.executor import Request, Snapshot
-from shared import __version__
-from shared import messages as m
-from shared.errors import PolysightError, ProtocolError, VersionError
-from shared.faults import PiFault, explain
-from shared.sockets import EVENT_TOPIC, publisher, replier
+from polysight.pi_controller.executor import Request, Snapshot
+from polysight.shared import __version__
+from polysight.shared import messages as m
+from polysight.shared.errors import PolysightError, ProtocolError, VersionError
+from polysight.shared.faults import PiFault, explain
+from polysight.shared.sockets import EVENT_TOPIC, publisher, replier
 
 LINGER_MS = 200
 

@@ -8,21 +8,21 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from pi_controller import realtime
-from pi_controller.executor import Executor
-from pi_controller.journal import JournalFolder, JournalFullError
-from pi_controller.ledger import Ledger
-from pi_controller.lines_gpiod import GpiodLines, load_gpiod
-from pi_controller.lines_gpiomem import GpiomemLines
-from pi_controller.lines_wires import WireLines
-from pi_controller.server import Server
-from pi_controller.stage_driver import StageDriver
-from pi_controller.stage_link import StageNews
-from pi_controller.trigger_lines import TriggerLines
-from pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
-from pi_controller.wiring import check_wiring, read_model
-from shared.config import Instrument
-from shared.errors import DeviceError
+from polysight.pi_controller import realtime
+from polysight.pi_controller.executor import Executor
+from polysight.pi_controller.journal import JournalFolder, JournalFullError
+from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.lines_gpiod import GpiodLines, load_gpiod
+from polysight.pi_controller.lines_gpiomem import GpiomemLines
+from polysight.pi_controller.lines_wires import WireLines
+from polysight.pi_controller.server import Server
+from polysight.pi_controller.stage_driver import StageDriver
+from polysight.pi_controller.stage_link import StageNews
+from polysight.pi_controller.trigger_lines import TriggerLines
+from polysight.pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
+from polysight.pi_controller.wiring import check_wiring, read_model
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DeviceError
 
 END_LIMIT_S = 0.8
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from pi_controller.rows import StageRow
-from pi_controller.stage_link import StageLink, StageLostError, StageNews, StageRefusedError
-from shared.config import Stage
-from shared.errors import ProtocolError
-from shared.faults import StageError
-from shared.stage_line import Immediate, Parameter, Reply
+from polysight.pi_controller.rows import StageRow
+from polysight.pi_controller.stage_link import StageLink, StageLostError, StageNews, StageRefusedError
+from polysight.shared.config import Stage
+from polysight.shared.errors import ProtocolError
+from polysight.shared.faults import StageError
+from polysight.shared.stage_line import Immediate, Parameter, Reply
 
 IDLE_STATUS_S = 1.0
 STATUS_PER_HEARTBEAT = 4  # while moving

@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import serial
 
-from pi_controller.supervision import StatusWatch
-from shared.errors import DeviceError, ProtocolError
-from shared.faults import StageError, explain
-from shared.stage_line import MAX_LINE_BYTES, MAX_SEQUENCE, PROTOCOL_VERSION, Command, Immediate, Reply
+from polysight.pi_controller.supervision import StatusWatch
+from polysight.shared.errors import DeviceError, ProtocolError
+from polysight.shared.faults import StageError, explain
+from polysight.shared.stage_line import MAX_LINE_BYTES, MAX_SEQUENCE, PROTOCOL_VERSION, Command, Immediate, Reply
 
 # Opening the port resets an UNO: its boot loader takes up to 2 s before the sketch sends its banner.
 BANNER_LIMIT_S = 3.0

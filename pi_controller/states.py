@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.messages import State
+from polysight.shared.messages import State
 
 #   idle --home--> homing --> homed --run begun--> ready --row--> running <--> held
 #     ^______________|__________|____________________|               | stage at the row's end

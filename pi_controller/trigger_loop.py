@@ -10,10 +10,10 @@ import threading
 from collections.abc import Callable
 from typing import NamedTuple
 
-from pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstRecord, BurstSpec, send_burst
-from pi_controller.trigger_lines import Edge, TriggerLines
-from shared.errors import DeviceError
-from shared.faults import PiFault
+from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstRecord, BurstSpec, send_burst
+from polysight.pi_controller.trigger_lines import Edge, TriggerLines
+from polysight.shared.errors import DeviceError
+from polysight.shared.faults import PiFault
 
 # How often the loop looks whether it shall end. Edges are not delayed by it.
 LOOK_UP_S = 0.1

@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from shared.config import Instrument
-from shared.errors import ConfigError
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ConfigError
 
 MODEL_FILE = Path("/proc/device-tree/model")
 # From one line to the next. Drawn from the drivers' sources; never measured by this project.

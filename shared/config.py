@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from shared.section import Count, NonNegative, Positive, Section, require
-from shared.stage import Grid, Stage
-from shared.sync_in import MIN_PERIOD_US, WIDTH_TEXT, WIDTH_US
-from shared.tables import decode, read_toml, to_builtins
+from polysight.shared.section import Count, NonNegative, Positive, Section, require
+from polysight.shared.stage import Grid, Stage
+from polysight.shared.sync_in import MIN_PERIOD_US, WIDTH_TEXT, WIDTH_US
+from polysight.shared.tables import decode, read_toml, to_builtins
 
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]

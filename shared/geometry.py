@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from shared.config import Board, Instrument, MountStep
+from polysight.shared.config import Board, Instrument, MountStep
 
 Vector = tuple[float, float, float]
 

@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgpack
 import msgspec
 
-from shared.errors import ProtocolError, VersionError
-from shared.raster import RasterPlan, Row
+from polysight.shared.errors import ProtocolError, VersionError
+from polysight.shared.raster import RasterPlan, Row
 
 WIRE_VERSION = "1.0"
 MOST_PULSES = 256  # of one `Pulse` ...
@@ -224,7 +224,7 @@ AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume |
 
 
 class HelloReply(_Message, frozen=True, kw_only=True):
-    """Who answers, and in which state. Not told: 0 of the wall clock, {} of `stage` (`shared.stage.Stage.placing`)."""
+    """Who answers, and in which state. Not told: 0 of the wall clock, {} of `stage` (`polysight.shared.stage.Stage.placing`)."""
 
     pi_release: str
     firmware: str

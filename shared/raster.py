@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import msgspec
 
-from shared.config import Burst, Grid, Stage
-from shared.errors import ConfigError
+from polysight.shared.config import Burst, Grid, Stage
+from polysight.shared.errors import ConfigError
 
 FIRST_PULSE_DELAY_S = 200e-6
 """From a trigger edge to its first SYNC_IN pulse: the Pi's fixed delay, longer than its usual wake-up."""

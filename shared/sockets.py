@@ -8,7 +8,7 @@ from typing import Any
 
 import zmq
 
-from shared.errors import ConfigError, DeviceError
+from polysight.shared.errors import ConfigError, DeviceError
 
 Socket = zmq.Socket[bytes]
 HOST_KEYS = ("pi.key", "host.key_secret")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from shared.section import Count, NonNegative, Positive, Section, require
+from polysight.shared.section import Count, NonNegative, Positive, Section, require
 
 if TYPE_CHECKING:
-    from shared.raster import RasterPlan
+    from polysight.shared.raster import RasterPlan
 
 _PLACING = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
 

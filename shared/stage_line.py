@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import msgspec
 
-from shared.errors import ProtocolError
+from polysight.shared.errors import ProtocolError
 
 PROTOCOL_VERSION = 1
 MAX_LINE_BYTES = 96

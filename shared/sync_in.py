@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.units import us_to_ns
+from polysight.shared.units import us_to_ns
 
 MIN_PERIOD_US = 300.0  # from one rising edge to the next: an earlier one is a fatal fault of the RF core
 WIDTH_US = (0.025, 4.0)

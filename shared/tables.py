@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from shared.errors import ConfigError
+from polysight.shared.errors import ConfigError
 
 T = TypeVar("T")
 

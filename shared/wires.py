@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from shared.errors import DeviceError, ProtocolError
+from polysight.shared.errors import DeviceError, ProtocolError
 
 
 class WireEdge(NamedTuple):

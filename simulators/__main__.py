@@ -1,4 +1,4 @@
-"""`python -m simulators simulate SCENE.toml --out DIR`: raw data of a scene, with its truth. `check`: scene files."""
+"""`python -m polysight.simulators simulate SCENE.toml --out DIR`: raw data of a scene, with its truth. `check`: scene files."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import signal
 import sys
 from pathlib import Path
 
-from shared.config import load_instrument
-from shared.errors import PolysightError, os_error
-from shared.raster import check_burst_fits
-from simulators import simulate
-from simulators._process import command_line
-from simulators.scene import apply_scene, load_scene
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import PolysightError, os_error
+from polysight.shared.raster import check_burst_fits
+from polysight.simulators import simulate
+from polysight.simulators._process import command_line
+from polysight.simulators.scene import apply_scene, load_scene
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -26,7 +26,7 @@ def _check(args: argparse.Namespace) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Run a subcommand; returns the exit status."""
     example = "simulate examples/metal-plate.toml --out out/plate"
-    parser = command_line("simulators", "Stand-ins for everything that is not there.", example)
+    parser = command_line("polysight.simulators", "Stand-ins for everything that is not there.", example)
     commands = parser.add_subparsers(dest="command", required=True)
     text = "raw data of a scene, without sockets"
     sub = commands.add_parser(
@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     simulate.add_arguments(sub)
     sub.set_defaults(run=simulate.run)
     text = "say what is wrong with scene files, or how one does not fit the rig; nothing when all is well"
-    example = "example:\n  python -m simulators check examples/metal-plate.toml"
+    example = "example:\n  python -m polysight.simulators check examples/metal-plate.toml"
     sub = commands.add_parser(
         "check", help=text, description=text, epilog=example, formatter_class=parser.formatter_class
     )

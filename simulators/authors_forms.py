@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Instrument
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.authors_layout import write_settings
-from simulators.fresnel import half_space
-from simulators.layouts import new_folder
-from simulators.optics import antennas, direct_factor
-from simulators.radar import reference_cube, sample_frequencies_hz
-from simulators.scene import Scene, apply_scene
+from polysight.shared.config import Instrument
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.authors_layout import write_settings
+from polysight.simulators.fresnel import half_space
+from polysight.simulators.layouts import new_folder
+from polysight.simulators.optics import antennas, direct_factor
+from polysight.simulators.radar import reference_cube, sample_frequencies_hz
+from polysight.simulators.scene import Scene, apply_scene
 
 Complex = NDArray[np.complexfloating]
 PIXELS = 150  # of an image's side

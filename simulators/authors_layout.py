@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Board, Instrument
-from shared.raster import Row
-from simulators.layouts import Gaps, blank, new_folder, packet_payload_bytes
+from polysight.shared.config import Board, Instrument
+from polysight.shared.raster import Row
+from polysight.simulators.layouts import Gaps, blank, new_folder, packet_payload_bytes
 
 Skipped = Mapping[tuple[str, int], Collection[int]]
 

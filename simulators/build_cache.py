@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from shared.errors import DeviceError
+from polysight.shared.errors import DeviceError
 
 FOLDER = Path(__file__).resolve().parents[1] / "arduino_stage" / "build"  # ignored by git, removed by `make clean`
 

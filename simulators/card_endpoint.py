@@ -5,11 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from shared.errors import PolysightError
-from simulators.card_faults import Faults
-from simulators.card_sender import CardSender, Pace, bound_udp
-from simulators.dca1000 import SOURCE_PORT, Card, Code, Message, Network, Output, Packets, message, parse_request
-from simulators.fault_draws import CommandFaults, NetworkFaults
+from polysight.shared.errors import PolysightError
+from polysight.simulators.card_faults import Faults
+from polysight.simulators.card_sender import CardSender, Pace, bound_udp
+from polysight.simulators.dca1000 import (
+    SOURCE_PORT,
+    Card,
+    Code,
+    Message,
+    Network,
+    Output,
+    Packets,
+    message,
+    parse_request,
+)
+from polysight.simulators.fault_draws import CommandFaults, NetworkFaults
 
 NO_DATA_FLOOR_S = 10.0  # wall time: at many times real time the card's 30 s would be over before the stage has moved
 Clock = Callable[[], float]

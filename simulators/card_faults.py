@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import msgspec
 
-from shared.errors import ConfigError
-from shared.tables import decode, read_toml
+from polysight.shared.errors import ConfigError
+from polysight.shared.tables import decode, read_toml
 
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Natural = Annotated[int, msgspec.Meta(ge=0)]

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import DeviceError
-from simulators.dca1000 import DATA_HEADER_BYTES
+from polysight.shared.errors import DeviceError
+from polysight.simulators.dca1000 import DATA_HEADER_BYTES
 
 Rows = NDArray[np.uint8]
 _UDP_SEGMENT = 103  # linux/udp.h: the kernel cuts one buffer into equal datagrams
@@ -254,7 +254,7 @@ def bound_udp(address: str, port: int) -> socket.socket:
         raise DeviceError(
             f"simulated card: cannot take {address}:{port}: {e.strerror}",
             "another simulated rig uses this address, or it is not an address of this machine (loopback is 127.x.y.z)",
-            "start the rig with `python -m simulators.rig`, which chooses free loopback addresses",
+            "start the rig with `python -m polysight.simulators.rig`, which chooses free loopback addresses",
         ) from None
     return s
 

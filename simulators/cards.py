@@ -17,21 +17,21 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from threading import Event
 
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError, PolysightError
-from shared.wires import WireClient, WireEdge, WireMotion
-from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
-from simulators.card_endpoint import Clock
-from simulators.card_faults import read_faults
-from simulators.card_sender import Pace
-from simulators.dca1000 import TAIL_S
-from simulators.line_server import LineServer
-from simulators.pattern import PatternSource, SignalSource
-from simulators.radar import SimulatedRig
-from simulators.radar_socket import RadarSocket
-from simulators.scene import Disturbances, Scene, load_scene
-from simulators.simulated_card import SimulatedCard
-from simulators.sync_in import StageTrack
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, PolysightError
+from polysight.shared.wires import WireClient, WireEdge, WireMotion
+from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.card_endpoint import Clock
+from polysight.simulators.card_faults import read_faults
+from polysight.simulators.card_sender import Pace
+from polysight.simulators.dca1000 import TAIL_S
+from polysight.simulators.line_server import LineServer
+from polysight.simulators.pattern import PatternSource, SignalSource
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.radar_socket import RadarSocket
+from polysight.simulators.scene import Disturbances, Scene, load_scene
+from polysight.simulators.simulated_card import SimulatedCard
+from polysight.simulators.sync_in import StageTrack
 
 EDGES_PER_TURN = 2048
 GATHER_S = 0.01  # between readings of the wires that brought pulses: many frames a call cost less than a few
@@ -172,8 +172,8 @@ class CardServer:
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_line(
-        "simulators.cards",
-        "Radars and capture cards of a simulated rig; `python -m simulators.rig` starts them.",
+        "polysight.simulators.cards",
+        "Radars and capture cards of a simulated rig; `python -m polysight.simulators.rig` starts them.",
         "--config rig/instrument.toml --wires rig/wires.sock --pattern",
     )
     parser.add_argument("--config", type=Path, required=True, help="rig file of the simulated rig")

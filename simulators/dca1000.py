@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import ProtocolError
+from polysight.shared.errors import ProtocolError
 
 REQUEST_HEADER = 0xA55A
 REQUEST_FOOTER = 0xEEAA

@@ -23,11 +23,11 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy.special import i0
 
-from shared.config import Board, Instrument
-from shared.errors import DataError
-from shared.tables import to_builtins
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.optics import (
+from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.tables import to_builtins
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.optics import (
     Real,
     Reflectivity,
     antennas,
@@ -37,8 +37,8 @@ from simulators.optics import (
     point_scale,
     sampled,
 )
-from simulators.scene import Scene
-from simulators.spectral_axis import OVERSAMPLING, TAPS, Axis, spectral_axes
+from polysight.simulators.scene import Scene
+from polysight.simulators.spectral_axis import OVERSAMPLING, TAPS, Axis, spectral_axes
 
 _PHYSICS = 2  # counts changes of what a cached field holds
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.scene import Layer, Plate
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.scene import Layer, Plate
 
 Complex = NDArray[np.complexfloating]
 

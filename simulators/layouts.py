@@ -13,13 +13,13 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from shared import __version__
-from shared.config import Instrument
-from shared.errors import DataError
-from shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_kept
-from shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s
-from shared.tables import to_builtins
-from shared.units import NS_PER_S, us_to_ns
+from polysight.shared import __version__
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_kept
+from polysight.shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s
+from polysight.shared.tables import to_builtins
+from polysight.shared.units import NS_PER_S, us_to_ns
 
 Gaps = list[tuple[int, int]]
 _HEADER_BYTES = 10  # sequence and byte count before each packet's payload

@@ -12,8 +12,8 @@ import socket
 import struct
 from collections.abc import Callable
 
-from shared.errors import DeviceError
-from simulators.card_faults import Faults
+from polysight.shared.errors import DeviceError
+from polysight.simulators.card_faults import Faults
 
 LINE = b"Retrigger"
 _LINGER_NONE = struct.pack("ii", 1, 0)  # closing sends a reset

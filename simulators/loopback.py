@@ -11,11 +11,11 @@ import socket
 from contextlib import ExitStack
 from typing import Any
 
-from shared.config import Instrument
-from shared.errors import DeviceError
-from shared.tables import decode, to_builtins
-from simulators.card_sender import bound_udp
-from simulators.dca1000 import SOURCE_PORT
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DeviceError
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.card_sender import bound_udp
+from polysight.simulators.dca1000 import SOURCE_PORT
 
 _TRIES = 50
 _COMMAND_PORT, _EVENT_PORT = 5601, 5602

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Board, Instrument
-from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.fresnel import plate_reflection
-from simulators.scene import Plate, Scene
+from polysight.shared.config import Board, Instrument
+from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.fresnel import plate_reflection
+from polysight.simulators.scene import Plate, Scene
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Instrument
+from polysight.shared.config import Instrument
 
 
 class SignalSource(Protocol):

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Board, Instrument
-from shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm, plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.field import ObjectField, build_field, node_matrix
-from simulators.optics import antennas, direct_factor
-from simulators.receiver import high_pass, per_chirp, power_on, pulse_uniform, stream_key, sync_delay_s
-from simulators.scene import Scene, apply_scene
+from polysight.shared.config import Board, Instrument
+from polysight.shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm, plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.field import ObjectField, build_field, node_matrix
+from polysight.simulators.optics import antennas, direct_factor
+from polysight.simulators.receiver import high_pass, per_chirp, power_on, pulse_uniform, stream_key, sync_delay_s
+from polysight.simulators.scene import Scene, apply_scene
 
 _BATCH = 64  # chirps worked on at once: their arrays fit the cache
 _FULL_SCALE = 32767
@@ -72,7 +72,7 @@ class SimulatedRig:
         Draws gains, timing, phases and noise; None takes the scene's. The same seed gives the same data for the same
         pulse numbers, however they are batched.
     cache_dir
-        Where object fields are kept between runs (simulators.field); None keeps nothing.
+        Where object fields are kept between runs (polysight.simulators.field); None keeps nothing.
 
     Attributes
     ----------

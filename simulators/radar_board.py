@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
-from shared.errors import DeviceError
+from polysight.shared.errors import DeviceError
 
 TO_DEVICE, READY, FROM_DEVICE = bytes.fromhex("34122143"), bytes.fromhex("78566587"), bytes.fromhex("badccdab")
 FUNCTIONAL = 4  # sense-on-power mode

@@ -10,9 +10,9 @@ import select
 import socket
 import struct
 
-from shared.errors import DeviceError
-from simulators.radar_board import RadarBoard
-from simulators.radar_usb import UsbChip
+from polysight.shared.errors import DeviceError
+from polysight.simulators.radar_board import RadarBoard
+from polysight.simulators.radar_usb import UsbChip
 
 _HEAD = struct.Struct("<ccH")
 

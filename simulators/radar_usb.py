@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from shared.errors import DeviceError
-from simulators.radar_board import RadarBoard
+from polysight.shared.errors import DeviceError
+from polysight.simulators.radar_board import RadarBoard
 
 _CLOCK, _OUT, _SELECT = 1 << 0, 1 << 1, 1 << 3
 _BARE = (0x85, 0x87, 0x8A, 0x8C, 0x8D, 0x97)

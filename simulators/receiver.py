@@ -9,8 +9,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Board, Chirp, Instrument
-from simulators.scene import Disturbances, Scene
+from polysight.shared.config import Board, Chirp, Instrument
+from polysight.simulators.scene import Disturbances, Scene
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]

@@ -1,7 +1,7 @@
 """A capture card that plays a recording: it answers commands and streams the bytes of a .bin file after record start.
 
-    python -m simulators.replay FILE.bin --rate-mbit 40
-    python -m simulators.replay SCAN --board RH --row 12
+    python -m polysight.simulators.replay FILE.bin --rate-mbit 40
+    python -m polysight.simulators.replay SCAN --board RH --row 12
 
 Any program that records from a DCA1000 can record from it. What the recording holds does not matter. Specification:
 docs/spec/simulated-rig.md.
@@ -21,14 +21,14 @@ from threading import Event
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import ConfigError, DataError, PolysightError
-from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
-from simulators.card_endpoint import CardEndpoint, Clock
-from simulators.card_faults import OF_CONTROL, read_faults
-from simulators.card_sender import Pace
-from simulators.dca1000 import Network
-from simulators.fault_draws import EventKind
-from simulators.simulated_card import MAC
+from polysight.shared.errors import ConfigError, DataError, PolysightError
+from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.card_endpoint import CardEndpoint, Clock
+from polysight.simulators.card_faults import OF_CONTROL, read_faults
+from polysight.simulators.card_sender import Pace
+from polysight.simulators.dca1000 import Network
+from polysight.simulators.fault_draws import EventKind
+from polysight.simulators.simulated_card import MAC
 
 _OF_PULSES = ("overflow", "ddr_full", "missed_pulse", "miss_pulses", *(kind.value for kind in EventKind))
 _OF_RADARS = tuple(key for keys in OF_CONTROL.values() for key in keys)
@@ -171,7 +171,7 @@ class Player:
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_line(
-        "simulators.replay", str(__doc__).partition("\n")[0], "scans/one --board RH --row 12 --rate-mbit 40"
+        "polysight.simulators.replay", str(__doc__).partition("\n")[0], "scans/one --board RH --row 12 --rate-mbit 40"
     )
     parser.add_argument("source", type=Path, help="a .bin file, or a scan folder, each row of which fills one record")
     parser.add_argument("--board", help="board of the scan folder")

@@ -1,6 +1,6 @@
 """A whole simulated rig in one command: wires, stage, radars with their cards, and on request the Pi's program.
 
-    python -m simulators.rig --config instrument.toml --scene SCENE.toml --dir DIR --time-scale 30 --with-pi
+    python -m polysight.simulators.rig --config instrument.toml --scene SCENE.toml --dir DIR --time-scale 30 --with-pi
 
 Writes DIR/instrument.toml, the rig file that reaches these processes, and DIR/truth.json, what the scene truly is; logs
 are in DIR/logs. Prints `ready DIR/instrument.toml` when everything serves, and ends everything on SIGTERM or SIGINT, or
@@ -21,15 +21,15 @@ from typing import Any, NamedTuple
 
 import tomli_w
 
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError, DeviceError, PolysightError, os_error
-from shared.tables import decode, to_builtins
-from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
-from simulators.card_faults import read_faults
-from simulators.loopback import on_free_subnet
-from simulators.scene import Scene, apply_scene, load_scene
-from simulators.simulate import truth
-from simulators.wires import MAX_SOCKET_PATH
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, DeviceError, PolysightError, os_error
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.card_faults import read_faults
+from polysight.simulators.loopback import on_free_subnet
+from polysight.simulators.scene import Scene, apply_scene, load_scene
+from polysight.simulators.simulate import truth
+from polysight.simulators.wires import MAX_SOCKET_PATH
 
 PATIENT_HEARTBEAT_MS = 2000
 READY_LIMIT_S = 60.0
@@ -189,7 +189,7 @@ class RigProcesses:
         return "--report", str(self._folder / f"cards-{group.partition(',')[0]}.json")
 
     def _module(self, name: str, module: str, *arguments: str) -> Child:
-        return self._launch(name, [sys.executable, "-m", f"simulators.{module}", *arguments])
+        return self._launch(name, [sys.executable, "-m", f"polysight.simulators.{module}", *arguments])
 
     def _launch(self, name: str, command: list[str]) -> Child:
         self.children.append(Child(name, command, self._logs))
@@ -308,7 +308,7 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
 def main(argv: list[str] | None = None) -> int:
     """Run a simulated rig until SIGTERM or SIGINT."""
     parser = command_line(
-        "simulators.rig",
+        "polysight.simulators.rig",
         "A whole simulated rig; prints `ready FILE`, the rig file that reaches it, and runs until Ctrl-C.",
         "--config instrument.toml --scene examples/metal-plate.toml --dir out/rig --time-scale 30 --with-pi",
     )

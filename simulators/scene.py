@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import msgspec
 
-from shared.config import Burst, Grid, Image, Instrument, Stage
-from shared.errors import ConfigError
-from shared.tables import decode, read_toml, to_builtins
+from polysight.shared.config import Burst, Grid, Image, Instrument, Stage
+from polysight.shared.errors import ConfigError
+from polysight.shared.tables import decode, read_toml, to_builtins
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]

@@ -16,16 +16,16 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from shared.config import Grid, Instrument, load_instrument
-from shared.errors import ConfigError
-from shared.geometry import incidence_deg, specular_midpoint_m
-from shared.raster import Row, check_burst_fits, mean_burst_travel_mm, plan_raster
-from shared.tables import to_builtins
-from simulators.authors_layout import AuthorsLayout, Skipped
-from simulators.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
-from simulators.radar import SimulatedRig
-from simulators.receiver import stream_key
-from simulators.scene import Scene, apply_scene, load_scene
+from polysight.shared.config import Grid, Instrument, load_instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.geometry import incidence_deg, specular_midpoint_m
+from polysight.shared.raster import Row, check_burst_fits, mean_burst_travel_mm, plan_raster
+from polysight.shared.tables import to_builtins
+from polysight.simulators.authors_layout import AuthorsLayout, Skipped
+from polysight.simulators.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.receiver import stream_key
+from polysight.simulators.scene import Scene, apply_scene, load_scene
 
 Progress = Callable[[int, int], None]
 
@@ -131,7 +131,7 @@ def simulate(
     progress
         Called with rows done and rows in all.
     by_columns, skipped
-        Authors' layout only: see :class:`simulators.authors_layout.AuthorsLayout`.
+        Authors' layout only: see :class:`polysight.simulators.authors_layout.AuthorsLayout`.
 
     Returns
     -------

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import groupby
 
-from shared.config import Board, Instrument
-from simulators.card_endpoint import CardEndpoint, Clock
-from simulators.card_faults import Faults
-from simulators.card_sender import Pace
-from simulators.dca1000 import TAIL_S, Card, Code, Network, message
-from simulators.fault_draws import EventKind, OverflowFaults, PulseEvents, PulseFaults
-from simulators.pattern import SignalSource
-from simulators.radar_board import RadarBoard
-from simulators.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput, sync_line
+from polysight.shared.config import Board, Instrument
+from polysight.simulators.card_endpoint import CardEndpoint, Clock
+from polysight.simulators.card_faults import Faults
+from polysight.simulators.card_sender import Pace
+from polysight.simulators.dca1000 import TAIL_S, Card, Code, Network, message
+from polysight.simulators.fault_draws import EventKind, OverflowFaults, PulseEvents, PulseFaults
+from polysight.simulators.pattern import SignalSource
+from polysight.simulators.radar_board import RadarBoard
+from polysight.simulators.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput, sync_line
 
 FRAMES_PER_CALL = 64  # bounds memory
 MAC = b"\x12\x34\x56\x78\x90\x12"

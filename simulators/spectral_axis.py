@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 
-from shared.config import Instrument
-from shared.raster import mean_burst_travel_mm
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.optics import Antennas, Real
-from simulators.scene import Scene
+from polysight.shared.config import Instrument
+from polysight.shared.raster import mean_burst_travel_mm
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.optics import Antennas, Real
+from polysight.simulators.scene import Scene
 
 FADE_M = 0.06  # the kernel's fade-out beyond the reach of the scene
 TAPS = 12  # of the windowed sinc

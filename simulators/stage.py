@@ -12,13 +12,13 @@ import shutil
 import sys
 from pathlib import Path
 
-from shared.config import load_instrument
-from shared.errors import PolysightError
-from shared.wires import WireClient
-from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
-from simulators.build_cache import compiled
-from simulators.stage_port import SerialPort, serve
-from simulators.stage_python import PythonStage, Rig
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import PolysightError
+from polysight.shared.wires import WireClient
+from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.build_cache import compiled
+from polysight.simulators.stage_port import SerialPort, serve
+from polysight.simulators.stage_python import PythonStage, Rig
 
 SKETCH_DIR = Path(__file__).resolve().parents[1] / "arduino_stage"
 BOOT_MS = 200
@@ -47,7 +47,7 @@ def build(gxx: str, flags: tuple[str, ...] = _FLAGS) -> Path:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    p = command_line("simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
+    p = command_line("polysight.simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
     p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
     p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires; without it no edges")
     p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import Enum
 
-from shared.faults import StageError
-from shared.stage_line import Immediate, Parameter
-from simulators.stage_motion import EMERGENCY, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
+from polysight.shared.faults import StageError
+from polysight.shared.stage_line import Immediate, Parameter
+from polysight.simulators.stage_motion import EMERGENCY, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
 
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999

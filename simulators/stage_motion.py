@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from shared.faults import StageError
+from polysight.shared.faults import StageError
 
 TICK_HZ = 2_000_000
 NS_PER_TICK = 1_000_000_000 // TICK_HZ

@@ -12,11 +12,11 @@ import tty
 from pathlib import Path
 from threading import Event as Signal
 
-from shared.errors import DeviceError
-from shared.units import NS_PER_MS
-from shared.wires import WireClient
-from simulators.stage_motion import TICK_HZ
-from simulators.stage_python import PythonStage
+from polysight.shared.errors import DeviceError
+from polysight.shared.units import NS_PER_MS
+from polysight.shared.wires import WireClient
+from polysight.simulators.stage_motion import TICK_HZ
+from polysight.simulators.stage_python import PythonStage
 
 STEP_POLL_MS, REST_POLL_MS = 2, 20
 _IN_CLOSE, _IN_OPEN = 0x08 | 0x10, 0x20  # inotify(7)

@@ -9,12 +9,12 @@ import math
 import re
 from typing import NamedTuple
 
-from shared.errors import ProtocolError
-from shared.faults import StageError
-from shared.stage_line import MAX_LINE_BYTES, PROTOCOL_VERSION, Command, Parameter, Reply, crc16
-from shared.wires import WireEdge, WireMessage, WireMotion
-from simulators.stage_logic import MOTION_VERBS, Event, Refused, StageLogic
-from simulators.stage_motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
+from polysight.shared.errors import ProtocolError
+from polysight.shared.faults import StageError
+from polysight.shared.stage_line import MAX_LINE_BYTES, PROTOCOL_VERSION, Command, Parameter, Reply, crc16
+from polysight.shared.wires import WireEdge, WireMessage, WireMotion
+from polysight.simulators.stage_logic import MOTION_VERBS, Event, Refused, StageLogic
+from polysight.simulators.stage_motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
 
 FIRMWARE = "0.1.0"
 TELL_TICKS = TICK_HZ // 100  # while the speed changes, tell it every 10 ms

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Board, Instrument
-from shared.errors import ConfigError
-from shared.raster import burst_middle_s, plan_raster
-from shared.units import us_to_ns
-from shared.wires import WireMotion
-from simulators.radar_board import RadarBoard
+from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.raster import burst_middle_s, plan_raster
+from polysight.shared.units import us_to_ns
+from polysight.shared.wires import WireMotion
+from polysight.simulators.radar_board import RadarBoard
 
 RECOVERY_US = 150.0  # between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger)
 _KEEP = 4096

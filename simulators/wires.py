@@ -14,9 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
-from shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError
-from shared.wires import WireMotion, parse
-from simulators._process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError
+from polysight.shared.wires import WireMotion, parse
+from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
 
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20
@@ -212,7 +212,7 @@ def _listen(path: Path) -> socket.socket:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the hub until SIGTERM or SIGINT."""
-    parser = command_line("simulators.wires", "Hub of the simulated wires.", "--socket out/wires.sock")
+    parser = command_line("polysight.simulators.wires", "Hub of the simulated wires.", "--socket out/wires.sock")
     parser.add_argument("--socket", type=Path, required=True, help="Unix socket to serve")
     args = parser.parse_args(argv)
     stop = stop_requested()

@@ -7,9 +7,9 @@ import scipy.fft
 import scipy.signal
 from numpy.typing import NDArray
 
-from shared.config import Board, Instrument
-from shared.geometry import rx_positions_m, tx_position_m
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.shared.config import Board, Instrument
+from polysight.shared.geometry import rx_positions_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = NDArray[np.complexfloating]
 FFT = 16_384

@@ -16,8 +16,8 @@ from unittest import mock
 
 from docs.check.pages import ROOT
 
-PROGRAMS = {"polysight": "host.cli", "polysight-pi": "pi_controller.cli"}
-OWN = ("benchmarks", "docs", "host", "pi_controller", "shared", "simulators")
+PROGRAMS = {"polysight": "polysight.host.cli", "polysight-pi": "polysight.pi_controller.cli"}
+OWN = ("benchmarks", "docs", "polysight", "papers")
 _BEFORE = ("sudo", "env", "exec", "time", "nohup", "ssh", "timeout", "nice")
 _ENDS = re.compile(r"[|&;()\n]+")
 _REDIRECTS = re.compile(r"[<>&]+")

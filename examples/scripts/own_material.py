@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from host.export import material_columns, read_products
-from host.materials import Library
-from host.offline import train
-from host.polarimetry import fresnel
-from shared.config import load_instrument
-from shared.geometry import incidence_deg
-from simulators.scene import load_scene
-from simulators.simulate import simulate
+from polysight.host.export import material_columns, read_products
+from polysight.host.materials import Library
+from polysight.host.offline import train
+from polysight.host.polarimetry import fresnel
+from polysight.shared.config import load_instrument
+from polysight.shared.geometry import incidence_deg
+from polysight.simulators.scene import load_scene
+from polysight.simulators.simulate import simulate
 
 ROOT = Path(__file__).parents[2]
 

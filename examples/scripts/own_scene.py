@@ -7,13 +7,13 @@
 # %%
 from pathlib import Path
 
-from host.materials import read_truth
-from host.options import Options
-from host.pipeline import Pipeline
-from host.store.scanfolder import ScanFolder
-from shared.config import load_instrument
-from simulators.scene import load_scene
-from simulators.simulate import simulate
+from polysight.host.materials import read_truth
+from polysight.host.options import Options
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import load_instrument
+from polysight.simulators.scene import load_scene
+from polysight.simulators.simulate import simulate
 
 ROOT = Path(__file__).parents[2]
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from host.capture.decode import row_words
-from host.imaging import ImageBuilder
-from host.store.scanfolder import ScanFolder
-from host.sync import BoardSetup, synchronise_row
+from polysight.host.capture.decode import row_words
+from polysight.host.imaging import ImageBuilder
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.sync import BoardSetup, synchronise_row
 
 # %%
 scan = ScanFolder.load(Path("out/points"))

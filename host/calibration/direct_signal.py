@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.radar.validator import direct_if_hz
-from host.sync import BoardSetup
-from host.sync.align import AlignedRow, align_row, whole_blocks
-from host.sync.direct_path import reference
-from host.sync.passes import FOLD
-from host.sync.residuals import noise_power
-from host.sync.tone import cis
-from shared.config import Board, Instrument
+from polysight.host.radar.validator import direct_if_hz
+from polysight.host.sync import BoardSetup
+from polysight.host.sync.align import AlignedRow, align_row, whole_blocks
+from polysight.host.sync.direct_path import reference
+from polysight.host.sync.passes import FOLD
+from polysight.host.sync.residuals import noise_power
+from polysight.host.sync.tone import cis
+from polysight.shared.config import Board, Instrument
 
 FULL_SCALE = 32767
 PASSBAND = 0.9  # of the sample rate

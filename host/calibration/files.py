@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 import msgspec
 import tomli_w
 
-from host.imaging.imaged_with import ImagedWith
-from host.store.scanfolder import versions
-from shared.config import Instrument
-from shared.errors import ConfigError, DeviceError
-from shared.tables import decode, read_toml, to_builtins
+from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.store.scanfolder import versions
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.tables import decode, read_toml, to_builtins
 
 FORMAT = 1
 Vector = tuple[float, float, float]

@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from host.calibration.direct_signal import find_direct
-from host.calibration.files import BoardFilter, places_crc32
-from host.calibration.rows import board_rows
-from host.store.source import ScanSource
-from host.sync import BoardSetup
-from host.sync.hpf import HighPass, fit_high_pass
-from shared.config import Board
-from shared.errors import DataError
+from polysight.host.calibration.direct_signal import find_direct
+from polysight.host.calibration.files import BoardFilter, places_crc32
+from polysight.host.calibration.rows import board_rows
+from polysight.host.store.source import ScanSource
+from polysight.host.sync import BoardSetup
+from polysight.host.sync.hpf import HighPass, fit_high_pass
+from polysight.shared.config import Board
+from polysight.shared.errors import DataError
 
 Real = NDArray[np.float64]
 ROWS = 6  # of a scan that are looked at

@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
-from host.imaging.grid import image_grid
-from host.imaging.imaged_with import ImagedWith
-from host.store import manifest
-from host.store.scanfolder import MANIFEST, ScanFolder
-from shared.config import Board, Instrument, MountStep
-from shared.errors import ConfigError, DataError
-from shared.tables import to_builtins
+from polysight.host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
+from polysight.host.imaging.grid import image_grid
+from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.shared.config import Board, Instrument, MountStep
+from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.tables import to_builtins
 
 if TYPE_CHECKING:
-    from host.polarimetry import PlaneReference
-    from host.sync.hpf import HighPass
+    from polysight.host.polarimetry import PlaneReference
+    from polysight.host.sync.hpf import HighPass
 
 FOLDER = "calibration"
 FACT = "calibration"
@@ -84,7 +84,7 @@ class Calibration:
 
     def high_pass(self, board: str) -> HighPass | None:
         """A board's filter as measured; None: as programmed."""
-        from host.sync.hpf import HighPass
+        from polysight.host.sync.hpf import HighPass
 
         found = None if self.filters is None else self.filters.boards.get(board)
         return None if found is None else HighPass(tuple(1e3 * corner for corner in found.corners_khz))
@@ -93,7 +93,7 @@ class Calibration:
         """Metal over the plane, pixel by pixel. Raises DataError when its images are not what the file names."""
         if self.metal is None:
             return None
-        from host.calibration.metal import read_metal
+        from polysight.host.calibration.metal import read_metal
 
         return read_metal(self.metal, self._path("metal").parent / self.metal.images)
 

@@ -1,6 +1,6 @@
 """A metal plate over the plane as a calibration file: gains of both channels at every pixel.
 
-What the gains are is :mod:`host.polarimetry.reference`; here they only get a file of their own.
+What the gains are is :mod:`polysight.host.polarimetry.reference`; here they only get a file of their own.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from host.calibration.files import MetalBand, MetalFile, SourceScan, head, write
-from host.imaging.subbands import SubBand
-from host.polarimetry import PlaneReference
-from shared.errors import DataError, DeviceError
+from polysight.host.calibration.files import MetalBand, MetalFile, SourceScan, head, write
+from polysight.host.imaging.subbands import SubBand
+from polysight.host.polarimetry import PlaneReference
+from polysight.shared.errors import DataError, DeviceError
 
 IMAGES = ("h", "v", "valid")
 LEAST_LEVEL = 0.02  # of a mirror's answer beside the direct path's; antenna patterns may take some 20 dB

@@ -25,19 +25,19 @@ import scipy.linalg
 import scipy.optimize
 from numpy.typing import NDArray
 
-from host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, head, places_crc32
-from host.calibration.rows import board_rows
-from host.imaging.grid import Antennas, image_grid, row_offsets_m
-from host.imaging.reduce import reduction, scene_gate_m
-from host.store.source import ScanSource
-from host.sync import BoardSetup, synchronise_row
-from host.sync.hpf import HighPass
-from shared.config import Instrument
-from shared.errors import DataError
-from shared.geometry import specular_midpoint_m
-from shared.raster import plan_raster
-from shared.tables import decode, read_toml
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, head, places_crc32
+from polysight.host.calibration.rows import board_rows
+from polysight.host.imaging.grid import Antennas, image_grid, row_offsets_m
+from polysight.host.imaging.reduce import reduction, scene_gate_m
+from polysight.host.store.source import ScanSource
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.host.sync.hpf import HighPass
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.geometry import specular_midpoint_m
+from polysight.shared.raster import plan_raster
+from polysight.shared.tables import decode, read_toml
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Real = NDArray[np.float64]
 DEPTH_M = 0.02  # how far the plane may lie from where the rig file has it

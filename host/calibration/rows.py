@@ -9,14 +9,14 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from host.calibration.files import SourceScan
-from host.capture.decode import row_words
-from host.store.authors import AuthorsCube, open_scan
-from host.store.raw import require_raw
-from host.store.scanfolder import MANIFEST, ScanFolder
-from host.store.source import ScanSource
-from shared.config import Instrument
-from shared.errors import DataError
+from polysight.host.calibration.files import SourceScan
+from polysight.host.capture.decode import row_words
+from polysight.host.store.authors import AuthorsCube, open_scan
+from polysight.host.store.raw import require_raw
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.source import ScanSource
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
 
 
 def open_raw(folder: Path, rig: Instrument | None = None) -> ScanSource:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.calibration.direct_signal import band_hz, find_direct, unwrapped
-from host.calibration.files import BoardStart
-from host.calibration.rows import board_rows
-from host.radar.validator import direct_if_hz
-from host.store.source import ScanSource
-from host.sync import BoardSetup
-from shared.config import Board, Instrument
-from shared.errors import DataError
+from polysight.host.calibration.direct_signal import band_hz, find_direct, unwrapped
+from polysight.host.calibration.files import BoardStart
+from polysight.host.calibration.rows import board_rows
+from polysight.host.radar.validator import direct_if_hz
+from polysight.host.store.source import ScanSource
+from polysight.host.sync import BoardSetup
+from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import DataError
 
 ROWS = 4
 FOUND = 0.25  # part of the chirps in which a direct path must be found to be believed

@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 from types import TracebackType
 
-from host.capture import dca1000
-from host.capture.dca1000 import Code, Reply, Status, Version
-from host.capture.hops import no_route, silent_card
-from host.capture.udp import bind_udp
-from shared.config import Board, Card
-from shared.errors import DeviceError, ProtocolError
+from polysight.host.capture import dca1000
+from polysight.host.capture.dca1000 import Code, Reply, Status, Version
+from polysight.host.capture.hops import no_route, silent_card
+from polysight.host.capture.udp import bind_udp
+from polysight.shared.config import Board, Card
+from polysight.shared.errors import DeviceError, ProtocolError
 
 ATTEMPTS = 3
 EEPROM_REPORT_S = 0.5
@@ -78,7 +78,7 @@ class CardClient:
     def write_eeprom(self, body: bytes) -> Status:
         """Send the 18 bytes of command 0x04, once; returns the status bits the card reported meanwhile.
 
-        Not sent again when no reply comes: it may be writing. Callers use :func:`host.capture.eeprom.program_eeprom`.
+        Not sent again when no reply comes: it may be writing. Callers use :func:`polysight.host.capture.eeprom.program_eeprom`.
         Raises DeviceError when the card refuses or is silent.
         """
         self._status = Status(0)

@@ -9,7 +9,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
-from shared.errors import ProtocolError
+from polysight.shared.errors import ProtocolError
 
 REQUEST_MAGIC = 0xA55A
 FOOTER = 0xEEAA

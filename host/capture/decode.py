@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import DataError
+from polysight.shared.errors import DataError
 
 Mask = NDArray[np.bool_] | Sequence[tuple[int, int]] | None
 
@@ -20,7 +20,7 @@ def row_words(
     rx: int = 4,
     swap_iq: bool = False,
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
-    """A 4-lane recording in its own order, without a copy: what `host.sync` takes.
+    """A 4-lane recording in its own order, without a copy: what `polysight.host.sync` takes.
 
     Parameters, `valid` and errors as of :func:`decode_row`; the words are int16 [frame, sample, 2, rx], I before Q.
     Those of frames that are not valid mean nothing.

@@ -10,10 +10,10 @@ import ipaddress
 import struct
 from dataclasses import dataclass
 
-from host.capture.card import CardClient
-from host.capture.dca1000 import Code, Status
-from shared.config import Board
-from shared.errors import ConfigError, DeviceError
+from polysight.host.capture.card import CardClient
+from polysight.host.capture.dca1000 import Code, Status
+from polysight.shared.config import Board
+from polysight.shared.errors import ConfigError, DeviceError
 
 _PORTS = struct.Struct("<HH")
 DEFAULT_MAC = "12:34:56:78:90:12"

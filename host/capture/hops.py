@@ -7,10 +7,10 @@ import struct
 from enum import Enum
 from pathlib import Path
 
-from host.capture.dca1000 import Status
-from host.capture.receiver_words import RowCapture
-from shared.config import Board
-from shared.errors import DeviceError
+from polysight.host.capture.dca1000 import Status
+from polysight.host.capture.receiver_words import RowCapture
+from polysight.shared.config import Board
+from polysight.shared.errors import DeviceError
 
 _GATEWAY, _UP = 0x2, 0x1
 _ARP_COMPLETE = 0x2

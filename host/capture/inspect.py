@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.dca1000 import Status
-from host.capture.packets_in_file import packets_in_file, place_packets
-from host.capture.placed import Placed
-from host.capture.shape import (
+from polysight.host.capture.dca1000 import Status
+from polysight.host.capture.packets_in_file import packets_in_file, place_packets
+from polysight.host.capture.placed import Placed
+from polysight.host.capture.shape import (
     DRAW,
     SAMPLES_TRIED,
     Shape,
@@ -27,8 +27,8 @@ from host.capture.shape import (
     spectra,
     spectral_disorder,
 )
-from shared.config import Instrument
-from shared.errors import DataError
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
 
 _FULL_SCALE = 32767
 _MUCH_DC = 0.05 * _FULL_SCALE

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from host.capture import dca1000
-from host.capture.dca1000 import Code, Status
-from host.capture.inspect import CardReport, Known, Report, inspect_payload
-from host.capture.packets_in_file import place_packets
-from host.capture.pcap import read_pcap
-from shared.errors import DataError, ProtocolError
+from polysight.host.capture import dca1000
+from polysight.host.capture.dca1000 import Code, Status
+from polysight.host.capture.inspect import CardReport, Known, Report, inspect_payload
+from polysight.host.capture.packets_in_file import place_packets
+from polysight.host.capture.pcap import read_pcap
+from polysight.shared.errors import DataError, ProtocolError
 
 
 def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> Report:  # noqa: B008 - immutable

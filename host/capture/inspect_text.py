@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.dca1000 import Code
-from host.capture.inspect import CardReport, Report
+from polysight.host.capture.dca1000 import Code
+from polysight.host.capture.inspect import CardReport, Report
 
 
 def main_text(report: Report) -> str:

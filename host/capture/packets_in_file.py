@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture import dca1000
-from host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES
-from host.capture.placed import Placed
-from host.capture.placement import Placement
-from shared.errors import DataError
+from polysight.host.capture import dca1000
+from polysight.host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES
+from polysight.host.capture.placed import Placed
+from polysight.host.capture.placement import Placement
+from polysight.shared.errors import DataError
 
 _LOOKED_AT = 16
 

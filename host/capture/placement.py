@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, SEQUENCE_BITS
-from host.capture.placed import Counters, Gap, Losses, PacketCounts, Placed
+from polysight.host.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, SEQUENCE_BITS
+from polysight.host.capture.placed import Counters, Gap, Losses, PacketCounts, Placed
 
 Bytes = NDArray[np.uint8]
 

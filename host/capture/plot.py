@@ -7,8 +7,8 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from host.capture.inspect import Report
-from shared.errors import DataError
+from polysight.host.capture.inspect import Report
+from polysight.shared.errors import DataError
 
 BOTTOM_DB = -20.0
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
-from host.capture import receiver_words as words
-from host.capture.dca1000 import Status
-from host.capture.receiver_words import Progress, RowCapture
-from shared.config import Board
-from shared.errors import DeviceError
+from polysight.host.capture import receiver_words as words
+from polysight.host.capture.dca1000 import Status
+from polysight.host.capture.receiver_words import Progress, RowCapture
+from polysight.shared.config import Board
+from polysight.shared.errors import DeviceError
 
 _START_LIMIT_S = 30.0
 _ANSWER_LIMIT_S = 60.0  # ending a row waits for the disk
@@ -32,7 +32,7 @@ class ReceiverProcess:
     buffer_bytes
         Receive buffer to ask the kernel for.
     core
-        Core to pin it to, as :func:`host.capture.scheduling.receiver_cores` chooses them; None leaves it free.
+        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None leaves it free.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class ReceiverProcess:
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "host.capture.receiver_process", str(theirs.fileno())],
+                [sys.executable, "-m", "polysight.host.capture.receiver_process", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C in the terminal is the host's to handle

@@ -1,4 +1,4 @@
-"""The receiving process of one card: `python -m host.capture.receiver_process FD`.
+"""The receiving process of one card: `python -m polysight.host.capture.receiver_process FD`.
 
 A process of its own, so that imaging in the host never starves it. It obeys requests on the inherited socket FD, sits
 in one poll() over that and the card's data, and ends when the host does, because then the socket closes.
@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture import receiver_words as words
-from host.capture.dca1000 import LOST_BEFORE_PACKETS, MAX_PAYLOAD_BYTES, Status
-from host.capture.placed import Counters
-from host.capture.placement import Placement
-from host.capture.scheduling import take_core, take_priority
-from host.capture.segment import Segment, write_index
-from host.capture.udp import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
-from shared.errors import DeviceError, PolysightError
+from polysight.host.capture import receiver_words as words
+from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, MAX_PAYLOAD_BYTES, Status
+from polysight.host.capture.placed import Counters
+from polysight.host.capture.placement import Placement
+from polysight.host.capture.scheduling import take_core, take_priority
+from polysight.host.capture.segment import Segment, write_index
+from polysight.host.capture.udp import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
+from polysight.shared.errors import DeviceError, PolysightError
 
 _MAX_BATCHES = 64  # batches fetched before the pipe is looked at again
 _GATHER_MS = 1  # packets gather in the kernel's buffer meanwhile: fewer, fuller batches

@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
-from shared.errors import DeviceError
+from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.shared.errors import DeviceError
 
 
 class _Words(msgspec.Struct, frozen=True, tag=True):
@@ -87,9 +87,9 @@ class RowCapture(_Words, frozen=True):
 
     `bytes` is what was placed, `missing` the byte ranges that are not (the whole row when `located` is false).
     Arrival times are the host's monotonic clock, 0 when no packet came. Counts of packets as in
-    :class:`host.capture.placed.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
-    :class:`host.capture.placed.Losses`. `card_status` is what the card reported by itself during the row. `holes`
-    and `slipped` as in :class:`host.capture.placed.Placed`.
+    :class:`polysight.host.capture.placed.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
+    :class:`polysight.host.capture.placed.Losses`. `card_status` is what the card reported by itself during the row. `holes`
+    and `slipped` as in :class:`polysight.host.capture.placed.Placed`.
     """
 
     row: int

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import DataError, DeviceError
+from polysight.shared.errors import DataError, DeviceError
 
 PAIR = np.dtype("<i8")
 

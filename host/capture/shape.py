@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.decode import decode_real, decode_row, decode_two_lane
-from shared.config import Instrument
+from polysight.host.capture.decode import decode_real, decode_row, decode_two_lane
+from polysight.shared.config import Instrument
 
 Samples = NDArray[np.complex64] | NDArray[np.float32]
 SAMPLES_TRIED = (256, 512, 128, 1024, 64)

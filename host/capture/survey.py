@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from host.capture.card import CardClient
-from host.capture.hops import Hop, route_interface, silent_hop, silent_radar
-from host.capture.receiver import ReceiverProcess
-from host.capture.receiver_words import RowCapture
-from host.capture.scheduling import PRIORITY_REMEDY, receiver_cores
-from host.capture.udp import check_receive_buffer
-from shared.config import Board, Instrument
-from shared.errors import DeviceError
+from polysight.host.capture.card import CardClient
+from polysight.host.capture.hops import Hop, route_interface, silent_hop, silent_radar
+from polysight.host.capture.receiver import ReceiverProcess
+from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.scheduling import PRIORITY_REMEDY, receiver_cores
+from polysight.host.capture.udp import check_receive_buffer
+from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import DeviceError
 
 Verdict = Literal["ok", "warning", "error", "not checked"]
 HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.dca1000 import MAX_PAYLOAD_BYTES
-from shared.errors import DeviceError
+from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES
+from polysight.shared.errors import DeviceError
 
 SO_RCVBUFFORCE = 33  # Linux; may exceed net.core.rmem_max, needs CAP_NET_ADMIN
 SO_MEMINFO = 55  # Linux: nine 32-bit words about the socket's memory

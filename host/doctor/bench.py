@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 
 import zmq
 
-from host.capture.survey import CardSurvey, survey_cards
-from host.doctor.kernel import clock_is_synchronised, write_speed
-from host.scan.pi_client import PiClient
-from shared.config import Board, Instrument
-from shared.messages import HelloReply
+from polysight.host.capture.survey import CardSurvey, survey_cards
+from polysight.host.doctor.kernel import clock_is_synchronised, write_speed
+from polysight.host.scan.pi_client import PiClient
+from polysight.shared.config import Board, Instrument
+from polysight.shared.messages import HelloReply
 
 if TYPE_CHECKING:  # they load numpy and numba, which most checks do not need
-    from host.calibration.direct_signal import DirectSignal
-    from host.doctor.capture import Captured
+    from polysight.host.calibration.direct_signal import DirectSignal
+    from polysight.host.doctor.capture import Captured
 
 BURSTS = 4
 

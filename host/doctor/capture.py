@@ -11,15 +11,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.decode import row_words
-from host.capture.receiver_words import RowCapture
-from host.radar.backends import radar_control
-from host.radar.interface import BoardState
-from host.scan.capture_rig import CaptureRig
-from host.scan.pi_client import PiClient
-from host.store.scanfolder import PART
-from shared.config import Instrument
-from shared.messages import Pulsed
+from polysight.host.capture.decode import row_words
+from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.radar.backends import radar_control
+from polysight.host.radar.interface import BoardState
+from polysight.host.scan.capture_rig import CaptureRig
+from polysight.host.scan.pi_client import PiClient
+from polysight.host.store.scanfolder import PART
+from polysight.shared.config import Instrument
+from polysight.shared.messages import Pulsed
 
 _TAIL_S = 2.5  # a card sends its short last packet two seconds after the last data
 _LOOK_S = 0.05

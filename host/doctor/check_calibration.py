@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from host.calibration.in_force import checked
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, ok
-from shared.backends import is_simulated
+from polysight.host.calibration.in_force import checked
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, ok
+from polysight.shared.backends import is_simulated
 
 
 def check_calibration(bench: Bench) -> Finding:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from host.capture.survey import HopFinding
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, ok
-from shared.config import Board
+from polysight.host.capture.survey import HopFinding
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, ok
+from polysight.shared.config import Board
 
 _BEFORE_DATA = ("host", "route", "link", "card")
 

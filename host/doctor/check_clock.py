@@ -5,8 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, not_checked, ok, warning
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
 
 APART_S = 1.0
 LOST_S = 60.0

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, ok
-from host.radar.validator import require
-from shared.config import load_instrument
-from shared.raster import check_burst_fits
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, ok
+from polysight.host.radar.validator import require
+from polysight.shared.config import load_instrument
+from polysight.shared.raster import check_burst_fits
 
 
 def check_config(bench: Bench) -> Finding:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.calibration.direct_signal import DirectSignal, band_hz, find_direct, jitter_hz, unwrapped
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, not_checked, ok, warning
-from shared.config import Board, Instrument
+from polysight.host.calibration.direct_signal import DirectSignal, band_hz, find_direct, jitter_hz, unwrapped
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
+from polysight.shared.config import Board, Instrument
 
 HEARD = 0.9  # part of the chirps in which it must be found
 APART_S = 10e-9  # 5 ns of trigger, and some ppm of crystals

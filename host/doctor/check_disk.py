@@ -5,11 +5,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, ok, warning
-from host.plan.timing import scan_time
-from shared.config import Instrument
-from shared.errors import ConfigError
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, ok, warning
+from polysight.host.plan.timing import scan_time
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ConfigError
 
 SPARE = 2.0  # the disk should take so many times what comes
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.calibration.direct_signal import FULL_SCALE
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, not_checked, ok, warning
-from shared.config import Board
+from polysight.host.calibration.direct_signal import FULL_SCALE
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
+from polysight.shared.config import Board
 
 CLIPPED = 0.01  # part of the chirps that may be clipped
 WEAK = 4.0  # counts

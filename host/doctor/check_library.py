@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, ok, warning
-from host.materials import Library
-from host.options import LIBRARY, Options
-from shared.geometry import incidence_deg
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, ok, warning
+from polysight.host.materials import Library
+from polysight.host.options import LIBRARY, Options
+from polysight.shared.geometry import incidence_deg
 
 
 def check_library(bench: Bench) -> Finding:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from host.capture.hops import route_interface
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, ok, warning
-from host.doctor.kernel import nic
-from shared.config import Board
+from polysight.host.capture.hops import route_interface
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, ok, warning
+from polysight.host.doctor.kernel import nic
+from polysight.shared.config import Board
 
 MTU = 1500
 SPEED_MBIT = 1000

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import shared
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, ok, warning
-from host.scan.pi_stage import differences
-from shared.backends import is_simulated
-from shared.sockets import HOST_KEYS, is_loopback
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, ok, warning
+from polysight.host.scan.pi_stage import differences
+from polysight.shared import __version__
+from polysight.shared.backends import is_simulated
+from polysight.shared.sockets import HOST_KEYS, is_loopback
 
 SIMULATED = "simulated wires: no hardware is driven"
 
@@ -47,10 +47,10 @@ def check_pi(bench: Bench) -> Finding:
     lines = SIMULATED if is_simulated(hello.backend) else f"lines by {hello.backend}"
     told = f"{bench.rig.pi.command_address} answers: release {hello.pi_release}, {lines}, state {hello.state}"
     facts = {"release": hello.pi_release, "backend": hello.backend, "state": hello.state}
-    if hello.pi_release != shared.__version__:
+    if hello.pi_release != __version__:
         return error(
             told,
-            f"this host is of release {shared.__version__}",
+            f"this host is of release {__version__}",
             "install the same release on both: `make pi-install HOST=...`",
             **facts,
         )

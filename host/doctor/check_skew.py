@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from host.calibration.direct_signal import DirectSignal, unwrapped
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, not_checked, ok, warning
-from shared.config import Instrument
+from polysight.host.calibration.direct_signal import DirectSignal, unwrapped
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
+from polysight.shared.config import Instrument
 
 MUCH_S = 10e-9
 TOO_MUCH_S = 20e-9

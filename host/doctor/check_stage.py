@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shared
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, ok, warning
-from shared.faults import explain
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, ok, warning
+from polysight.shared import __version__
+from polysight.shared.faults import explain
 
 
 def check_stage(bench: Bench) -> Finding:
@@ -22,10 +22,10 @@ def check_stage(bench: Bench) -> Finding:
     firmware = bench.hello.firmware if bench.hello is not None else ""
     where = f"at {status.x_mm:.1f}, {status.y_mm:.1f} mm" if status.homed else "not homed yet"
     told, facts = f"answers, sketch {firmware or 'unknown'}, {where}", {"firmware": firmware, "homed": status.homed}
-    if firmware != shared.__version__:
+    if firmware != __version__:
         return error(
             told,
-            f"this release's sketch is {shared.__version__}: the board was not flashed with it",
+            f"this release's sketch is {__version__}: the board was not flashed with it",
             "`make flash PORT=/dev/ttyACM0` with the board on this machine",
             **facts,
         )

@@ -5,14 +5,14 @@ Nothing moves. Radars that are armed transmit for as long as the pulses last, so
 
 from __future__ import annotations
 
-from host.capture.hops import silent_radar
-from host.doctor.bench import Bench
-from host.doctor.finding import Finding, error, not_checked, ok, warning
-from host.radar.interface import RadarState
-from host.scan.pi_client import RefusedError
-from shared.config import Board
-from shared.faults import PiFault, explain
-from shared.messages import MOST_PULSES, MOST_PULSES_S
+from polysight.host.capture.hops import silent_radar
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
+from polysight.host.radar.interface import RadarState
+from polysight.host.scan.pi_client import RefusedError
+from polysight.shared.config import Board
+from polysight.shared.faults import PiFault, explain
+from polysight.shared.messages import MOST_PULSES, MOST_PULSES_S
 
 
 def check_pulses(bench: Bench) -> Finding:
@@ -21,7 +21,7 @@ def check_pulses(bench: Bench) -> Finding:
         return not_checked("--no-pulse: no SYNC_IN pulse is sent", "leave it out; nothing moves")
     if not bench.sound:
         return not_checked("no card can be used")
-    from host.doctor.capture import capture, only
+    from polysight.host.doctor.capture import capture, only
 
     rig, burst = only(bench.rig, bench.sound), bench.rig.burst
     period_s = burst.period_us * 1e-6
@@ -57,7 +57,10 @@ def check_radar(bench: Bench, board: Board) -> Finding:
     facts = {"frames_expected": frames, "frames": whole, "bytes": row.bytes, "packets": row.packets}
     if got.radar is not None and got.radar.state is RadarState.FAULT:
         return error(
-            f"the radar stopped by itself: {got.radar.detail}", "see there", "`python -m host.radar check`", **facts
+            f"the radar stopped by itself: {got.radar.detail}",
+            "see there",
+            "`python -m polysight.host.radar check`",
+            **facts,
         )
     if row.packets == 0:
         e = silent_radar(board, row)

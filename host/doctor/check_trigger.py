@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import time
 
-from host.doctor.bench import Bench
-from host.doctor.check_pi import check_free
-from host.doctor.finding import Finding, error, not_checked, ok, warning
-from host.scan.ready import make_ready
-from host.scan.stop import StopRequest
-from host.store.scanfolder import new_scan_id
-from shared.errors import DeviceError
-from shared.faults import explain
-from shared.messages import BeginRun, RowFinished
-from shared.raster import RasterPlan
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.check_pi import check_free
+from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
+from polysight.host.scan.ready import make_ready
+from polysight.host.scan.stop import StopRequest
+from polysight.host.store.scanfolder import new_scan_id
+from polysight.shared.errors import DeviceError
+from polysight.shared.faults import explain
+from polysight.shared.messages import BeginRun, RowFinished
+from polysight.shared.raster import RasterPlan
 
 POINTS = 8
 _LIMIT_S = 120.0

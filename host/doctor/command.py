@@ -6,11 +6,11 @@ import json
 import sys
 from dataclasses import asdict
 
-from host.doctor.bench import Bench, System, Wanted
-from host.doctor.check_pi import SIMULATED
-from host.doctor.finding import Finding
-from host.doctor.walk import walk
-from shared.backends import is_simulated
+from polysight.host.doctor.bench import Bench, System, Wanted
+from polysight.host.doctor.check_pi import SIMULATED
+from polysight.host.doctor.finding import Finding
+from polysight.host.doctor.walk import walk
+from polysight.shared.backends import is_simulated
 
 _WIDTH = 16
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from shared.errors import PolysightError
+from polysight.shared.errors import PolysightError
 
 Verdict = Literal["ok", "warning", "error", "not checked"]
 

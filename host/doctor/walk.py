@@ -5,47 +5,47 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
-from host.doctor.bench import Bench
-from host.doctor.check_cards import check_buffer, check_card
-from host.doctor.check_clock import check_host_clock, check_pi_clock
-from host.doctor.check_config import check_config
-from host.doctor.check_disk import check_disk, check_time
-from host.doctor.check_network import check_network
-from host.doctor.check_pi import check_free, check_keys, check_pi
-from host.doctor.check_stage import check_stage
-from host.doctor.check_stream import check_pulses, check_radar
-from host.doctor.check_trigger import check_trigger
-from host.doctor.finding import Finding, not_checked, of_error
-from shared.config import Board
-from shared.errors import DeviceError, PolysightError
+from polysight.host.doctor.bench import Bench
+from polysight.host.doctor.check_cards import check_buffer, check_card
+from polysight.host.doctor.check_clock import check_host_clock, check_pi_clock
+from polysight.host.doctor.check_config import check_config
+from polysight.host.doctor.check_disk import check_disk, check_time
+from polysight.host.doctor.check_network import check_network
+from polysight.host.doctor.check_pi import check_free, check_keys, check_pi
+from polysight.host.doctor.check_stage import check_stage
+from polysight.host.doctor.check_stream import check_pulses, check_radar
+from polysight.host.doctor.check_trigger import check_trigger
+from polysight.host.doctor.finding import Finding, not_checked, of_error
+from polysight.shared.config import Board
+from polysight.shared.errors import DeviceError, PolysightError
 
 
 def _calibration(bench: Bench) -> Finding:
-    from host.doctor.check_calibration import check_calibration
+    from polysight.host.doctor.check_calibration import check_calibration
 
     return check_calibration(bench)
 
 
 def _library(bench: Bench) -> Finding:
-    from host.doctor.check_library import check_library
+    from polysight.host.doctor.check_library import check_library
 
     return check_library(bench)
 
 
 def _level(bench: Bench, board: Board) -> Finding:
-    from host.doctor.check_level import check_level
+    from polysight.host.doctor.check_level import check_level
 
     return check_level(bench, board)
 
 
 def _direct_path(bench: Bench, board: Board) -> Finding:
-    from host.doctor.check_direct_path import check_direct_path
+    from polysight.host.doctor.check_direct_path import check_direct_path
 
     return check_direct_path(bench, board)
 
 
 def _skew(bench: Bench) -> Finding:
-    from host.doctor.check_skew import check_skew
+    from polysight.host.doctor.check_skew import check_skew
 
     return check_skew(bench)
 

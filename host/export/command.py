@@ -5,12 +5,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from host.export.hdf5 import write_hdf5
-from host.export.matlab import write_mat
-from host.export.pictures import write_pngs
-from host.export.table import write_csv
-from host.report.read import read_products
-from shared.errors import ConfigError, DataError
+from polysight.host.export.hdf5 import write_hdf5
+from polysight.host.export.matlab import write_mat
+from polysight.host.export.pictures import write_pngs
+from polysight.host.export.table import write_csv
+from polysight.host.report.read import read_products
+from polysight.shared.errors import ConfigError, DataError
 
 FORMATS = ("hdf5", "mat", "png", "csv")
 _FOLDER = "export"

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from host.export.table import material_columns
-from host.report.read import SavedProducts
-from shared.errors import ConfigError
+from polysight.host.export.table import material_columns
+from polysight.host.report.read import SavedProducts
+from polysight.shared.errors import ConfigError
 
 CONVENTION = (
     "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
@@ -27,7 +27,7 @@ def _h5py() -> Any:
         raise ConfigError(
             "HDF5 needs the package h5py, which is not installed",
             "only this export uses it, so it is an extra",
-            "pip install 'polysight-host[export]', or pip install h5py",
+            "pip install 'polysight[export]', or pip install h5py",
         ) from None
 
 
@@ -35,7 +35,7 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
     """Write a file of these products.
 
     /h, /v, /p complex64 [y, x], /valid bool [y, x]; /x, /y float64 in metres, the dimension scales of all four; group
-    /materials with a column for each of :func:`host.export.table.material_columns`; attributes scan_id, simulated,
+    /materials with a column for each of :func:`polysight.host.export.table.material_columns`; attributes scan_id, simulated,
     convention, and as JSON instrument, versions, quality, materials.
 
     Raises

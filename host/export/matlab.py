@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from host.export.hdf5 import CONVENTION
-from host.export.table import material_columns
-from host.report import write_atomically
-from host.report.read import SavedProducts
+from polysight.host.export.hdf5 import CONVENTION
+from polysight.host.export.table import material_columns
+from polysight.host.report import write_atomically
+from polysight.host.report.read import SavedProducts
 
 _LONGEST_NAME = 63
 

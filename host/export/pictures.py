@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from host.report import ReportContext, figures, write_atomically
-from host.report.read import SavedProducts
+from polysight.host.report import ReportContext, figures, write_atomically
+from polysight.host.report.read import SavedProducts
 
 
 def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:

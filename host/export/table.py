@@ -8,8 +8,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from host.report import write_atomically
-from host.report.read import SavedProducts
+from polysight.host.report import write_atomically
+from polysight.host.report.read import SavedProducts
 
 _COLUMNS = (
     "patch", "name", "confidence", "metal_reference", "metal_like", "centre_x_mm", "centre_y_mm", "width_mm",

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from host.imaging.grid import Antennas, ImageGrid
+from polysight.host.imaging.grid import Antennas, ImageGrid
 
 _SAME_M = 1e-6  # closer places are one: 2e-3 rad at one position, far below the noise of any
 _FINER = 4  # the lattice in y may be this much finer than the pixels

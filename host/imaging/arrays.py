@@ -2,7 +2,7 @@
 
 The imagers use the functions of the Python array API standard only, from the library their samples come in. numpy
 needs nothing more; for any other library the package `array-api-compat` maps what differs (`pip install
-polysight-host[gpu]`).
+polysight[gpu]`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.fft
 
-from shared.errors import ConfigError
+from polysight.shared.errors import ConfigError
 
 
 def namespace(array: Any) -> Any:
@@ -32,7 +32,7 @@ def namespace(array: Any) -> Any:
         raise ConfigError(
             f"arrays of type {type(array).__module__}.{type(array).__name__} need the package array-api-compat",
             "it is an optional dependency, for GPUs",
-            "pip install polysight-host[gpu], or give numpy arrays",
+            "pip install polysight[gpu], or give numpy arrays",
         ) from None
     return array_api_compat.array_namespace(array)
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from host.imaging.images import ChannelImages, ImageBuilder
-from host.imaging.resolution import point_response
-from host.imaging.samples import BoardSamples
+from polysight.host.imaging.images import ChannelImages, ImageBuilder
+from polysight.host.imaging.resolution import point_response
+from polysight.host.imaging.samples import BoardSamples
 
 
 def imaging_facts(builder: ImageBuilder, images: ChannelImages) -> dict[str, Any]:

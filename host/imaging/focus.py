@@ -21,8 +21,8 @@ import scipy.optimize
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from host.imaging.images import ImageBuilder
-from host.imaging.resolution import limit_m
+from polysight.host.imaging.images import ImageBuilder
+from polysight.host.imaging.resolution import limit_m
 
 Progress = Callable[[int, int], None]
 _MAX_TILT_DEG = 3.0

@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from host.imaging.grid import Antennas
-from host.imaging.reduce import Reduction
-from shared.config import Chirp
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.grid import Antennas
+from polysight.host.imaging.reduce import Reduction
+from polysight.shared.config import Chirp
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 
 def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:

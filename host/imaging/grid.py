@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from host.imaging.model import excess_path_m
-from shared.config import Board, Instrument
-from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.raster import Row, mean_burst_travel_mm, plan_raster
+from polysight.host.imaging.model import excess_path_m
+from polysight.shared.config import Board, Instrument
+from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.raster import Row, mean_burst_travel_mm, plan_raster
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from collections.abc import Iterator, Mapping
 
 import msgspec
 
-from host.sync.hpf import HighPass, high_pass
-from shared.config import Board, Instrument
-from shared.geometry import Vector, place
+from polysight.host.sync.hpf import HighPass, high_pass
+from polysight.shared.config import Board, Instrument
+from polysight.shared.geometry import Vector, place
 
 SAME_MM = 1e-3
 """Closer places are one: 2e-3 rad of an echo's phase."""

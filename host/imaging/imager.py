@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from host.imaging.aperture import Aperture, irregular
-from host.imaging.direct import DirectImager
-from host.imaging.spectral import SpectralImager
+from polysight.host.imaging.aperture import Aperture, irregular
+from polysight.host.imaging.direct import DirectImager
+from polysight.host.imaging.spectral import SpectralImager
 
 
 class Imager(Protocol):

@@ -9,13 +9,13 @@ import scipy.signal
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from host.imaging.grid import Antennas, image_grid
-from host.imaging.reduce import Window, reduction, scene_gate_m
-from host.imaging.samples import BoardSamples, Image
-from host.sync.chain import SyncedRow
-from shared.config import Instrument
-from shared.errors import DataError
-from shared.raster import plan_raster
+from polysight.host.imaging.grid import Antennas, image_grid
+from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
+from polysight.host.imaging.samples import BoardSamples, Image
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.raster import plan_raster
 
 _VISIBLE = 0.15  # of the strongest footprint: weaker pixels would be mostly amplified noise
 _NEIGHBOURS = 15  # pixels
@@ -77,7 +77,7 @@ class ImageBuilder:
     rig
         The scan's rig file.
     window
-        Fast-time window, see :func:`host.imaging.reduce.reduction`.
+        Fast-time window, see :func:`polysight.host.imaging.reduce.reduction`.
     taper
         Window over the aperture in x and y, by scipy's name; "boxcar" for none; None takes the rig file's. A sharp
         aperture's sidelobes make the inside of a plate depend on all that surrounds it, and H and V differently
@@ -109,7 +109,7 @@ class ImageBuilder:
     def add_row(
         self, board_name: str, row_index: int, row: SyncedRow, offsets_m: NDArray[np.float64] | None = None
     ) -> None:
-        """Take in one synchronised row of one board, see :meth:`host.imaging.samples.BoardSamples.add_row`.
+        """Take in one synchronised row of one board, see :meth:`polysight.host.imaging.samples.BoardSamples.add_row`.
 
         Raises
         ------

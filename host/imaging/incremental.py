@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from host.imaging.aperture import Aperture, row_starts_m
-from host.imaging.kernels import kept
-from host.imaging.spectral import RowSpectra
+from polysight.host.imaging.aperture import Aperture, row_starts_m
+from polysight.host.imaging.kernels import kept
+from polysight.host.imaging.spectral import RowSpectra
 
 SLACK_M = 2e-3
 """How far along x a row may start from where the aperture says."""
@@ -85,20 +85,20 @@ class IncrementalImager(RowSpectra):
         return self.to_pixels(self._constant.mT)
 
     def image(self, samples: Any) -> Any:
-        """See :class:`host.imaging.imager.Imager`; what was added before is dropped."""
+        """See :class:`polysight.host.imaging.imager.Imager`; what was added before is dropped."""
         rx, m, rows, columns = self.aperture.shape
         self._clear(np.zeros((rx, m)))
         self._add_all(samples, self.xp.zeros((rows, columns), dtype=self.xp.float32, device=self.device))
         return self.image_of_sum(np.ones(rx))
 
     def constant(self, echo: Any, weights: Any) -> Any:
-        """See :class:`host.imaging.imager.Imager`; what was added before is dropped."""
+        """See :class:`polysight.host.imaging.imager.Imager`; what was added before is dropped."""
         self._clear(echo)
         self._add_all(self.xp.zeros(self.aperture.shape, dtype=self.xp.complex64, device=self.device), weights)
         return self.constant_of_sum()
 
     def samples(self, image: Any) -> Any:
-        """See :class:`host.imaging.imager.Imager`."""
+        """See :class:`polysight.host.imaging.imager.Imager`."""
         xp, (rx, m, rows, columns) = self.xp, self.aperture.shape
         lines = self.of_pixels(image).mT[:, :, None]
         ramps = self.ramps(row_starts_m(self.aperture.offsets_m))

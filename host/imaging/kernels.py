@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from host.imaging.aperture import Aperture
-from host.imaging.arrays import fft_of
-from host.imaging.lattice import Lattice, cross_fade, delays_s
-from host.imaging.model import turn
+from polysight.host.imaging.aperture import Aperture
+from polysight.host.imaging.arrays import fft_of
+from polysight.host.imaging.lattice import Lattice, cross_fade, delays_s
+from polysight.host.imaging.model import turn
 
 KEEP_BYTES = 1 << 28
 """Spectra kept in memory: two boards of the published grid are 90 MB."""

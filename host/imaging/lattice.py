@@ -12,9 +12,9 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from host.imaging.aperture import Aperture, column_step_m, pitch_y_m
-from host.imaging.model import excess_path_m, turn
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.aperture import Aperture, column_step_m, pitch_y_m
+from polysight.host.imaging.model import excess_path_m, turn
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _FADE = 0.08  # of the kernel's length in x: room in which it fades out and in again
 _FADE_COLUMNS = 20  # at least

@@ -6,7 +6,7 @@ weighs an echo whose phase turns by `kappa` cycles a metre along the row with
     D(kappa) = mean_k exp(j 2 pi kappa x_k) = sin(pi kappa n s) / (n sin(pi kappa s)),
 
 n pulses, s apart: real and even, so an echo loses amplitude, most where the aperture ends, and no phase. A burst ends
-before the next point (`shared.raster.check_burst_fits`), so up to the row's Nyquist limit D is above 2/pi: 1 / D is a
+before the next point (`polysight.shared.raster.check_burst_fits`), so up to the row's Nyquist limit D is above 2/pi: 1 / D is a
 short symmetrical filter along the row.
 
 Only turns beside each other are seen: burst alignment has turned each chirp back by the phase that all it holds, direct
@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Instrument
+from polysight.shared.config import Instrument
 
 REACH = 4  # positions to either side
 _BAND = 0.45  # cycles a position the filter is made for

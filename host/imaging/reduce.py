@@ -23,10 +23,10 @@ import scipy.linalg
 import scipy.signal
 from numpy.typing import NDArray
 
-from host.imaging.grid import Antennas, ImageGrid
-from shared.config import Chirp
-from shared.raster import RasterPlan
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.grid import Antennas, ImageGrid
+from polysight.shared.config import Chirp
+from polysight.shared.raster import RasterPlan
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Window = str | tuple[Any, ...]  # as scipy.signal.get_window takes it
 _NOISE = 1e-3  # noise power of one sample beside the gate's, for the direct path's estimate

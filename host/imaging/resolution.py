@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from host.imaging.aperture import Aperture
-from host.imaging.direct import DirectImager, backproject
-from host.imaging.grid import ImageGrid
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.aperture import Aperture
+from polysight.host.imaging.direct import DirectImager, backproject
+from polysight.host.imaging.grid import ImageGrid
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _BLOCKS = 32  # positions an axis the response is summed from: enough to see 16 resolution cells to either side
 _CELLS = 6.0  # resolution cells to either side that are looked at

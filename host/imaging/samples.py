@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.imaging.aperture import Aperture, irregular, row_starts_m
-from host.imaging.footprint import mirror_reduced
-from host.imaging.grid import Antennas, ImageGrid, scan_offsets_m
-from host.imaging.imager import Imager, choose_imager
-from host.imaging.incremental import SLACK_M, IncrementalImager
-from host.imaging.motion import burst_filters, undo_burst_motion
-from host.imaging.reduce import Reduction
-from host.imaging.spectral import SpectralImager
-from host.sync.chain import SyncedRow
-from shared.config import Board, Instrument
-from shared.errors import DataError
-from shared.raster import plan_raster
+from polysight.host.imaging.aperture import Aperture, irregular, row_starts_m
+from polysight.host.imaging.footprint import mirror_reduced
+from polysight.host.imaging.grid import Antennas, ImageGrid, scan_offsets_m
+from polysight.host.imaging.imager import Imager, choose_imager
+from polysight.host.imaging.incremental import SLACK_M, IncrementalImager
+from polysight.host.imaging.motion import burst_filters, undo_burst_motion
+from polysight.host.imaging.reduce import Reduction
+from polysight.host.imaging.spectral import SpectralImager
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.raster import plan_raster
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)

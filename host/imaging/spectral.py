@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from host.imaging.aperture import Aperture, row_starts_m
-from host.imaging.arrays import fft_of
-from host.imaging.kernels import kept, key_of, lattice_key, spectra_along_x
-from host.imaging.lattice import Lattice, lattice
+from polysight.host.imaging.aperture import Aperture, row_starts_m
+from polysight.host.imaging.arrays import fft_of
+from polysight.host.imaging.kernels import kept, key_of, lattice_key, spectra_along_x
+from polysight.host.imaging.lattice import Lattice, lattice
 
 
 class RowSpectra:
@@ -26,7 +26,7 @@ class RowSpectra:
     Parameters
     ----------
     aperture
-        Not :func:`host.imaging.aperture.irregular`.
+        Not :func:`polysight.host.imaging.aperture.irregular`.
     xp, device
         Array API namespace, and where its arrays lie.
     slack_m

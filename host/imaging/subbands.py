@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import msgspec
 
-from host.imaging.images import ChannelImages, ImageBuilder
-from host.sync.chain import SyncedRow
-from shared.config import Chirp, Instrument
-from shared.errors import ConfigError
+from polysight.host.imaging.images import ChannelImages, ImageBuilder
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import Chirp, Instrument
+from polysight.shared.errors import ConfigError
 
 LEAST_SAMPLES = 24
 """Of a sub-band: fewer cannot tell the object from the direct path."""
@@ -55,7 +55,7 @@ def sub_bands(chirp: Chirp, count: int) -> tuple[SubBand, ...]:
 
 
 class SubBandImages:
-    """Collects rows as :class:`host.imaging.ImageBuilder` does, and forms the images of every sub-band.
+    """Collects rows as :class:`polysight.host.imaging.ImageBuilder` does, and forms the images of every sub-band.
 
     Parameters
     ----------

@@ -1,17 +1,17 @@
 """Materials: patches, permittivity, the reference library and the classifier."""
 
-from host.materials.analyse import MaterialsResult, PatchResult, analyse, image_centre_mm, pixel_accuracy
-from host.materials.classify import UNKNOWN, Classifier, NamedPatch, Verdict
-from host.materials.fit import fit_library
-from host.materials.knn import Fit, Weights, fit_weights
-from host.materials.labels import patches_from_labels, patches_from_plates, read_labels, write_labels
-from host.materials.library import Entry, Library
-from host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
-from host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
-from host.materials.segment import Patch, Segmentation, SegmentSettings, segment
-from host.materials.table2 import Published, table2
-from host.materials.train import TrainingScan, entries_of, make_library
-from host.materials.truth import TruthPlate, read_truth, truth_labels, truth_plates
+from polysight.host.materials.analyse import MaterialsResult, PatchResult, analyse, image_centre_mm, pixel_accuracy
+from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, Verdict
+from polysight.host.materials.fit import fit_library
+from polysight.host.materials.knn import Fit, Weights, fit_weights
+from polysight.host.materials.labels import patches_from_labels, patches_from_plates, read_labels, write_labels
+from polysight.host.materials.library import Entry, Library
+from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
+from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
+from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, segment
+from polysight.host.materials.table2 import Published, table2
+from polysight.host.materials.train import TrainingScan, entries_of, make_library
+from polysight.host.materials.truth import TruthPlate, read_truth, truth_labels, truth_plates
 
 __all__ = [
     "UNKNOWN",

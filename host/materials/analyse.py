@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.classify import Classifier, Verdict, features_of
-from host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
-from host.materials.permittivity import Permittivity, estimate_permittivity, inverse_spread
-from host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
-from host.materials.truth import TruthPlate, match
-from host.polarimetry import Calibrated, PlaneReference, calibrate, correct_leakage, ratio, smooth
+from polysight.host.materials.classify import Classifier, Verdict, features_of
+from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
+from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, inverse_spread
+from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
+from polysight.host.materials.truth import TruthPlate, match
+from polysight.host.polarimetry import Calibrated, PlaneReference, calibrate, correct_leakage, ratio, smooth
 
 Image = npt.NDArray[np.complexfloating]
 FILLED = 0.1
@@ -53,7 +53,7 @@ class MaterialsResult:
     theta_rad
         Incidence angle, a number or [ny, nx].
     bands
-        Patch number to its ratios in sub-bands of the sweep (:mod:`host.materials.subbands`); empty when not asked for.
+        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.subbands`); empty when not asked for.
     boxes
         Patch number to the name of the box drawn by hand; empty when the patches were found.
     """

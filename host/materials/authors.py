@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.library import Entry, Library
-from shared.errors import DataError
+from polysight.host.materials.library import Entry, Library
+from polysight.shared.errors import DataError
 
 _ADMITTED = {
     ("numpy", "ndarray"),

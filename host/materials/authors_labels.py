@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.labels import read_labels
-from host.materials.library import Entry
-from host.materials.segment import Box
-from host.polarimetry import calibrate
-from shared.errors import DataError
+from polysight.host.materials.labels import read_labels
+from polysight.host.materials.library import Entry
+from polysight.host.materials.segment import Box
+from polysight.host.polarimetry import calibrate
+from polysight.shared.errors import DataError
 
 Image = npt.NDArray[np.complexfloating]
 METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")

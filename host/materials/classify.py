@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.knn import PaperKnn, Weights
-from host.materials.library import Library
-from host.materials.models import MODELS, PAPER, SHORT
-from host.materials.samples import Real, Samples, feature_matrix, usable
-from shared.errors import DataError
+from polysight.host.materials.knn import PaperKnn, Weights
+from polysight.host.materials.library import Library
+from polysight.host.materials.models import MODELS, PAPER, SHORT
+from polysight.host.materials.samples import Real, Samples, feature_matrix, usable
+from polysight.shared.errors import DataError
 
 UNKNOWN = "unknown"
 
@@ -110,7 +110,7 @@ class Classifier:
         Parameters
         ----------
         patches
-            Features of each patch's pixels, [n, 4 * angles] (:func:`host.materials.samples.feature_matrix`); pixels
+            Features of each patch's pixels, [n, 4 * angles] (:func:`polysight.host.materials.samples.feature_matrix`); pixels
             that are not finite are unknown.
         """
         good = [usable(x) for x in patches]

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from host.materials.library import Library
-from shared.errors import DataError
+from polysight.host.materials.library import Library
+from polysight.shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
 _PERCENT = re.compile(r"(\d+(?:\.\d+)?)\s*%")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.samples import Real, Samples
+from polysight.host.materials.samples import Real, Samples
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class NamedScan:
 
 
 class Model(ABC):
-    """A classifier of metal-referenced pixels, features [n, 4 * angles] as in `host.materials.samples`."""
+    """A classifier of metal-referenced pixels, features [n, 4 * angles] as in `polysight.host.materials.samples`."""
 
     knows_scans = False
     """Whether `by_scan` makes use of what the patches of a scan have in common."""

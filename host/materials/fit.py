@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import reduce
 from typing import Any
 
-from host.materials.judge import best_model, score
-from host.materials.knn import fit_weights
-from host.materials.library import Library
-from host.materials.models import PAPER
-from host.materials.samples import Samples
+from polysight.host.materials.judge import best_model, score
+from polysight.host.materials.knn import fit_weights
+from polysight.host.materials.library import Library
+from polysight.host.materials.models import PAPER
+from polysight.host.materials.samples import Samples
 
 PIXELS = 16
 """Pixels of a patch that models are judged on."""

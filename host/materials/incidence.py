@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from host.materials.analyse import MaterialsResult
-from host.polarimetry import IncidenceChoice, permittivity_from_ratio
+from polysight.host.materials.analyse import MaterialsResult
+from polysight.host.polarimetry import IncidenceChoice, permittivity_from_ratio
 
 
 def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.decision import majority
-from host.materials.models import MODELS, SLOW
-from host.materials.samples import Real, Samples
-from shared.errors import DataError
+from polysight.host.materials.decision import majority
+from polysight.host.materials.models import MODELS, SLOW
+from polysight.host.materials.samples import Real, Samples
+from polysight.shared.errors import DataError
 
 FOLDS = 8
 OPTIMISTIC = "by pixel (optimistic)"

@@ -22,9 +22,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.decision import Model
-from host.materials.samples import Real, Samples, by_angle
-from shared.errors import DataError
+from polysight.host.materials.decision import Model
+from polysight.host.materials.samples import Real, Samples, by_angle
+from polysight.shared.errors import DataError
 
 Measure = Literal["paper", "inverse", "log"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)

@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.analyse import MaterialsResult
-from host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
-from host.materials.truth import TruthPlate
-from shared.errors import DataError
+from polysight.host.materials.analyse import MaterialsResult
+from polysight.host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
+from polysight.host.materials.truth import TruthPlate
+from polysight.shared.errors import DataError
 
 
 def read_labels(path: Path) -> dict[str, Box]:

@@ -1,7 +1,7 @@
 """The permittivity of one unknown layer in a stack: sheets thinner than the wave, liquids behind a container's wall.
 
 Eq. 3 of the paper sees one interface. A sheet has two, a filled container three, and the wave that returns from the
-ones behind is as strong as the first. Here the whole stack is the model (:func:`host.polarimetry.multilayer`), the
+ones behind is as strong as the first. Here the whole stack is the model (:func:`polysight.host.polarimetry.multilayer`), the
 measured quantities are those of the sub-bands of the sweep, and the unknown is found by least squares from every
 promising start. What the data cannot tell apart is listed, not hidden.
 """
@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, optimize, stats
 
-from host.materials.spectrum import Bands, Spectrum
-from host.polarimetry import multilayer
-from shared.errors import DataError, PolysightError
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.materials.spectrum import Bands, Spectrum
+from polysight.host.polarimetry import multilayer
+from polysight.shared.errors import DataError, PolysightError
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 __all__ = ["Bands", "Layer", "LayerFit", "Spectrum", "fit_layer", "predict"]
 

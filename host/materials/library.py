@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shared.errors import DataError
+from polysight.shared.errors import DataError
 
 FORMAT = "polysight-library-1"
 SAME_ANGLE_DEG = 1.0
@@ -65,7 +65,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Library:
-    """Entries, and what was fitted on them (`host.materials.fit`; empty when nothing was)."""
+    """Entries, and what was fitted on them (`polysight.host.materials.fit`; empty when nothing was)."""
 
     entries: tuple[Entry, ...]
     fit: dict[str, Any] = field(default_factory=dict)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.permittivity import median_ratio
-from host.materials.segment import Box, Mask, Patch, Segmentation, box_mask
-from host.polarimetry import calibrate, correct_leakage, fresnel, permittivity_from_ratio
-from shared.errors import DataError
+from polysight.host.materials.permittivity import median_ratio
+from polysight.host.materials.segment import Box, Mask, Patch, Segmentation, box_mask
+from polysight.host.polarimetry import calibrate, correct_leakage, fresnel, permittivity_from_ratio
+from polysight.shared.errors import DataError
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The classifiers by name, all on the same features and with the same three methods.
 
-The paper's weighted KNN is one of them, the discriminant of `host.materials.discriminant` another, in two forms; the
+The paper's weighted KNN is one of them, the discriminant of `polysight.host.materials.discriminant` another, in two forms; the
 others are scikit-learn's. Which one a library is used with is
-decided on that library with whole scans left out (`host.materials.judge`).
+decided on that library with whole scans left out (`polysight.host.materials.judge`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.decision import Model
-from host.materials.discriminant import ErrorDiscriminant
-from host.materials.knn import PaperKnn
-from host.materials.samples import WIDTH, Real, Samples, by_angle
+from polysight.host.materials.decision import Model
+from polysight.host.materials.discriminant import ErrorDiscriminant
+from polysight.host.materials.knn import PaperKnn
+from polysight.host.materials.samples import WIDTH, Real, Samples, by_angle
 
 PAPER = "weighted KNN (paper)"
 DISCRIMINANT = "discriminant of error sources"

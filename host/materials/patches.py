@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from host.materials.analyse import MaterialsResult
-from host.materials.classify import features_of
-from host.materials.samples import Real
-from host.materials.segment import axis_mm
-from shared.errors import DataError
+from polysight.host.materials.analyse import MaterialsResult
+from polysight.host.materials.classify import features_of
+from polysight.host.materials.samples import Real
+from polysight.host.materials.segment import axis_mm
+from polysight.shared.errors import DataError
 
 PATCHES = "patches.npz"
 FORMAT = "polysight-patches-1"

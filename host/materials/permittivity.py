@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from host.polarimetry import permittivity_from_ratio
+from polysight.host.polarimetry import permittivity_from_ratio
 
 METAL_LIKE = 0.25
 """|P - 1| below which no permittivity is given.

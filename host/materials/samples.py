@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.library import Library
-from shared.errors import DataError
+from polysight.host.materials.library import Library
+from polysight.shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
 WIDTH = 4

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from skimage import filters, measure, morphology, restoration
 
-from shared.errors import DataError
+from polysight.shared.errors import DataError
 
 Mask = npt.NDArray[np.bool_]
 Box = tuple[float, float, float, float]

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal
 
-from shared.config import Chirp
-from shared.errors import DataError, PolysightError
+from polysight.shared.config import Chirp
+from polysight.shared.errors import DataError, PolysightError
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -33,7 +33,7 @@ class Spectrum:
     def of(cls, chirp: Chirp, bands: int = 1, window: str = "hann") -> Spectrum:
         """Sub-bands of the linear part of a chirp: windows that overlap by half, as in Welch's method.
 
-        One band is the whole linear part under the image's own window (:func:`host.imaging.reduce.reduction`).
+        One band is the whole linear part under the image's own window (:func:`polysight.host.imaging.reduce.reduction`).
         """
         first, last = chirp.linear_samples
         length = 2 * (last - first) / (bands + 1)

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from host.imaging import ChannelImages
-from host.imaging.subbands import SubBand
-from host.materials.analyse import MaterialsResult, reference_error, smooth_inside, to_metal
-from host.materials.layers import Bands, Spectrum
-from host.materials.permittivity import inverse_spread, median_ratio
-from host.polarimetry import PlaneReference
-from shared.config import Chirp
-from shared.errors import DataError
+from polysight.host.imaging import ChannelImages
+from polysight.host.imaging.subbands import SubBand
+from polysight.host.materials.analyse import MaterialsResult, reference_error, smooth_inside, to_metal
+from polysight.host.materials.layers import Bands, Spectrum
+from polysight.host.materials.permittivity import inverse_spread, median_ratio
+from polysight.host.polarimetry import PlaneReference
+from polysight.shared.config import Chirp
+from polysight.shared.errors import DataError
 
 AMPLITUDE_ERROR = 0.1
 """Relative standard deviation of |H| of a patch: its size, its edges and its tilt are in it, and in no ratio."""
@@ -91,7 +91,7 @@ def band_rows(
 def bands_of_row(
     row: Mapping[str, Any], chirp: Chirp, count: int = 1, amplitude_error: float = AMPLITUDE_ERROR
 ) -> Bands | None:
-    """What :func:`host.materials.layers.fit_layer` needs of a row of materials.json.
+    """What :func:`polysight.host.materials.layers.fit_layer` needs of a row of materials.json.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ class Published:
 
 def table2() -> tuple[Published, ...]:
     """The 36 rows of the paper's Table 2, in its order."""
-    raw = json.loads(resources.files("host.materials").joinpath("table2.json").read_text(encoding="utf-8"))
+    raw = json.loads(resources.files("polysight.host.materials").joinpath("table2.json").read_text(encoding="utf-8"))
     return tuple(
         Published(m["number"], m["name"], complex(m["real"], -(m["loss"] or 0.0)), m["thickness_mm"], m["note"])
         for m in raw["materials"]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from host.materials.analyse import MaterialsResult
-from host.materials.fit import fit_library
-from host.materials.library import Entry, Library
-from shared.errors import DataError
+from polysight.host.materials.analyse import MaterialsResult
+from polysight.host.materials.fit import fit_library
+from polysight.host.materials.library import Entry, Library
+from polysight.shared.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class TrainingScan:
     scan
         Its name: pixels of one scan never test what they trained.
     result
-        Output of :func:`host.materials.analyse`, made with the truth's plates.
+        Output of :func:`polysight.host.materials.analyse`, made with the truth's plates.
     simulated
         Whether it was simulated.
     seed

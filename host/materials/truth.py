@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.segment import Box, Patch, box_mask
-from shared.errors import DataError
+from polysight.host.materials.segment import Box, Patch, box_mask
+from polysight.shared.errors import DataError
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from shared.config import Instrument
-from shared.tables import decode, to_builtins
+from polysight.shared.config import Instrument
+from polysight.shared.tables import decode, to_builtins
 
 
 @dataclass(frozen=True)

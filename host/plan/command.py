@@ -7,14 +7,14 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from host.plan.changes import Changes, rig_lines
-from host.plan.forecast import Noise, forecast
-from host.plan.measured import noise_of, row_overhead_of
-from host.plan.search import propose
-from host.plan.text import describe, numbers, table
-from host.plan.timing import ROW_OVERHEAD_S
-from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, load_instrument
+from polysight.host.plan.changes import Changes, rig_lines
+from polysight.host.plan.forecast import Noise, forecast
+from polysight.host.plan.measured import noise_of, row_overhead_of
+from polysight.host.plan.search import propose
+from polysight.host.plan.text import describe, numbers, table
+from polysight.host.plan.timing import ROW_OVERHEAD_S
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import Instrument, load_instrument
 
 _SIMULATED = "the simulated rig's (no hardware has been measured; --like SCAN or --snr-db give another)"
 

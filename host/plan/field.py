@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import scipy.optimize
 
-from host.imaging.grid import Antennas
-from shared.config import Instrument
-from shared.geometry import specular_midpoint_m
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.grid import Antennas
+from polysight.shared.config import Instrument
+from polysight.shared.geometry import specular_midpoint_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _STEP_M = 1e-4  # of the numerical derivative
 _FARTHEST_M = 20.0

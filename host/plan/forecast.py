@@ -8,21 +8,21 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
-from host.imaging.aperture import Aperture
-from host.imaging.grid import Antennas, image_grid, scan_offsets_m
-from host.imaging.images import TAPERS
-from host.imaging.reduce import Window, reduction, scene_gate_m
-from host.imaging.resolution import PointResponse, point_response
-from host.plan.field import FieldLimits, PhaseSlope, field_limits
-from host.plan.timing import ROW_OVERHEAD_S, ScanTime, scan_time
-from host.plan.warn import Caution, warnings_of
-from shared.config import Instrument
-from shared.raster import burst_duration_s, plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.aperture import Aperture
+from polysight.host.imaging.grid import Antennas, image_grid, scan_offsets_m
+from polysight.host.imaging.images import TAPERS
+from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
+from polysight.host.imaging.resolution import PointResponse, point_response
+from polysight.host.plan.field import FieldLimits, PhaseSlope, field_limits
+from polysight.host.plan.timing import ROW_OVERHEAD_S, ScanTime, scan_time
+from polysight.host.plan.warn import Caution, warnings_of
+from polysight.shared.config import Instrument
+from polysight.shared.raster import burst_duration_s, plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Real = NDArray[np.float64]
 SIMULATED_DIRECT_SNR_DB = 5.5
-_FAST_TIME_WINDOW = "hann"  # of host.imaging.ImageBuilder
+_FAST_TIME_WINDOW = "hann"  # of polysight.host.imaging.ImageBuilder
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def forecast(
     Parameters
     ----------
     rig
-        Rig file, :class:`host.plan.Changes` applied.
+        Rig file, :class:`polysight.host.plan.Changes` applied.
     noise
         Default: the simulated rig's.
     row_overhead_s

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from host.capture.decode import row_words
-from host.plan.forecast import Noise
-from host.plan.timing import row_motion_s, tail_s, turn_s
-from host.report.sync_report import SyncReport
-from host.store.events import read_events
-from host.store.scanfolder import EVENTS, ScanFolder
-from host.store.source import ScanSource
-from host.sync import BoardSetup, synchronise_row
-from shared.errors import DataError
-from shared.messages import Capture
+from polysight.host.capture.decode import row_words
+from polysight.host.plan.forecast import Noise
+from polysight.host.plan.timing import row_motion_s, tail_s, turn_s
+from polysight.host.report.sync_report import SyncReport
+from polysight.host.store.events import read_events
+from polysight.host.store.scanfolder import EVENTS, ScanFolder
+from polysight.host.store.source import ScanSource
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.shared.errors import DataError
+from polysight.shared.messages import Capture
 
 _ROWS = 5  # that the noise is taken from
 

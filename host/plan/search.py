@@ -8,14 +8,14 @@ from itertools import islice
 import msgspec
 import numpy as np
 
-from host.plan.changes import Changes
-from host.plan.forecast import Forecast, Noise, burst_facts, cautions, forecast, noise_facts
-from host.plan.timing import ROW_OVERHEAD_S, payload_bytes, scan_time
-from host.plan.warn import MAX_STEPS_PER_S, Caution
-from host.radar.program import TRIGGER_MARGIN_US, chirp_us
-from host.radar.validator import INTER_FRAME_US
-from shared.config import Instrument
-from shared.errors import ConfigError
+from polysight.host.plan.changes import Changes
+from polysight.host.plan.forecast import Forecast, Noise, burst_facts, cautions, forecast, noise_facts
+from polysight.host.plan.timing import ROW_OVERHEAD_S, payload_bytes, scan_time
+from polysight.host.plan.warn import MAX_STEPS_PER_S, Caution
+from polysight.host.radar.program import TRIGGER_MARGIN_US, chirp_us
+from polysight.host.radar.validator import INTER_FRAME_US
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ConfigError
 
 _MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
 _MARGIN = 0.95  # of the time between two points that a burst may fill
@@ -51,7 +51,7 @@ def propose(
     count
         Plans wanted; fewer, or none, where the time is too short.
     noise, row_overhead_s, scene_mm
-        As for :func:`host.plan.forecast`.
+        As for :func:`polysight.host.plan.forecast`.
     """
     noise = noise or Noise()
     best: list[tuple[float, Instrument]] = []

@@ -6,7 +6,7 @@ import math
 import textwrap
 from typing import Any
 
-from host.plan.forecast import Forecast
+from polysight.host.plan.forecast import Forecast
 
 _WIDTH = 118
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from host.capture.dca1000 import MAX_PAYLOAD_BYTES
-from shared.config import Grid, Instrument, Stage
-from shared.raster import burst_duration_s
+from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES
+from polysight.shared.config import Grid, Instrument, Stage
+from polysight.shared.raster import burst_duration_s
 
 ROW_OVERHEAD_S = 0.3
 """Standstill between rows once the data is there: row made durable, cards and radars armed, commands.

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
-from host.options import Options
-from host.plan.field import FieldLimits
-from host.plan.timing import payload_bytes, tail_s
-from host.radar.validator import constraints
-from shared.config import Instrument
-from shared.errors import ConfigError
-from shared.raster import check_burst_fits
+from polysight.host.options import Options
+from polysight.host.plan.field import FieldLimits
+from polysight.host.plan.timing import payload_bytes, tail_s
+from polysight.host.radar.validator import constraints
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.raster import check_burst_fits
 
 if TYPE_CHECKING:
-    from host.plan.forecast import BurstFacts, NoiseFacts
+    from polysight.host.plan.forecast import BurstFacts, NoiseFacts
 
 MAX_STEPS_PER_S = 20_000
 """Of the stage's firmware (docs/spec/stage-line.md, timing)."""
@@ -144,7 +144,7 @@ def _aliases(rig: Instrument, field: FieldLimits, scene_mm: tuple[float, float])
                 "aliasing",
                 f"in {axis}, steps of {step:g} mm make ghosts {free:.0f} mm from each object; a scene of {scene:.0f} mm"
                 f" in an image of {shown:.0f} mm needs {need:.0f} mm: at most {step * free / need:.2g} mm steps, a"
-                " smaller image, or a reconstruction (host.imaging.sparse)",
+                " smaller image, or a reconstruction (polysight.host.imaging.sparse)",
             )
 
 

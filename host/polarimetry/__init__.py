@@ -1,6 +1,6 @@
 """Polarimetry: from the two images to the material's reflection and permittivity."""
 
-from host.polarimetry.calibrate import (
+from polysight.host.polarimetry.calibrate import (
     Calibrated,
     axial_ratio_from_known,
     calibrate,
@@ -10,14 +10,14 @@ from host.polarimetry.calibrate import (
     ratio,
     smooth,
 )
-from host.polarimetry.fresnel import (
+from polysight.host.polarimetry.fresnel import (
     brewster_angle_rad,
     fresnel,
     multilayer,
     permittivity_from_ratio,
     ratio_from_permittivity,
 )
-from host.polarimetry.incidence import (
+from polysight.host.polarimetry.incidence import (
     Incidence,
     IncidenceChoice,
     effective_incidence_map,
@@ -25,7 +25,7 @@ from host.polarimetry.incidence import (
     incidence_map,
     specular_incidence_rad,
 )
-from host.polarimetry.leakage import (
+from polysight.host.polarimetry.leakage import (
     Leakage,
     Standard,
     common_direction,
@@ -34,7 +34,7 @@ from host.polarimetry.leakage import (
     leakage_from_images,
     strips_wave,
 )
-from host.polarimetry.reference import PlaneReference, plane_reference
+from polysight.host.polarimetry.reference import PlaneReference, plane_reference
 
 __all__ = [
     "Calibrated",

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
 
-from shared.errors import DataError, PolysightError
+from polysight.shared.errors import DataError, PolysightError
 
 Image = npt.NDArray[np.complexfloating]
 Mask = npt.NDArray[np.bool_]

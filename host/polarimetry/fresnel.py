@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shared.errors import PolysightError
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.shared.errors import PolysightError
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, signal
 
-from shared.config import Instrument
-from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.shared.config import Instrument
+from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
 Incidence = Literal["one", "pixel"]

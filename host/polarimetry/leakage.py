@@ -27,8 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from host.polarimetry.calibrate import Image, Mask, ratio
-from shared.errors import DataError, PolysightError
+from polysight.host.polarimetry.calibrate import Image, Mask, ratio
+from polysight.shared.errors import DataError, PolysightError
 
 PLATE = (1.0, 1.0)
 """What a whole metal plate returns of s and p."""
@@ -196,7 +196,7 @@ def leakage_from_images(
     Parameters
     ----------
     plate
-        H and V of the whole plate, complex [ny, nx] (smoothed: :class:`host.polarimetry.PlaneReference` h and v).
+        H and V of the whole plate, complex [ny, nx] (smoothed: :class:`polysight.host.polarimetry.PlaneReference` h and v).
     strips
         (psi in radians from the vertical, H, V) of each orientation; one is enough for the axial ratio alone.
     mask

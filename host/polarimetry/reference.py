@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, stats
 
-from host.imaging.imaged_with import ImagedWith
-from host.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
-from shared.errors import DataError
+from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
+from polysight.shared.errors import DataError
 
 SMOOTH_MM = 8.0
 FLOOR_DB = -10.0

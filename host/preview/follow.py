@@ -11,10 +11,10 @@ from pathlib import Path
 
 import msgpack
 
-from host.store import manifest
-from host.store.manifest import Fact
-from shared.errors import ProtocolError
-from shared.messages import AnyEvent, unpack_kept
+from polysight.host.store import manifest
+from polysight.host.store.manifest import Fact
+from polysight.shared.errors import ProtocolError
+from polysight.shared.messages import AnyEvent, unpack_kept
 
 _HEAD = 256
 

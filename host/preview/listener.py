@@ -9,11 +9,20 @@ from pathlib import Path
 
 import zmq
 
-from host.preview.words import Notice, of_error, of_fault
-from shared.config import Instrument
-from shared.errors import PolysightError, ProtocolError
-from shared.messages import Capture, Fault, Heartbeat, RowFinished, RowStarted, StageStatus, State, unpack_event
-from shared.sockets import observer
+from polysight.host.preview.words import Notice, of_error, of_fault
+from polysight.shared.config import Instrument
+from polysight.shared.errors import PolysightError, ProtocolError
+from polysight.shared.messages import (
+    Capture,
+    Fault,
+    Heartbeat,
+    RowFinished,
+    RowStarted,
+    StageStatus,
+    State,
+    unpack_event,
+)
+from polysight.shared.sockets import observer
 
 _TURN_MS = 200
 _FAULTS = 20

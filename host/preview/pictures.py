@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from host.imaging import ChannelImages
+from polysight.host.imaging import ChannelImages
 
 AMPLITUDE, PHASE = "cividis", "twilight"
 _RANGE_DB = 35.0

@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.imaging.grid import Antennas, image_grid
-from host.imaging.reduce import scene_gate_m
-from host.pipeline import Pipeline
-from host.preview.pictures import Picture, draw
-from host.preview.words import Notice, of_error
-from host.store.manifest import Manifest
-from host.store.scanfolder import ScanFolder
-from host.sync.chain import SyncedRow
-from shared.config import Chirp, Instrument
-from shared.errors import PolysightError
-from shared.raster import plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.grid import Antennas, image_grid
+from polysight.host.imaging.reduce import scene_gate_m
+from polysight.host.pipeline import Pipeline
+from polysight.host.preview.pictures import Picture, draw
+from polysight.host.preview.words import Notice, of_error
+from polysight.host.store.manifest import Manifest
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import Chirp, Instrument
+from polysight.shared.errors import PolysightError
+from polysight.shared.raster import plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _FFT = 2048
 _PICTURES_S = 0.5  # at most so often, while many rows are caught up with
@@ -40,7 +40,7 @@ class Shown:
     rows
         Rows that are in the images, ascending.
     pictures
-        See :func:`host.preview.pictures.draw`.
+        See :func:`polysight.host.preview.pictures.draw`.
     profile
         Range profile of the last row: `row`, `excess_m` [n], `boards` {name: dB below the direct path [n]}, and where
         the scene can be: `scene_m`.

@@ -14,9 +14,9 @@ from pathlib import Path
 import uvicorn
 from starlette.applications import Starlette
 
-from host.preview.server import make_app
-from host.preview.watch import Watch
-from shared.errors import DeviceError
+from polysight.host.preview.server import make_app
+from polysight.host.preview.watch import Watch
+from polysight.shared.errors import DeviceError
 
 NICE = 10
 _END_S = 1

@@ -20,10 +20,10 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from host.preview.pictures import AMPLITUDE, PHASE, colour_bar
-from host.preview.watch import Watch
-from host.scan.control import Wish
-from shared.errors import PolysightError
+from polysight.host.preview.pictures import AMPLITUDE, PHASE, colour_bar
+from polysight.host.preview.watch import Watch
+from polysight.host.scan.control import Wish
+from polysight.shared.errors import PolysightError
 
 STATIC = Path(__file__).parent / "static"
 TOKEN_HEADER = "X-Polysight-Token"

@@ -7,14 +7,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from host.preview.listener import Heard
-from host.preview.rows import Shown
-from host.preview.story import Story
-from host.preview.verdict import Signs, judge, no_scan, sync_notices, unreadable
-from host.preview.words import Notice
-from host.scan.control import Wish
-from host.scan.time_left import time_left
-from shared.sync_in import WIDTH_US
+from polysight.host.preview.listener import Heard
+from polysight.host.preview.rows import Shown
+from polysight.host.preview.story import Story
+from polysight.host.preview.verdict import Signs, judge, no_scan, sync_notices, unreadable
+from polysight.host.preview.words import Notice
+from polysight.host.scan.control import Wish
+from polysight.host.scan.time_left import time_left
+from polysight.shared.sync_in import WIDTH_US
 
 PAPER_PHASE_RAD = 0.022
 """Phase residual after all stages, paper section 9.1."""

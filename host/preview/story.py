@@ -11,16 +11,16 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from host.plan.timing import scan_time
-from host.preview.words import Notice, of_fault, of_kept, of_rejection
-from host.scan.time_left import usual_row_s
-from host.store.connection import reconnected
-from host.store.manifest import Fact
-from shared.config import Instrument
-from shared.messages import AnyEvent, Capture
-from shared.messages import Fault as FaultEvent
-from shared.raster import RasterPlan, plan_raster
-from shared.tables import decode as decode_config
+from polysight.host.plan.timing import scan_time
+from polysight.host.preview.words import Notice, of_fault, of_kept, of_rejection
+from polysight.host.scan.time_left import usual_row_s
+from polysight.host.store.connection import reconnected
+from polysight.host.store.manifest import Fact
+from polysight.shared.config import Instrument
+from polysight.shared.messages import AnyEvent, Capture
+from polysight.shared.messages import Fault as FaultEvent
+from polysight.shared.raster import RasterPlan, plan_raster
+from polysight.shared.tables import decode as decode_config
 
 RowMark = Literal["committed", "kept", "rejected"]
 _RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")

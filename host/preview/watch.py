@@ -13,16 +13,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from host.preview.follow import EventTail, ManifestTail
-from host.preview.listener import Heard, PiListener
-from host.preview.rows import RowViewer, Shown
-from host.preview.snapshot import Content, make_motion, make_snapshot
-from host.preview.story import Story
-from host.preview.verdict import Signs
-from host.scan.control import Wish, ask, last_sign_of_life
-from host.store.manifest import Manifest
-from host.store.scanfolder import EVENTS, MANIFEST
-from shared.errors import PolysightError
+from polysight.host.preview.follow import EventTail, ManifestTail
+from polysight.host.preview.listener import Heard, PiListener
+from polysight.host.preview.rows import RowViewer, Shown
+from polysight.host.preview.snapshot import Content, make_motion, make_snapshot
+from polysight.host.preview.story import Story
+from polysight.host.preview.verdict import Signs
+from polysight.host.scan.control import Wish, ask, last_sign_of_life
+from polysight.host.store.manifest import Manifest
+from polysight.host.store.scanfolder import EVENTS, MANIFEST
+from polysight.shared.errors import PolysightError
 
 _TURN_S = 0.2
 _LAPSE_S = 15.0  # the scan program touches its file once a second

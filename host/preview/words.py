@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from host.scan.take_faults import FaultKind
-from host.store.manifest import Fact
-from shared.errors import PolysightError
-from shared.faults import PiFault, explain
-from shared.messages import Fault
+from polysight.host.scan.take_faults import FaultKind
+from polysight.host.store.manifest import Fact
+from polysight.shared.errors import PolysightError
+from polysight.shared.faults import PiFault, explain
+from polysight.shared.messages import Fault
 
 Level = Literal["bad", "warn", "note"]
 

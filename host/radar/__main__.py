@@ -1,4 +1,4 @@
-"""`python -m host.radar`: one board by itself, for its first days. Not run on hardware yet.
+"""`python -m polysight.host.radar`: one board by itself, for its first days. Not run on hardware yet.
 
 `plan RIG.toml`: constraints and every byte a board would be sent, without touching one. `check RIG.toml BOARD`:
 power-up to configured, with what it says of itself. `firmware RIG.toml BOARD IMAGE`: write TI's image to its flash.
@@ -11,14 +11,14 @@ import json
 import sys
 from pathlib import Path
 
-from host.radar.board import RadarBoard
-from host.radar.messages import command, encode
-from host.radar.native import open_board
-from host.radar.program import program
-from host.radar.spi import SystemClock
-from host.radar.validator import constraints, require
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError, PolysightError
+from polysight.host.radar.board import RadarBoard
+from polysight.host.radar.messages import command, encode
+from polysight.host.radar.native import open_board
+from polysight.host.radar.program import program
+from polysight.host.radar.spi import SystemClock
+from polysight.host.radar.validator import constraints, require
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, PolysightError
 
 
 def _plan(rig: Instrument) -> str:
@@ -51,9 +51,9 @@ def _board(rig: Instrument, name: str, image: Path | None) -> str:
 def main() -> int:
     """Run a command; 0 only when it worked."""
     parser = argparse.ArgumentParser(
-        prog="python -m host.radar",
+        prog="python -m polysight.host.radar",
         description=__doc__,
-        epilog="example:\n  python -m host.radar check instrument.toml RH",
+        epilog="example:\n  python -m polysight.host.radar check instrument.toml RH",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", choices=("plan", "check", "firmware"), help="what to do; only plan touches no board")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from host.radar.interface import BoardState, RadarControl
-from host.radar.line_server import LineServers
-from host.radar.native import NativeRadars
-from shared.config import Instrument
+from polysight.host.radar.interface import BoardState, RadarControl
+from polysight.host.radar.line_server import LineServers
+from polysight.host.radar.native import NativeRadars
+from polysight.shared.config import Instrument
 
 
 class Endless(RadarControl):

@@ -10,13 +10,13 @@ import struct
 from collections.abc import Callable, Mapping
 from enum import Enum
 
-from host.radar import commands as c
-from host.radar import events as e
-from host.radar.firmware import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
-from host.radar.messages import Message
-from host.radar.program import Program
-from host.radar.spi import RESPONSE_S, Clock, Link, WordLink
-from shared.errors import DeviceError
+from polysight.host.radar import commands as c
+from polysight.host.radar import events as e
+from polysight.host.radar.firmware import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
+from polysight.host.radar.messages import Message
+from polysight.host.radar.program import Program
+from polysight.host.radar.spi import RESPONSE_S, Clock, Link, WordLink
+from polysight.shared.errors import DeviceError
 
 _POWER_UP_S = 5.0
 _CALIBRATION_S = 5.0

@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from host.radar.messages import SubBlock
-from shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ
+from polysight.host.radar.messages import SubBlock
+from polysight.shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ
 
 START_HZ_PER_CODE = 3.6e9 / 2**26  # ICD 81
 SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6  # ICD 83: 48.279 kHz/us
@@ -152,7 +152,7 @@ class ApllBandwidth(Command):
 class LdoBypass(Command):
     """RF LDO bypass: with 1.3 V on the RF supplies, as boards usually have it, bypassing may damage the device.
 
-    ICD 202. :mod:`host.radar.validator` refuses `bypass` without an acknowledgement for that very board.
+    ICD 202. :mod:`polysight.host.radar.validator` refuses `bypass` without an acknowledgement for that very board.
     """
 
     ID = 0x02CC

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from host.radar.messages import SubBlock
+from polysight.host.radar.messages import SubBlock
 
 RF_CPU_FAULT, RF_ESM_FAULT, RF_INIT_DONE = 0x1002, 0x1003, 0x1004
 TRIGGER_READY, FRAME_END, ANALOG_FAULT, TIMING_FAILURE = 0x100B, 0x100F, 0x1010, 0x1011

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import struct
 
-from host.radar.commands import FileChunk
-from host.radar.messages import BODY_LIMIT
+from polysight.host.radar.commands import FileChunk
+from polysight.host.radar.messages import BODY_LIMIT
 
 TO_RAM = 0  # lost at power-off
 TO_FLASH = 4  # the first of four places in the board's serial flash

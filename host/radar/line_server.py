@@ -15,8 +15,8 @@ import termios
 import time
 from collections.abc import Mapping
 
-from host.radar.interface import BoardState, RadarControl, RadarState
-from shared.errors import DeviceError
+from polysight.host.radar.interface import BoardState, RadarControl, RadarState
+from polysight.shared.errors import DeviceError
 
 LINE = b"Retrigger\n"
 _LOOK_MS = 5

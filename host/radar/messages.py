@@ -12,7 +12,7 @@ import zlib
 from dataclasses import dataclass
 from enum import IntEnum
 
-from shared.errors import ProtocolError
+from polysight.shared.errors import ProtocolError
 
 HOST_SYNC = bytes.fromhex("34122143")
 DEVICE_SYNC = bytes.fromhex("badccdab")

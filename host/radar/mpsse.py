@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from shared.errors import DeviceError
+from polysight.shared.errors import DeviceError
 
 SPI_DIRECTION = 0b0100_1011  # clock, data out, chip select, PMIC reset are outputs
 SELECTED_WRITE, SELECTED_READ, IDLE = 0xC0, 0xC2, 0xC8
@@ -70,7 +70,7 @@ def read_words(count: int) -> bytes:
 
 
 class UsbWords:
-    """A board behind the four channels of one chip; satisfies :class:`host.radar.spi.WordLink`."""
+    """A board behind the four channels of one chip; satisfies :class:`polysight.host.radar.spi.WordLink`."""
 
     def __init__(
         self, spi: Port, interrupt: Port, reset: Port, sense: Port, sleep: Callable[[float], None] = time.sleep

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 
-from host.radar.board import RadarBoard, State
-from host.radar.interface import BoardState, RadarControl, RadarState
-from host.radar.program import program
-from host.radar.spi import Clock, SystemClock, WordLink
-from host.radar.usb import open_usb
-from host.radar.usb_tcp import SCHEME, open_tcp
-from host.radar.validator import constraints, direct_if_hz, require
-from shared.config import Instrument
-from shared.errors import DeviceError
+from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.interface import BoardState, RadarControl, RadarState
+from polysight.host.radar.program import program
+from polysight.host.radar.spi import Clock, SystemClock, WordLink
+from polysight.host.radar.usb import open_usb
+from polysight.host.radar.usb_tcp import SCHEME, open_tcp
+from polysight.host.radar.validator import constraints, direct_if_hz, require
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DeviceError
 
 
 def open_board(serial: str) -> WordLink:
@@ -79,7 +79,7 @@ class NativeRadars(RadarControl):
     Raises
     ------
     ConfigError
-        when a constraint is broken (:mod:`host.radar.validator`), or the USB library is missing.
+        when a constraint is broken (:mod:`polysight.host.radar.validator`), or the USB library is missing.
     DeviceError
         when a board cannot be opened or configured.
     """

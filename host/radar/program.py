@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from host.radar import commands as c
-from shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instrument
+from polysight.host.radar import commands as c
+from polysight.shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instrument
 
 TRIGGER_MARGIN_US = 200.0
 """From the end of a frame's period to the next pulse: 150 us at least, 300 us at most recommended (ICD 93)."""

@@ -12,9 +12,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from host.radar.commands import RF_POWER_UP, Command
-from host.radar.events import Event, decode_event, describe_refusal
-from host.radar.messages import (
+from polysight.host.radar.commands import RF_POWER_UP, Command
+from polysight.host.radar.events import Event, decode_event, describe_refusal
+from polysight.host.radar.messages import (
     HEADER_BYTES,
     READY_TO_READ,
     SYNC_BYTES,
@@ -25,7 +25,7 @@ from host.radar.messages import (
     decode_header,
     encode,
 )
-from shared.errors import DeviceError, ProtocolError
+from polysight.shared.errors import DeviceError, ProtocolError
 
 RESPONSE_S = 1.0
 ATTEMPTS = 3

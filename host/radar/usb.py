@@ -8,8 +8,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from host.radar.mpsse import INTERRUPT_DIRECTION, RESET_DIRECTION, SENSE_DIRECTION, SPI_DIRECTION, UsbWords
-from shared.errors import ConfigError, DeviceError
+from polysight.host.radar.mpsse import INTERRUPT_DIRECTION, RESET_DIRECTION, SENSE_DIRECTION, SPI_DIRECTION, UsbWords
+from polysight.shared.errors import ConfigError, DeviceError
 
 VENDOR, PRODUCT = 0x0451, 0xFD03
 _READ_S = 0.5
@@ -106,6 +106,6 @@ def _library() -> tuple[Any, tuple[type[Exception], ...]]:
         raise ConfigError(
             'radar.control = "native" needs pyftdi, which is not installed',
             "it comes with the host's extra `radar`",
-            "pip install 'polysight-host[radar]' (in this repository: .venv/bin/pip install -e './host[radar]')",
+            "pip install 'polysight[radar]' (in this repository: .venv/bin/pip install -e '.[radar]')",
         ) from None
     return Ftdi, (OSError, ValueError, UsbToolsError)  # FtdiError and USBError are OSErrors

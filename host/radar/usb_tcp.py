@@ -9,8 +9,8 @@ from __future__ import annotations
 import socket
 import struct
 
-from host.radar.mpsse import UsbWords
-from shared.errors import DeviceError
+from polysight.host.radar.mpsse import UsbWords
+from polysight.shared.errors import DeviceError
 
 SCHEME = "tcp://"
 _HEAD = struct.Struct("<ccH")

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from host.radar.commands import SLOPE_HZ_PER_S_PER_CODE, START_HZ_PER_CODE, slope_code, start_code
-from host.radar.program import chirp_us, frame_period_us
-from shared.config import Board, Instrument
-from shared.errors import ConfigError
-from shared.geometry import direct_path_m
-from shared.sync_in import MIN_PERIOD_US, WIDTH_US
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.radar.commands import SLOPE_HZ_PER_S_PER_CODE, START_HZ_PER_CODE, slope_code, start_code
+from polysight.host.radar.program import chirp_us, frame_period_us
+from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.geometry import direct_path_m
+from polysight.shared.sync_in import MIN_PERIOD_US, WIDTH_US
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 BAND_HZ = (76e9, 81e9)
 INTER_FRAME_US = 300.0

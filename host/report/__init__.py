@@ -1,10 +1,10 @@
 """The report and the product files."""
 
-from host.report.assemble import context_of
-from host.report.context import ReportContext
-from host.report.figures import banner_png, figures
-from host.report.products import plain, read_image, write_atomically, write_image, write_json
-from host.report.report import write_report
+from polysight.host.report.assemble import context_of
+from polysight.host.report.context import ReportContext
+from polysight.host.report.figures import banner_png, figures
+from polysight.host.report.products import plain, read_image, write_atomically, write_image, write_json
+from polysight.host.report.report import write_report
 
 __all__ = [
     "ReportContext",

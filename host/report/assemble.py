@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
-from host.report.context import ReportContext
+from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
+from polysight.host.report.context import ReportContext
 
 
 def context_of(
@@ -27,7 +27,7 @@ def context_of(
     provenance: dict[str, Any] | None = None,
     notes: Sequence[str] = (),
 ) -> ReportContext:
-    """Everything a report shows of a :class:`host.materials.MaterialsResult`; the rest is passed on as it is."""
+    """Everything a report shows of a :class:`polysight.host.materials.MaterialsResult`; the rest is passed on as it is."""
     return ReportContext(
         title=title,
         simulated=simulated,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shared.raster import RasterPlan
+from polysight.shared.raster import RasterPlan
 
 Image = npt.NDArray[np.complexfloating]
 Labels = npt.NDArray[np.int32]
@@ -33,7 +33,7 @@ class ReportContext:
     metal_referenced
         Whether h, v, p are relative to metal (0 dB = metal) or in arbitrary units.
     materials
-        Rows as `host.materials.MaterialsResult.rows` makes them, in the order of their labels.
+        Rows as `polysight.host.materials.MaterialsResult.rows` makes them, in the order of their labels.
     segments
         int32 [ny, nx], 0 = nothing, else the row's label.
     pixel_names

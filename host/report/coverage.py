@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from host.report.context import ReportContext
-from shared.raster import RasterPlan
+from polysight.host.report.context import ReportContext
+from polysight.shared.raster import RasterPlan
 
 _COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: told apart without colour
 _INK, _MUTED, _STAMP = "#1b2330", "#5b6675", "#b3261e"

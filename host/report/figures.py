@@ -20,8 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
-from host.report.context import ReportContext
-from host.report.coverage import coverage_figure, masked_positions
+from polysight.host.report.context import ReportContext
+from polysight.host.report.coverage import coverage_figure, masked_positions
 
 PALETTE = (
     "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from host.report.figures import INK, MUTED, STAMP, axis_mm, png
+from polysight.host.report.figures import INK, MUTED, STAMP, axis_mm, png
 
 _RANGE_DB = 30.0
 

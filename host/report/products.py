@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shared.errors import DataError
+from polysight.shared.errors import DataError
 
 
 def write_atomically(path: Path, data: bytes) -> None:

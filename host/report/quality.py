@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from host.report.context import ReportContext
-from host.report.imaging import imaging_table
+from polysight.host.report.context import ReportContext
+from polysight.host.report.imaging import imaging_table
 
 Table = dict[str, Any]
 _NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")

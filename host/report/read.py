@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials.patches import PATCHES, SeenPatches, read_patches
-from host.report.products import read_image
-from host.report.scan_facts import SCAN
-from shared.config import Chirp
-from shared.errors import ConfigError, DataError
-from shared.tables import decode
+from polysight.host.materials.patches import PATCHES, SeenPatches, read_patches
+from polysight.host.report.products import read_image
+from polysight.host.report.scan_facts import SCAN
+from polysight.shared.config import Chirp
+from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.tables import decode
 
 IMAGE, QUALITY, MATERIALS = "image.npz", "quality.json", "materials.json"
 _PRODUCTS = "products"  # of a scan folder
@@ -36,7 +36,7 @@ class SavedProducts:
 
     @cached_property
     def image(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays of image.npz, see :func:`host.report.write_image`."""
+        """Arrays of image.npz, see :func:`polysight.host.report.write_image`."""
         return read_image(self.folder / IMAGE)
 
     @property

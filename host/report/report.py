@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from host.report.context import ReportContext
-from host.report.coverage import coverage_sentence, masked_positions
-from host.report.figures import FIGURES, UNKNOWN_COLOUR, colours_of, figures
-from host.report.products import write_atomically
-from host.report.quality import key_numbers, quality_tables, text
+from polysight.host.report.context import ReportContext
+from polysight.host.report.coverage import coverage_sentence, masked_positions
+from polysight.host.report.figures import FIGURES, UNKNOWN_COLOUR, colours_of, figures
+from polysight.host.report.products import write_atomically
+from polysight.host.report.quality import key_numbers, quality_tables, text
 
 DASH = "–"
 
@@ -37,7 +37,7 @@ def write_report(out_dir: Path, ctx: ReportContext) -> Path:
 def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
     """The page as text, with the given PNG figures inline."""
     environment = Environment(
-        loader=PackageLoader("host.report", "."),
+        loader=PackageLoader("polysight.host.report", "."),
         autoescape=select_autoescape(["html"]),
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from host.imaging import ChannelImages
-from host.report.context import ReportContext
-from host.report.products import write_json
-from host.store.scanfolder import versions
-from host.store.source import Scan
-from shared.config import Instrument
-from shared.raster import RasterPlan
-from shared.tables import to_builtins
+from polysight.host.imaging import ChannelImages
+from polysight.host.report.context import ReportContext
+from polysight.host.report.products import write_json
+from polysight.host.store.scanfolder import versions
+from polysight.host.store.source import Scan
+from polysight.shared.config import Instrument
+from polysight.shared.raster import RasterPlan
+from polysight.shared.tables import to_builtins
 
 SCAN = "scan.json"
 

@@ -16,10 +16,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from host.report.figures import INK, MUTED, STAMP
-from host.report.products import write_atomically, write_json
-from host.sync.chain import SyncedRow
-from host.sync.residuals import STAGES
+from polysight.host.report.figures import INK, MUTED, STAMP
+from polysight.host.report.products import write_atomically, write_json
+from polysight.host.sync.chain import SyncedRow
+from polysight.host.sync.residuals import STAGES
 
 PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
 """Standard deviations after all stages, paper section 9.1."""

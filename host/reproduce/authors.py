@@ -6,13 +6,13 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from host.materials import table2
-from host.reproduce.authors_data import AuthorsData, read_authors
-from host.reproduce.authors_items import Judgements, authors_fig18, authors_fig20, authors_fig21
-from host.reproduce.authors_table2 import authors_table2
-from host.reproduce.item import Item, Table
-from host.reproduce.report import Origin, write_item, write_page
-from shared.errors import ConfigError, PolysightError
+from polysight.host.materials import table2
+from polysight.host.reproduce.authors_data import AuthorsData, read_authors
+from polysight.host.reproduce.authors_items import Judgements, authors_fig18, authors_fig20, authors_fig21
+from polysight.host.reproduce.authors_table2 import authors_table2
+from polysight.host.reproduce.item import Item, Table
+from polysight.host.reproduce.report import Origin, write_item, write_page
+from polysight.shared.errors import ConfigError, PolysightError
 
 MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "table2": lambda judge: authors_table2(judge.data),
@@ -35,7 +35,7 @@ def reproduce_authors(
     Parameters
     ----------
     folder, config, images, names
-        As of :func:`host.reproduce.authors_data.read_authors`.
+        As of :func:`polysight.host.reproduce.authors_data.read_authors`.
     out
         Folder for the page and the files.
     keys

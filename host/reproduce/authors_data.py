@@ -12,9 +12,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from host.materials import Entry, Library, table2
-from host.materials.authors import read_material
-from host.materials.authors_labels import (
+from polysight.host.materials import Entry, Library, table2
+from polysight.host.materials.authors import read_material
+from polysight.host.materials.authors_labels import (
     LabelledScan,
     entries_of_boxes,
     label_folders,
@@ -22,11 +22,11 @@ from host.materials.authors_labels import (
     reading_of,
     told_angle,
 )
-from host.reproduce.authors_names import read_names, rows_of
-from host.store.authors_settings import COLLECTION, read_settings, rig_of
-from shared.config import Instrument, load_instrument
-from shared.errors import DataError
-from shared.geometry import incidence_deg
+from polysight.host.reproduce.authors_names import read_names, rows_of
+from polysight.host.store.authors_settings import COLLECTION, read_settings, rig_of
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import DataError
+from polysight.shared.geometry import incidence_deg
 
 T = TypeVar("T")
 SAME_ANGLE_DEG = 2.5

@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from host.materials import Library, table2
-from host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
-from host.materials.judge import Score, score
-from host.materials.models import DISCRIMINANT, PAPER
-from host.materials.samples import CHANNELS, Samples
-from host.report.figures import INK, PALETTE
-from host.reproduce.authors_data import AuthorsData
-from host.reproduce.confusion import confusion_figure
-from host.reproduce.item import Item, Picture, Table, dress, new_figure, percent
-from host.reproduce.patches import groups
-from host.reproduce.published import published
-from host.reproduce.sugar import WATER
-from shared.errors import DataError
+from polysight.host.materials import Library, table2
+from polysight.host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
+from polysight.host.materials.judge import Score, score
+from polysight.host.materials.models import DISCRIMINANT, PAPER
+from polysight.host.materials.samples import CHANNELS, Samples
+from polysight.host.report.figures import INK, PALETTE
+from polysight.host.reproduce.authors_data import AuthorsData
+from polysight.host.reproduce.confusion import confusion_figure
+from polysight.host.reproduce.item import Item, Picture, Table, dress, new_figure, percent
+from polysight.host.reproduce.patches import groups
+from polysight.host.reproduce.published import published
+from polysight.host.reproduce.sugar import WATER
+from polysight.shared.errors import DataError
 
 SECOND_ANGLE_DEG = 55.0
 TASKS = ("solids", "solids, two angles", "liquids", "powders")

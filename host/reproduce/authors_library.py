@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from host.materials import Entry, Library, fit_library
-from host.polarimetry import correct_leakage
-from host.reproduce.authors_data import IMAGES, AuthorsData, read_authors
-from shared.errors import DataError
+from polysight.host.materials import Entry, Library, fit_library
+from polysight.host.polarimetry import correct_leakage
+from polysight.host.reproduce.authors_data import IMAGES, AuthorsData, read_authors
+from polysight.shared.errors import DataError
 
 PIXELS = 16
 """Of a patch, at even intervals: as in a library that is trained here."""

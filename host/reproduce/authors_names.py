@@ -11,9 +11,9 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from host.materials import Published, table2
-from host.materials.authors_labels import METALS
-from shared.errors import DataError
+from polysight.host.materials import Published, table2
+from polysight.host.materials.authors_labels import METALS
+from polysight.shared.errors import DataError
 
 _FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
 _ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials import Published, estimate_permittivity, table2
-from host.polarimetry import permittivity_from_ratio
-from host.report.figures import INK, PALETTE
-from host.reproduce.authors_data import IMAGES, AuthorsData
-from host.reproduce.item import Item, Picture, Table, dress, new_figure
-from host.reproduce.patches import groups
-from shared.errors import DataError
+from polysight.host.materials import Published, estimate_permittivity, table2
+from polysight.host.polarimetry import permittivity_from_ratio
+from polysight.host.report.figures import INK, PALETTE
+from polysight.host.reproduce.authors_data import IMAGES, AuthorsData
+from polysight.host.reproduce.item import Item, Picture, Table, dress, new_figure
+from polysight.host.reproduce.patches import groups
+from polysight.shared.errors import DataError
 
 AXIAL_RATIO, METAL_FACTOR, PERCENTILES = 0.05, 1 / 0.8, (30, 70)
 """What the authors apply before Eq. 3: leakage, a factor on |P| relative to metal, and the pixels by |P| they keep."""

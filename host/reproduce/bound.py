@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 
-from host.materials import Published
-from host.polarimetry import fresnel
-from host.reproduce.patches import Errors
+from polysight.host.materials import Published
+from polysight.host.polarimetry import fresnel
+from polysight.host.reproduce.patches import Errors
 
 TRIALS = 4000
 

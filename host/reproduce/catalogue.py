@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from host.reproduce.classification import fig18, fig20
-from host.reproduce.fresnel_figures import fig3, fig16
-from host.reproduce.front_on import fig4
-from host.reproduce.images import fig13, fig14, fig19
-from host.reproduce.item import Item, Run
-from host.reproduce.location import fig17
-from host.reproduce.permittivities import table2_item
-from host.reproduce.receiver import fig9
-from host.reproduce.sugar import fig21
-from host.reproduce.sync_figures import fig12, fig15
+from polysight.host.reproduce.classification import fig18, fig20
+from polysight.host.reproduce.fresnel_figures import fig3, fig16
+from polysight.host.reproduce.front_on import fig4
+from polysight.host.reproduce.images import fig13, fig14, fig19
+from polysight.host.reproduce.item import Item, Run
+from polysight.host.reproduce.location import fig17
+from polysight.host.reproduce.permittivities import table2_item
+from polysight.host.reproduce.receiver import fig9
+from polysight.host.reproduce.sugar import fig21
+from polysight.host.reproduce.sync_figures import fig12, fig15
 
 TITLES: dict[str, str] = {
     "fig3": "Fresnel reflection of common materials",

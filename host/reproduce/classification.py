@@ -8,15 +8,15 @@ from functools import cache
 
 import numpy as np
 
-from host.materials.judge import Score, best_model, score, strangers
-from host.materials.models import DISCRIMINANT, PAPER
-from host.materials.samples import CHANNELS, Samples
-from host.report.figures import PALETTE
-from host.reproduce.bound import pixel_bound
-from host.reproduce.confusion import confusion_figure
-from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure, percent
-from host.reproduce.patches import calibrated_errors, draw, groups
-from host.reproduce.published import published
+from polysight.host.materials.judge import Score, best_model, score, strangers
+from polysight.host.materials.models import DISCRIMINANT, PAPER
+from polysight.host.materials.samples import CHANNELS, Samples
+from polysight.host.report.figures import PALETTE
+from polysight.host.reproduce.bound import pixel_bound
+from polysight.host.reproduce.confusion import confusion_figure
+from polysight.host.reproduce.item import Item, Picture, Run, Table, dress, new_figure, percent
+from polysight.host.reproduce.patches import calibrated_errors, draw, groups
+from polysight.host.reproduce.published import published
 
 SECOND_ANGLE_DEG = 55.0
 CHOICE, RESULT = 17, 20

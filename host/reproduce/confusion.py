@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from host.materials import Published
-from host.materials.judge import Score
-from host.report.figures import INK
-from host.reproduce.item import dress, new_figure
+from polysight.host.materials import Published
+from polysight.host.materials.judge import Score
+from polysight.host.report.figures import INK
+from polysight.host.reproduce.item import dress, new_figure
 
 Panel = tuple[Score, npt.NDArray[np.float64], str]
 

@@ -6,11 +6,11 @@ from itertools import combinations
 
 import numpy as np
 
-from host.materials import Published, table2
-from host.polarimetry import brewster_angle_rad, fresnel, ratio_from_permittivity
-from host.report.figures import INK, PALETTE
-from host.reproduce.item import MARKERS, Item, Picture, Run, Table, dress, new_figure
-from host.reproduce.patches import calibrated_errors, draw
+from polysight.host.materials import Published, table2
+from polysight.host.polarimetry import brewster_angle_rad, fresnel, ratio_from_permittivity
+from polysight.host.report.figures import INK, PALETTE
+from polysight.host.reproduce.item import MARKERS, Item, Picture, Run, Table, dress, new_figure
+from polysight.host.reproduce.patches import calibrated_errors, draw
 
 COMMON = (1, 3, 6, 12, 13, 15, 21)
 CONTRAST = (1, 13, 16, 12, 18, 6, 3)

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import tomli_w
 
-from host.materials import table2
-from host.polarimetry import ratio_from_permittivity
-from host.report import context_of
-from host.reproduce.images import Seen, draw_row, ratio_data, ratio_table
-from host.reproduce.item import Item, Picture, Run, new_figure
-from host.reproduce.scenes import imaged, plate, scanned
+from polysight.host.materials import table2
+from polysight.host.polarimetry import ratio_from_permittivity
+from polysight.host.report import context_of
+from polysight.host.reproduce.images import Seen, draw_row, ratio_data, ratio_table
+from polysight.host.reproduce.item import Item, Picture, Run, new_figure
+from polysight.host.reproduce.scenes import imaged, plate, scanned
 
 FRONT_ON_MM = 60.0
 """Distance of each board from the middle in the front-on rig: 1.4 degrees of incidence."""

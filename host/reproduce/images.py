@@ -12,12 +12,12 @@ import numpy.typing as npt
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import gaussian_filter
 
-from host.materials import MaterialsResult, table2
-from host.polarimetry import ratio_from_permittivity
-from host.report import ReportContext, context_of
-from host.report.figures import INK, draw_channel, extent_mm
-from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
-from host.reproduce.scenes import imaged, plate, scanned
+from polysight.host.materials import MaterialsResult, table2
+from polysight.host.polarimetry import ratio_from_permittivity
+from polysight.host.report import ReportContext, context_of
+from polysight.host.report.figures import INK, draw_channel, extent_mm
+from polysight.host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
+from polysight.host.reproduce.scenes import imaged, plate, scanned
 
 PLACES_MM = tuple((60.0 * x, -60.0 * y) for y, x in product((-1, 0, 1), repeat=2))
 """Nine places; the metal reference lies in the middle."""

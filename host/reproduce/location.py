@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from host.materials import table2
-from host.polarimetry import permittivity_from_ratio
-from host.report.figures import INK, PALETTE
-from host.reproduce.item import MARKERS, Item, Picture, Run, Table, dress, new_figure
-from host.reproduce.published import published
-from host.reproduce.scenes import imaged, plate, scanned
+from polysight.host.materials import table2
+from polysight.host.polarimetry import permittivity_from_ratio
+from polysight.host.report.figures import INK, PALETTE
+from polysight.host.reproduce.item import MARKERS, Item, Picture, Run, Table, dress, new_figure
+from polysight.host.reproduce.published import published
+from polysight.host.reproduce.scenes import imaged, plate, scanned
 
 Complex = npt.NDArray[np.complex128]
 PLACEMENTS = 8

@@ -20,12 +20,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from host.materials import Entry, Library, Published, table2
-from host.materials.judge import score
-from host.materials.models import PAPER
-from host.materials.samples import Samples, feature_matrix
-from host.polarimetry import fresnel
-from host.reproduce.published import published
+from polysight.host.materials import Entry, Library, Published, table2
+from polysight.host.materials.judge import score
+from polysight.host.materials.models import PAPER
+from polysight.host.materials.samples import Samples, feature_matrix
+from polysight.host.polarimetry import fresnel
+from polysight.host.reproduce.published import published
 
 Complex = npt.NDArray[np.complex128]
 SCANS, PIXELS = 8, 12

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from host.materials import estimate_permittivity
-from host.report.figures import INK, PALETTE
-from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
-from host.reproduce.patches import calibrated_errors, draw, groups
+from polysight.host.materials import estimate_permittivity
+from polysight.host.report.figures import INK, PALETTE
+from polysight.host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
+from polysight.host.reproduce.patches import calibrated_errors, draw, groups
 
 
 def table2_item(run: Run) -> Item:

@@ -1,4 +1,4 @@
-"""The published numbers that results are shown beside, as data (`published.json`; Table 2 is in `host.materials`)."""
+"""The published numbers that results are shown beside, as data (`published.json`; Table 2 is in `polysight.host.materials`)."""
 
 from __future__ import annotations
 
@@ -11,4 +11,6 @@ from typing import Any
 @cache
 def published() -> dict[str, Any]:
     """Content of `published.json`; percentages as the paper prints them."""
-    return json.loads(resources.files("host.reproduce").joinpath("published.json").read_text(encoding="utf-8"))
+    return json.loads(
+        resources.files("polysight.host.reproduce").joinpath("published.json").read_text(encoding="utf-8")
+    )

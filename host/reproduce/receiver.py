@@ -6,12 +6,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal
 
-from host.capture.decode import decode_row
-from host.report.figures import INK, PALETTE
-from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
-from host.reproduce.scenes import scanned
-from host.sync.hpf import fit_high_pass, high_pass
-from shared.config import Chirp, load_instrument
+from polysight.host.capture.decode import decode_row
+from polysight.host.report.figures import INK, PALETTE
+from polysight.host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
+from polysight.host.reproduce.scenes import scanned
+from polysight.host.sync.hpf import fit_high_pass, high_pass
+from polysight.shared.config import Chirp, load_instrument
 
 GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
 OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)

@@ -12,10 +12,10 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
-from host.report.figures import STAMP, png
-from host.report.products import write_atomically, write_json
-from host.reproduce.catalogue import MAKERS, TITLES
-from host.reproduce.item import Item, Table
+from polysight.host.report.figures import STAMP, png
+from polysight.host.report.products import write_atomically, write_json
+from polysight.host.reproduce.catalogue import MAKERS, TITLES
+from polysight.host.reproduce.item import Item, Table
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def write_page(
     """
     makers = MAKERS if makers is None else makers
     environment = Environment(
-        loader=PackageLoader("host.reproduce", "."),
+        loader=PackageLoader("polysight.host.reproduce", "."),
         autoescape=select_autoescape(["html"]),
         undefined=StrictUndefined,
         trim_blocks=True,

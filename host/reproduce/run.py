@@ -7,10 +7,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from host.reproduce.catalogue import MAKERS, TITLES
-from host.reproduce.item import Item, Run
-from host.reproduce.report import write_item, write_page
-from shared.errors import ConfigError, PolysightError
+from polysight.host.reproduce.catalogue import MAKERS, TITLES
+from polysight.host.reproduce.item import Item, Run
+from polysight.host.reproduce.report import write_item, write_page
+from polysight.shared.errors import ConfigError, PolysightError
 
 
 def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> int:

@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 import tomli_w
 
-from host.demo import run_simulator
-from host.materials import MaterialsResult, TruthPlate, patches_from_plates, read_truth
-from host.offline import EDGE_MM, TRUTH
-from host.pipeline import Pipeline
-from host.store.scanfolder import ScanFolder
-from host.store.source import ScanSource
-from shared.errors import ScanError
+from polysight.host.demo import run_simulator
+from polysight.host.materials import MaterialsResult, TruthPlate, patches_from_plates, read_truth
+from polysight.host.offline import EDGE_MM, TRUTH
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.source import ScanSource
+from polysight.shared.errors import ScanError
 
 PLATE_MM = 45.0
 GRID = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}

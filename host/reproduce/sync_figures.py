@@ -10,16 +10,16 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from host.capture.decode import decode_row, row_words
-from host.imaging import ImageBuilder
-from host.report.figures import INK, PALETTE
-from host.report.sync_report import QUANTITIES, SyncReport
-from host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
-from host.reproduce.published import published
-from host.reproduce.scenes import plate, scanned
-from host.sync import BoardSetup, synchronise_row
-from host.sync.residuals import STAGES
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.capture.decode import decode_row, row_words
+from polysight.host.imaging import ImageBuilder
+from polysight.host.report.figures import INK, PALETTE
+from polysight.host.report.sync_report import QUANTITIES, SyncReport
+from polysight.host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
+from polysight.host.reproduce.published import published
+from polysight.host.reproduce.scenes import plate, scanned
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.host.sync.residuals import STAGES
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = npt.NDArray[np.complex64]
 UNITS = ("frequency (Hz)", "phase (rad)", "relative amplitude")

@@ -8,16 +8,16 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 
-from host.capture.card import CardClient
-from host.capture.dca1000 import Status, Version
-from host.capture.end_of_record import TAIL_S
-from host.capture.receiver import ReceiverProcess
-from host.capture.receiver_words import Progress, RowCapture
-from host.capture.scheduling import receiver_cores
-from host.capture.udp import check_receive_buffer
-from host.store.scanfolder import PART
-from shared.config import Instrument
-from shared.errors import PolysightError
+from polysight.host.capture.card import CardClient
+from polysight.host.capture.dca1000 import Status, Version
+from polysight.host.capture.end_of_record import TAIL_S
+from polysight.host.capture.receiver import ReceiverProcess
+from polysight.host.capture.receiver_words import Progress, RowCapture
+from polysight.host.capture.scheduling import receiver_cores
+from polysight.host.capture.udp import check_receive_buffer
+from polysight.host.store.scanfolder import PART
+from polysight.shared.config import Instrument
+from polysight.shared.errors import PolysightError
 
 _COMPLETED_LIMIT_S = 0.2  # from a record's stop to its last packet and its status
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from host.capture.decode import valid_frames
-from host.capture.hops import silent_radar
-from host.scan.slipped_row import write_in_place
-from host.scan.take import Take
-from host.scan.take_faults import TakeFault, reasons
-from host.store.appending import sync_folder
-from host.store.manifest import Fact, ManifestWriter
-from host.store.scanfolder import PART, ScanFolder, utc_now
-from shared.errors import DeviceError, ScanError, advice
-from shared.faults import explain
+from polysight.host.capture.decode import valid_frames
+from polysight.host.capture.hops import silent_radar
+from polysight.host.scan.slipped_row import write_in_place
+from polysight.host.scan.take import Take
+from polysight.host.scan.take_faults import TakeFault, reasons
+from polysight.host.store.appending import sync_folder
+from polysight.host.store.manifest import Fact, ManifestWriter
+from polysight.host.store.scanfolder import PART, ScanFolder, utc_now
+from polysight.shared.errors import DeviceError, ScanError, advice
+from polysight.shared.faults import explain
 
 _KINDS = (
     "packets",

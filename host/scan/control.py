@@ -14,8 +14,8 @@ from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
 
-from host.scan.stop import StopRequest
-from shared.errors import ScanError
+from polysight.host.scan.stop import StopRequest
+from polysight.shared.errors import ScanError
 
 CONTROL = "control"
 ALIVE = "alive"

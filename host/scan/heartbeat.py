@@ -8,10 +8,10 @@ from typing import Any
 
 import zmq
 
-from host.capture.scheduling import take_priority
-from shared.config import Instrument
-from shared.messages import Alive, pack
-from shared.sockets import requester
+from polysight.host.capture.scheduling import take_priority
+from polysight.shared.config import Instrument
+from polysight.shared.messages import Alive, pack
+from polysight.shared.sockets import requester
 
 REAL_TIME = 1  # below the receiving processes
 _REPLY_LIMIT_S = 1.0  # then the question was lost, and another one is asked

@@ -11,10 +11,10 @@ from typing import Any, TypeVar
 
 import zmq
 
-from host.scan.heartbeat import HostHeartbeat
-from shared.config import Instrument
-from shared.errors import DeviceError, ProtocolError, ScanError
-from shared.messages import (
+from polysight.host.scan.heartbeat import HostHeartbeat
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DeviceError, ProtocolError, ScanError
+from polysight.shared.messages import (
     JOURNALLED,
     Abort,
     Accepted,
@@ -43,7 +43,7 @@ from shared.messages import (
     unpack_event,
     unpack_reply,
 )
-from shared.sockets import requester, subscriber
+from polysight.shared.sockets import requester, subscriber
 
 ATTEMPTS = 3
 AT_WORK: tuple[State, ...] = ("homing", "running", "held", "done")  # which change by themselves

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from host.store.manifest import Fact
-from shared.config import Stage
-from shared.errors import ScanError
-from shared.messages import HelloReply
+from polysight.host.store.manifest import Fact
+from polysight.shared.config import Stage
+from polysight.shared.errors import ScanError
+from polysight.shared.messages import HelloReply
 
 UNTOLD = "the Pi does not tell its [stage], so nobody compares it with this rig file's: install this release on the Pi"
 

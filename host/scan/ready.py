@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from host.scan.pi_client import AT_WORK, PiClient
-from host.scan.stop import StopRequest
-from host.scan.take_faults import ON_REQUEST
-from shared.config import Instrument
-from shared.errors import ScanError
-from shared.faults import PiFault, explain
-from shared.messages import StatusReply
-from shared.stage_line import HOMING_LIMIT_S
+from polysight.host.scan.pi_client import AT_WORK, PiClient
+from polysight.host.scan.stop import StopRequest
+from polysight.host.scan.take_faults import ON_REQUEST
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ScanError
+from polysight.shared.faults import PiFault, explain
+from polysight.shared.messages import StatusReply
+from polysight.shared.stage_line import HOMING_LIMIT_S
 
 _HOMING_LIMIT_S = HOMING_LIMIT_S + 30.0  # longer than the Pi, whose reason is the exact one
 STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # homed by hand, after a look: `polysight-pi home`

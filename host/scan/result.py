@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from host.store.scanfolder import ScanFolder
-from shared.messages import ExitStatus
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.messages import ExitStatus
 
 
 @dataclass(frozen=True)

@@ -9,22 +9,22 @@ from pathlib import Path
 
 import zmq
 
-from host.capture.end_of_record import record_ending
-from host.radar.interface import RadarControl
-from host.scan.capture_rig import CaptureRig
-from host.scan.pi_client import PiClient
-from host.scan.slipped_row import ToldCapture, find_frames, find_slip
-from host.scan.states import RowState, RowTransaction
-from host.scan.stop import StopRequest
-from host.scan.take import Take
-from host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
-from host.store.scanfolder import PART
-from shared.config import Instrument
-from shared.errors import ScanError
-from shared.faults import explain
-from shared.messages import Capture, RowFinished
-from shared.raster import Row
-from shared.units import NS_PER_S
+from polysight.host.capture.end_of_record import record_ending
+from polysight.host.radar.interface import RadarControl
+from polysight.host.scan.capture_rig import CaptureRig
+from polysight.host.scan.pi_client import PiClient
+from polysight.host.scan.slipped_row import ToldCapture, find_frames, find_slip
+from polysight.host.scan.states import RowState, RowTransaction
+from polysight.host.scan.stop import StopRequest
+from polysight.host.scan.take import Take
+from polysight.host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
+from polysight.host.store.scanfolder import PART
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ScanError
+from polysight.shared.faults import explain
+from polysight.shared.messages import Capture, RowFinished
+from polysight.shared.raster import Row
+from polysight.shared.units import NS_PER_S
 
 _TURN_MS = 50  # how often stop requests and limits are looked at
 _ABORT_LIMIT_S = 10.0

@@ -11,25 +11,25 @@ from pathlib import Path
 
 import zmq
 
-from host.calibration.in_force import keep_in_scan
-from host.radar.backends import radar_control
-from host.radar.interface import RadarControl
-from host.scan.capture_rig import CaptureRig
-from host.scan.pi_client import PiClient
-from host.scan.pi_stage import check_same_stage, differences, pi_fact
-from host.scan.processing import OnRow
-from host.scan.result import OnProgress, ScanProgress, ScanResult
-from host.scan.running import RunningScan
-from host.scan.stop import StopRequest, interrupts_wait
-from host.store.connection import check_same_scan, connection_of
-from host.store.manifest import ManifestWriter
-from host.store.scanfolder import ScanFolder, new_scan_id, utc_now
-from host.store.validate import damaged_rows
-from shared.backends import is_simulated
-from shared.config import Instrument
-from shared.errors import ScanError
-from shared.messages import HelloReply
-from shared.raster import check_burst_fits, plan_raster
+from polysight.host.calibration.in_force import keep_in_scan
+from polysight.host.radar.backends import radar_control
+from polysight.host.radar.interface import RadarControl
+from polysight.host.scan.capture_rig import CaptureRig
+from polysight.host.scan.pi_client import PiClient
+from polysight.host.scan.pi_stage import check_same_stage, differences, pi_fact
+from polysight.host.scan.processing import OnRow
+from polysight.host.scan.result import OnProgress, ScanProgress, ScanResult
+from polysight.host.scan.running import RunningScan
+from polysight.host.scan.stop import StopRequest, interrupts_wait
+from polysight.host.store.connection import check_same_scan, connection_of
+from polysight.host.store.manifest import ManifestWriter
+from polysight.host.store.scanfolder import ScanFolder, new_scan_id, utc_now
+from polysight.host.store.validate import damaged_rows
+from polysight.shared.backends import is_simulated
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ScanError
+from polysight.shared.messages import HelloReply
+from polysight.shared.raster import check_burst_fits, plan_raster
 
 __all__ = ["OnRow", "ScanProgress", "ScanResult", "resume_scan", "run_scan"]
 
@@ -106,7 +106,7 @@ def resume_scan(
     """Go on with a scan at its first row that is not committed; committed rows are compared with their digests.
 
     A row that is not what was committed is taken again. `rig_now` says how the Pi and the boards are reached from now
-    on, and the limits; in all else it has to be the rig that the scan was begun with (:mod:`host.store.connection`).
+    on, and the limits; in all else it has to be the rig that the scan was begun with (:mod:`polysight.host.store.connection`).
 
     Parameters and errors as :func:`run_scan`. `on_row` is called for the rows committed earlier too.
     """

@@ -6,25 +6,25 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from host.radar.interface import RadarControl
-from host.scan.capture_rig import CaptureRig
-from host.scan.commit import commit_row, gave_up, reject_row
-from host.scan.pi_client import PiClient
-from host.scan.processing import OnRow, ProcessingQueue
-from host.scan.ready import check_disk, check_may_move, make_ready
-from host.scan.result import OnProgress, ScanProgress, ScanResult
-from host.scan.row import RowTaker
-from host.scan.states import RowState, RowTransaction
-from host.scan.stop import StopRequest, interrupts_request
-from host.scan.take import Take
-from host.scan.take_faults import ON_REQUEST, reasons
-from host.scan.time_left import time_left, usual_row_s
-from host.store.events import EventWriter, read_events
-from host.store.manifest import Fact, ManifestWriter
-from host.store.scanfolder import EVENTS, ScanFolder, utc_now
-from shared.errors import PolysightError, advice
-from shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
-from shared.raster import Row
+from polysight.host.radar.interface import RadarControl
+from polysight.host.scan.capture_rig import CaptureRig
+from polysight.host.scan.commit import commit_row, gave_up, reject_row
+from polysight.host.scan.pi_client import PiClient
+from polysight.host.scan.processing import OnRow, ProcessingQueue
+from polysight.host.scan.ready import check_disk, check_may_move, make_ready
+from polysight.host.scan.result import OnProgress, ScanProgress, ScanResult
+from polysight.host.scan.row import RowTaker
+from polysight.host.scan.states import RowState, RowTransaction
+from polysight.host.scan.stop import StopRequest, interrupts_request
+from polysight.host.scan.take import Take
+from polysight.host.scan.take_faults import ON_REQUEST, reasons
+from polysight.host.scan.time_left import time_left, usual_row_s
+from polysight.host.store.events import EventWriter, read_events
+from polysight.host.store.manifest import Fact, ManifestWriter
+from polysight.host.store.scanfolder import EVENTS, ScanFolder, utc_now
+from polysight.shared.errors import PolysightError, advice
+from polysight.shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
+from polysight.shared.raster import Row
 
 _LOOK_S = 0.05
 
@@ -60,7 +60,7 @@ class RunningScan:
         self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
 
     def run(self) -> ScanResult:
-        """Take every missing row, and write down how it ended. Raises what :func:`host.scan.run.run_scan` does."""
+        """Take every missing row, and write down how it ended. Raises what :func:`polysight.host.scan.run.run_scan` does."""
         for warning in self.result.warnings:
             self._say("warning", warning)
         begun = False

@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.receiver_words import RowCapture
-from host.capture.segment import read_index, write_index
-from host.scan.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from shared.config import Instrument
-from shared.errors import DeviceError
-from shared.messages import Capture
-from shared.raster import Row
+from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.segment import read_index, write_index
+from polysight.host.scan.missed_pulses import PlacedFrames, place_frames, slipped_frames
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DeviceError
+from polysight.shared.messages import Capture
+from polysight.shared.raster import Row
 
 HEADERS_BYTES = 14  # of `card.packet_bytes`: what is not payload (docs/spec/dca1000.md)
 _SHOWN = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import StrEnum
 
-from shared.errors import ScanError
+from polysight.shared.errors import ScanError
 
 
 class RowState(StrEnum):

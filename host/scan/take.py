@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from host.capture.receiver_words import RowCapture
-from host.radar.interface import BoardState, RadarState
-from host.scan.missed_pulses import PlacedFrames
-from host.scan.slipped_row import ToldCapture, describe
-from host.scan.take_faults import FaultKind, TakeFault
-from shared.faults import explain
-from shared.messages import RowFinished
-from shared.raster import Row
+from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.radar.interface import BoardState, RadarState
+from polysight.host.scan.missed_pulses import PlacedFrames
+from polysight.host.scan.slipped_row import ToldCapture, describe
+from polysight.host.scan.take_faults import FaultKind, TakeFault
+from polysight.shared.faults import explain
+from polysight.shared.messages import RowFinished
+from polysight.shared.raster import Row
 
 
 @dataclass

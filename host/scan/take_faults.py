@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from host.store.manifest import Fact
+from polysight.host.store.manifest import Fact
 
 
 class FaultKind(StrEnum):

@@ -7,7 +7,7 @@ import os
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from shared.errors import DeviceError
+from polysight.shared.errors import DeviceError
 
 
 class AppendFile:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.store.authors_packets import (
+from polysight.host.store.authors_packets import (
     Bursts,
     RowShape,
     Stream,
@@ -27,12 +27,12 @@ from host.store.authors_packets import (
     read_log,
     read_stream,
 )
-from host.store.authors_settings import COLLECTION, mirrored, read_settings, rig_of
-from host.store.scanfolder import MANIFEST, ScanFolder
-from host.store.source import RowData
-from shared.config import Instrument
-from shared.errors import DataError
-from shared.raster import RasterPlan, plan_raster
+from polysight.host.store.authors_settings import COLLECTION, mirrored, read_settings, rig_of
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.source import RowData
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.raster import RasterPlan, plan_raster
 
 _ROW_FILE = re.compile(r"(\d+)_(\d+)\.bin")
 _SYNCED = "_synced.npy"

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import DataError
+from polysight.shared.errors import DataError
 
 Gaps = list[tuple[int, int]]
 PACKET_BYTES = 1456  # payload of a full packet, where no log tells

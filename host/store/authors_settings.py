@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
-from shared.config import Board, Instrument, MountStep
-from shared.errors import DataError
-from shared.tables import decode
+from polysight.shared.config import Board, Instrument, MountStep
+from polysight.shared.errors import DataError
+from polysight.shared.tables import decode
 
 COLLECTION, DEVICES = "data_collection_cfg.json", "devices_comm_cfg.json"
 

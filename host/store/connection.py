@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from shared.config import Instrument
-from shared.errors import ConfigError
-from shared.tables import decode, to_builtins
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.tables import decode, to_builtins
 
 SECTIONS = ("pi", "limits")
 ADDRESSES = ("card_address", "host_address", "command_port", "data_port")

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import msgpack
 
-from host.store.appending import AppendFile
-from shared.errors import DataError, DeviceError, ProtocolError
-from shared.messages import AnyEvent, pack_kept, unpack_kept
+from polysight.host.store.appending import AppendFile
+from polysight.shared.errors import DataError, DeviceError, ProtocolError
+from polysight.shared.messages import AnyEvent, pack_kept, unpack_kept
 
 DAMAGED = ".damaged"  # suffix of the copy that is kept of a damaged file
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from host.store.appending import AppendFile
-from shared.errors import DataError, DeviceError, PolysightError
+from polysight.host.store.appending import AppendFile
+from polysight.shared.errors import DataError, DeviceError, PolysightError
 
 Fact = dict[str, Any]
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from host.store.appending import sync_folder
-from host.store.manifest import Fact
-from host.store.scanfolder import CommittedRow, ScanFolder, utc_now
-from shared.errors import DataError, DeviceError, ScanError
+from polysight.host.store.appending import sync_folder
+from polysight.host.store.manifest import Fact
+from polysight.host.store.scanfolder import CommittedRow, ScanFolder, utc_now
+from polysight.shared.errors import DataError, DeviceError, ScanError
 
 Digests = dict[str, dict[int, str]]
 """CRC-32 (hex) of the payload a product was made from, by board and row."""

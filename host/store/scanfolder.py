@@ -13,19 +13,19 @@ from typing import Any
 import msgspec
 import numpy as np
 
-import shared
-from host.capture.segment import read_index
-from host.store import manifest
-from host.store.appending import sync_folder
-from host.store.connection import reconnected
-from host.store.crc import crc32
-from host.store.manifest import Fact, Manifest, ManifestWriter
-from host.store.source import RowData
-from shared.config import Instrument
-from shared.errors import DataError, DeviceError
-from shared.raster import RasterPlan
-from shared.tables import decode as decode_config
-from shared.tables import to_builtins
+from polysight.host.capture.segment import read_index
+from polysight.host.store import manifest
+from polysight.host.store.appending import sync_folder
+from polysight.host.store.connection import reconnected
+from polysight.host.store.crc import crc32
+from polysight.host.store.manifest import Fact, Manifest, ManifestWriter
+from polysight.host.store.source import RowData
+from polysight.shared import __version__
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError, DeviceError
+from polysight.shared.raster import RasterPlan
+from polysight.shared.tables import decode as decode_config
+from polysight.shared.tables import to_builtins
 
 FORMAT = 1
 MANIFEST = "manifest.jsonl"
@@ -63,8 +63,8 @@ def new_scan_id(now: datetime | None = None) -> str:
 
 def versions() -> dict[str, str]:
     """Releases of everything that shapes the data."""
-    found = {"python": platform.python_version(), "numpy": np.__version__, "shared": shared.__version__}
-    for package in ("polysight-host", "scipy", "scikit-learn"):
+    found = {"python": platform.python_version(), "numpy": np.__version__, "polysight": __version__}
+    for package in ("scipy", "scikit-learn"):
         try:
             found[package] = version(package)
         except PackageNotFoundError:

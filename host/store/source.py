@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.config import Instrument
-from shared.raster import RasterPlan
+from polysight.shared.config import Instrument
+from polysight.shared.raster import RasterPlan
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
-from host.capture.segment import read_index
-from host.store import manifest
-from host.store.events import read_events
-from host.store.raw import dropped_files
-from host.store.scanfolder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
-from shared.errors import DeviceError, PolysightError
-from shared.raster import plan_raster
+from polysight.host.capture.segment import read_index
+from polysight.host.store import manifest
+from polysight.host.store.events import read_events
+from polysight.host.store.raw import dropped_files
+from polysight.host.store.scanfolder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
+from polysight.shared.errors import DeviceError, PolysightError
+from polysight.shared.raster import plan_raster
 
 _CHUNK = 1 << 22
 _COPY = "restore it from a copy, or resume takes its row again"

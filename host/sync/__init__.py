@@ -1,5 +1,5 @@
 """Synchronisation of one row of one board: filter compensation, burst alignment, direct-path reference."""
 
-from host.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
 
 __all__ = ["BoardSetup", "SyncedRow", "synchronise_row"]

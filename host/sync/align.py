@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from host.sync import hpf
-from host.sync.passes import FOLD, Passes, passes_for
-from host.sync.tone import Real, Tone, cis
+from polysight.host.sync import hpf
+from polysight.host.sync.passes import FOLD, Passes, passes_for
+from polysight.host.sync.tone import Real, Tone, cis
 
 _REFERENCES = 4  # reference chirps to try before a position is given up
 _GOOD = 0.5  # a good chirp has at least this part of the coherence of the position's median chirp

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from host.sync.chain import SyncedRow
-from host.sync.direct_path import excess_path_m
-from shared.config import Board, Instrument
-from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.raster import mean_burst_travel_mm, plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.sync.chain import SyncedRow
+from polysight.host.sync.direct_path import excess_path_m
+from polysight.shared.config import Board, Instrument
+from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.raster import mean_burst_travel_mm, plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _GROUPS = 10  # of rows, for the standard deviation
 _STEPS = 3  # Gauss-Newton

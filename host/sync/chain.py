@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from host.capture.decode import raw_words
-from host.sync import direct_path, hpf, residuals
-from host.sync.align import align_row
-from host.sync.passes import FOLD
-from shared.config import Board, Chirp, Instrument
-from shared.errors import DataError
+from polysight.host.capture.decode import raw_words
+from polysight.host.sync import direct_path, hpf, residuals
+from polysight.host.sync.align import align_row
+from polysight.host.sync.passes import FOLD
+from polysight.shared.config import Board, Chirp, Instrument
+from polysight.shared.errors import DataError
 
 _FULL_SCALE = 32767  # largest int16: a sample at it was clipped
 

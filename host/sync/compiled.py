@@ -1,4 +1,4 @@
-"""The passes of `host.sync.plain`, compiled: a chirp is taken from the card's words into the cache and used there.
+"""The passes of `polysight.host.sync.plain`, compiled: a chirp is taken from the card's words into the cache and used there.
 
 Each pass reads the words anew, which costs less than any copy of them in memory would, and all of a chirp even where
 only its linear samples are needed: memory is fetched ahead only where it is read in line. For four RX. Compiled at the
@@ -12,10 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from host.sync import kernels
-from host.sync.kernels import LANES, RX, compiled
-from host.sync.plain import BAND_BINS, FOLD
-from host.sync.tone import block_edges, block_times, search_size
+from polysight.host.sync import kernels
+from polysight.host.sync.kernels import LANES, RX, compiled
+from polysight.host.sync.plain import BAND_BINS, FOLD
+from polysight.host.sync.tone import block_edges, block_times, search_size
 
 CHUNK = 512
 """Positions at a time: as many as NumPy needs for its calls to cost little; reading words from memory costs less."""

@@ -18,15 +18,15 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from host.store.source import SyncedSource
-from host.sync.align import AlignedRow, whole_blocks
-from host.sync.chain import SyncedRow
-from host.sync.direct_path import DirectPath, excess_path_m, prepare, reference
-from host.sync.passes import FOLD
-from shared.config import Board, Chirp, Instrument
-from shared.errors import DataError
-from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.store.source import SyncedSource
+from polysight.host.sync.align import AlignedRow, whole_blocks
+from polysight.host.sync.chain import SyncedRow
+from polysight.host.sync.direct_path import DirectPath, excess_path_m, prepare, reference
+from polysight.host.sync.passes import FOLD
+from polysight.shared.config import Board, Chirp, Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _SPREAD_M = 0.15  # echoes come from this far to either side of the mirror point
 _NOISE = 1e-3  # noise power of one sample beside the object's, for the direct path's estimate

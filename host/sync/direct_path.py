@@ -29,12 +29,12 @@ import scipy.fft
 import scipy.linalg
 from numpy.typing import NDArray
 
-from host.sync.align import AlignedRow, whole_blocks
-from host.sync.passes import FOLD
-from host.sync.tone import Complex, cis, phasor
-from shared.config import Board, Chirp, Instrument
-from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.sync.align import AlignedRow, whole_blocks
+from polysight.host.sync.passes import FOLD
+from polysight.host.sync.tone import Complex, cis, phasor
+from polysight.shared.config import Board, Chirp, Instrument
+from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _FFT = 256  # of averaged samples
 _STEPS = 3

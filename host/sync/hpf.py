@@ -14,8 +14,8 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from shared.config import Chirp
-from shared.errors import DataError
+from polysight.shared.config import Chirp
+from polysight.shared.errors import DataError
 
 SMALLEST_GAIN = 0.25
 """A gain below this is not undone further."""

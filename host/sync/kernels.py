@@ -1,4 +1,4 @@
-"""Small compiled loops of `host.sync.compiled`, over one chirp of four RX at a time, or one burst of sixteen chirps.
+"""Small compiled loops of `polysight.host.sync.compiled`, over one chirp of four RX at a time, or one burst of sixteen chirps.
 
 What makes them fast: every loop runs over values that lie next to each other, so it becomes vector instructions. The
 card's integers are sorted into that order before they become numbers, since they are half as wide. Strides are
@@ -15,7 +15,7 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from host.sync.plain import FOLD
+from polysight.host.sync.plain import FOLD
 
 RX = 4
 LANES = FOLD * RX  # samples that are averaged, of every RX; also chirps that are transformed at once

@@ -1,4 +1,4 @@
-"""The three passes over a burst's raw samples, in NumPy: what `host.sync.compiled` does, plainly and more slowly.
+"""The three passes over a burst's raw samples, in NumPy: what `polysight.host.sync.compiled` does, plainly and more slowly.
 
 Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing is by `exp(-j 2 pi f (n -
 centre))`, with f in cycles a sample and `centre` the middle of the linear samples.
@@ -11,8 +11,8 @@ import scipy.fft
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from host.sync import hpf
-from host.sync.tone import block_edges, block_times, cis, phasor, refine, search_size, strongest
+from polysight.host.sync import hpf
+from polysight.host.sync.tone import block_edges, block_times, cis, phasor, refine, search_size, strongest
 
 CHUNK = 8
 """Positions at a time: the working set stays in the second-level cache."""

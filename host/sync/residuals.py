@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from host.sync.align import AlignedRow
-from host.sync.direct_path import DirectPath, Referenced
-from host.sync.passes import FOLD
-from host.sync.tone import Complex, Real, block_edges, block_times, cis, phasor, refine
+from polysight.host.sync.align import AlignedRow
+from polysight.host.sync.direct_path import DirectPath, Referenced
+from polysight.host.sync.passes import FOLD
+from polysight.host.sync.tone import Complex, Real, block_edges, block_times, cis, phasor, refine
 
 STAGES = {
     "received": "one chirp as the hardware trigger left it",

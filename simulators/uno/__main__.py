@@ -1,4 +1,4 @@
-"""The emulated UNO at real time: a drop-in for `python -m simulators.stage` that runs the compiled sketch itself.
+"""The emulated UNO at real time: a drop-in for `python -m polysight.simulators.stage` that runs the compiled sketch itself.
 
 `--time-scale` is the speed of the whole board, its heartbeat clock included: a host that asks for the status four
 times per heartbeat allows 2, and a machine that cannot keep up slows the simulated world down.
@@ -10,16 +10,16 @@ import os
 import sys
 from pathlib import Path
 
-from shared.config import load_instrument
-from shared.errors import PolysightError
-from simulators._process import command_line, die_with_parent
-from simulators.stage_logic import homing_zero
-from simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import PolysightError
+from polysight.simulators._process import command_line, die_with_parent
+from polysight.simulators.stage_logic import homing_zero
+from polysight.simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run until SIGTERM or SIGINT."""
-    p = command_line("simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
+    p = command_line("polysight.simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
     p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
     p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires: gets trigger and motion")
     p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")

@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
-from shared.errors import DeviceError
+from polysight.shared.errors import DeviceError
 
 HZ = 16_000_000
 STEP_VECTOR, TRIGGER_END_VECTOR, MILLIS_VECTOR, RECEIVE_VECTOR, SEND_VECTOR = 11, 12, 16, 18, 19
@@ -40,7 +40,7 @@ class EmulatedUno:
     Parameters
     ----------
     program, image
-        From :func:`simulators.uno.emulator` and :func:`simulators.uno.firmware`.
+        From :func:`polysight.simulators.uno.emulator` and :func:`polysight.simulators.uno.firmware`.
     start
         Steps the stage stands clear of its switches.
     watch

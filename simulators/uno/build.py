@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from simulators.build_cache import compiled
+from polysight.simulators.build_cache import compiled
 
 SKETCH_DIR = Path(__file__).resolve().parents[2] / "arduino_stage"
 CORE_DIR = Path("/usr/share/arduino/hardware/arduino/avr/cores/arduino")

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from benchmarks import peers
 from benchmarks.data import published
-from host.imaging import backproject, image_grid
-from host.imaging.aperture import Aperture
-from host.imaging.grid import Antennas
+from polysight.host.imaging import backproject, image_grid
+from polysight.host.imaging.aperture import Aperture
+from polysight.host.imaging.grid import Antennas
 
 ROWS, COLUMNS, EVERY = 6, 7, 2
 

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 from benchmarks.data import RIG
 from benchmarks.published.image import SETTINGS, form_image
 from benchmarks.published.synchronise import Synchroniser
-from host.imaging import ImageGrid, backproject, image_grid
-from host.imaging.grid import Antennas
-from shared.config import Instrument, load_instrument
-from shared.raster import mean_burst_travel_mm, plan_raster
-from simulators.radar import SimulatedRig, reference_cube
-from simulators.scene import Scene, apply_scene, decode_scene
-from simulators.simulate import row_offsets_mm
+from polysight.host.imaging import ImageGrid, backproject, image_grid
+from polysight.host.imaging.grid import Antennas
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.raster import mean_burst_travel_mm, plan_raster
+from polysight.simulators.radar import SimulatedRig, reference_cube
+from polysight.simulators.scene import Scene, apply_scene, decode_scene
+from polysight.simulators.simulate import row_offsets_mm
 
 STEP_MM = 5.0
 SMALL = {

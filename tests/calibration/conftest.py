@@ -10,10 +10,10 @@ from zlib import crc32
 
 import pytest
 
-from shared.config import Instrument, load_instrument
-from shared.tables import decode, to_builtins
-from simulators.scene import decode_scene
-from simulators.simulate import simulate
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import simulate
 
 REPO = Path(__file__).resolve().parents[2]
 Change = Callable[[dict[str, Any]], None]

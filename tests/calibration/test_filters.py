@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from host.calibration.files import FilterFile, read
-from host.calibration.filters import BIN_HZ, LEAST, binned
-from host.calibration.in_force import load_calibration
-from host.cli import main
-from host.pipeline import Pipeline
-from host.store.scanfolder import ScanFolder
-from host.sync.hpf import HighPass, high_pass
+from polysight.host.calibration.files import FilterFile, read
+from polysight.host.calibration.filters import BIN_HZ, LEAST, binned
+from polysight.host.calibration.in_force import load_calibration
+from polysight.host.cli import main
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.sync.hpf import HighPass, high_pass
 
 OFFSETS_HZ = (60e3, 250e3, 500e3, 850e3, 1250e3)
 TRUE_KHZ = (235.0, 700.0)

@@ -6,18 +6,27 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.calibration.files import BoardFilter, FilterFile, MetalFile, PlacesFile, SourceScan, head, read, write
-from host.calibration.in_force import keep_in_scan, load_calibration, of_rig, of_scan
-from host.calibration.metal import write_metal
-from host.imaging.grid import image_grid
-from host.imaging.imaged_with import ImagedWith
-from host.polarimetry import plane_reference
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError, DataError
-from shared.raster import plan_raster
-from shared.tables import to_builtins
+from polysight.host.calibration.files import (
+    BoardFilter,
+    FilterFile,
+    MetalFile,
+    PlacesFile,
+    SourceScan,
+    head,
+    read,
+    write,
+)
+from polysight.host.calibration.in_force import keep_in_scan, load_calibration, of_rig, of_scan
+from polysight.host.calibration.metal import write_metal
+from polysight.host.imaging.grid import image_grid
+from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.polarimetry import plane_reference
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.raster import plan_raster
+from polysight.shared.tables import to_builtins
 
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 

@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from host.calibration.in_force import load_calibration
-from host.cli import main
-from host.metal_scans import load_reference
-from host.options import Options
-from host.pipeline import Pipeline
-from host.store.scanfolder import ScanFolder
+from polysight.host.calibration.in_force import load_calibration
+from polysight.host.cli import main
+from polysight.host.metal_scans import load_reference
+from polysight.host.options import Options
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scanfolder import ScanFolder
 
 TABLES = {
     "grid": {"columns": 14, "rows": 10, "step_x_mm": 12.0, "step_y_mm": 12.0},

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import tomli_w
 
-from host.calibration.files import PlacesFile, read
-from host.calibration.in_force import Calibration, load_calibration
-from host.calibration.places import Prior, TargetPoint, fit_places, look, places_file, read_target
-from host.calibration.rows import open_raw
-from host.calibration_commands import with_places_of
-from host.cli import main
-from host.imaging.grid import Antennas
-from shared.errors import ConfigError, DataError
-from shared.geometry import specular_midpoint_m
+from polysight.host.calibration.files import PlacesFile, read
+from polysight.host.calibration.in_force import Calibration, load_calibration
+from polysight.host.calibration.places import Prior, TargetPoint, fit_places, look, places_file, read_target
+from polysight.host.calibration.rows import open_raw
+from polysight.host.calibration_commands import with_places_of
+from polysight.host.cli import main
+from polysight.host.imaging.grid import Antennas
+from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.geometry import specular_midpoint_m
 
 SHIFTS = {"RH": (1.5, -1.0, 0.8), "RV": (-1.2, 0.7, -1.4)}
 DEEPER_MM = 1.7
@@ -119,7 +119,7 @@ def glimpse(case):
     """What the boards saw at few positions."""
     folder, _, believed, _ = case
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("host.calibration.places.POSITIONS", 60)
+        patch.setattr("polysight.host.calibration.places.POSITIONS", 60)
         return look(open_raw(folder), believed)
 
 

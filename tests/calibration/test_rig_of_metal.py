@@ -7,18 +7,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
-from host.calibration.in_force import checked, load_calibration
-from host.calibration.metal import write_metal
-from host.cli import main
-from host.imaging.grid import image_grid
-from host.imaging.imaged_with import ImagedWith
-from host.metal_scans import load_reference
-from host.options import Options
-from host.pipeline import Pipeline
-from host.polarimetry import plane_reference
-from host.store.scanfolder import ScanFolder
-from shared.errors import DataError
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.calibration.in_force import checked, load_calibration
+from polysight.host.calibration.metal import write_metal
+from polysight.host.cli import main
+from polysight.host.imaging.grid import image_grid
+from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.metal_scans import load_reference
+from polysight.host.options import Options
+from polysight.host.pipeline import Pipeline
+from polysight.host.polarimetry import plane_reference
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.errors import DataError
 
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 

@@ -4,12 +4,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.calibration.direct_signal import unwrapped
-from host.calibration.files import StartFile, read
-from host.calibration.start_frequency import by_geometry, start_of
-from host.cli import main
-from host.radar.validator import direct_if_hz
-from shared.tables import to_builtins
+from polysight.host.calibration.direct_signal import unwrapped
+from polysight.host.calibration.files import StartFile, read
+from polysight.host.calibration.start_frequency import by_geometry, start_of
+from polysight.host.cli import main
+from polysight.host.radar.validator import direct_if_hz
+from polysight.shared.tables import to_builtins
 
 TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {"columns": 20, "rows": 20}}
 

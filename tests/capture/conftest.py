@@ -14,15 +14,15 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from shared.config import Board, Instrument, load_instrument
-from shared.tables import decode, to_builtins
-from simulators.card_endpoint import CardEndpoint
-from simulators.card_faults import Faults
-from simulators.card_sender import Pace
-from simulators.dca1000 import Network
-from simulators.loopback import on_free_subnet
-from simulators.replay import Player, Recording
-from simulators.simulated_card import MAC
+from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.card_endpoint import CardEndpoint
+from polysight.simulators.card_faults import Faults
+from polysight.simulators.card_sender import Pace
+from polysight.simulators.dca1000 import Network
+from polysight.simulators.loopback import on_free_subnet
+from polysight.simulators.replay import Player, Recording
+from polysight.simulators.simulated_card import MAC
 
 sys.path.insert(0, str(Path(__file__).parent))  # for recordings.py
 

@@ -10,11 +10,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from host.capture import dca1000
-from host.capture.card import CardClient
-from host.capture.dca1000 import Code, Status
-from shared.config import Board, Card
-from shared.errors import DeviceError
+from polysight.host.capture import dca1000
+from polysight.host.capture.card import CardClient
+from polysight.host.capture.dca1000 import Code, Status
+from polysight.shared.config import Board, Card
+from polysight.shared.errors import DeviceError
 
 
 class Script:

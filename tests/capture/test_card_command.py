@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from shared.tables import to_builtins
-from simulators.card_faults import Faults
-from simulators.card_sender import bound_udp
+from polysight.shared.tables import to_builtins
+from polysight.simulators.card_faults import Faults
+from polysight.simulators.card_sender import bound_udp
 
 POLYSIGHT = Path(sys.executable).parent / "polysight"
 LIMIT_S = 60.0

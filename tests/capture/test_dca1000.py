@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.capture import dca1000 as d
-from shared.errors import ProtocolError
+from polysight.host.capture import dca1000 as d
+from polysight.shared.errors import ProtocolError
 
 
 def test_vectors_seen():

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.capture.decode import decode_row, decode_two_lane, valid_frames
-from shared.errors import DataError
+from polysight.host.capture.decode import decode_row, decode_two_lane, valid_frames
+from polysight.shared.errors import DataError
 
 
 def cube(frames: int, samples: int, rx: int, seed: int = 0) -> np.ndarray:

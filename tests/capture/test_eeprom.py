@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.capture.card import CardClient
-from host.capture.dca1000 import Code, Status, decode_request, encode_reply
-from host.capture.eeprom import EepromSettings, program_eeprom
-from shared.errors import ConfigError, DeviceError
-from simulators.dca1000 import Network
+from polysight.host.capture.card import CardClient
+from polysight.host.capture.dca1000 import Code, Status, decode_request, encode_reply
+from polysight.host.capture.eeprom import EepromSettings, program_eeprom
+from polysight.shared.errors import ConfigError, DeviceError
+from polysight.simulators.dca1000 import Network
 
 
 def test_the_bytes_are_reversed():

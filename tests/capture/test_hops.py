@@ -11,10 +11,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from host.capture.dca1000 import Status
-from host.capture.hops import Hop, neighbour_answers, route_interface, silent_card, silent_hop, silent_radar
-from host.capture.receiver_words import RowCapture
-from shared.config import Board
+from polysight.host.capture.dca1000 import Status
+from polysight.host.capture.hops import Hop, neighbour_answers, route_interface, silent_card, silent_hop, silent_radar
+from polysight.host.capture.receiver_words import RowCapture
+from polysight.shared.config import Board
 
 CARD = "192.168.33.180"
 BOARD = Board("RH", "receive_h", CARD, "192.168.33.30", 4096, 4098, ())
@@ -93,8 +93,8 @@ try() { "$PYTHON" - "$1" <<'END'
 import sys
 from pathlib import Path
 import msgspec
-from host.capture.survey import survey_cards
-from shared.config import load_instrument
+from polysight.host.capture.survey import survey_cards
+from polysight.shared.config import load_instrument
 rig = load_instrument(Path("instrument.toml"))
 limits = msgspec.structs.replace(rig.limits, command_timeout_s=0.15)
 survey = survey_cards(msgspec.structs.replace(rig, limits=limits))[0]

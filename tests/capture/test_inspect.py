@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from recordings import real_row, row, write_pcap
 
-from host.capture import dca1000
-from host.capture.dca1000 import Status
-from host.capture.inspect import Known, Report, inspect_bin
-from host.capture.inspect_pcap import inspect_pcap
-from host.capture.inspect_text import main_text
-from host.capture.pcap import read_pcap
-from host.capture.plot import plot_profile
-from host.capture.shape import Shape
-from shared.config import load_instrument
-from shared.errors import DataError
+from polysight.host.capture import dca1000
+from polysight.host.capture.dca1000 import Status
+from polysight.host.capture.inspect import Known, Report, inspect_bin
+from polysight.host.capture.inspect_pcap import inspect_pcap
+from polysight.host.capture.inspect_text import main_text
+from polysight.host.capture.pcap import read_pcap
+from polysight.host.capture.plot import plot_profile
+from polysight.host.capture.shape import Shape
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError
 
 RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
 REAL = Path(__file__).resolve().parents[3] / "shared/data/dca1000-real"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from recordings import CARD, OTHER, row, write_pcap
 
-from host.capture import dca1000
+from polysight.host.capture import dca1000
 from tests.small_scene import small_scene
 
 RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
@@ -57,7 +57,7 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
 
 def test_a_row_of_a_scan_brings_its_own_rig_file_and_says_that_it_is_simulated(polysight, tmp_path):
     (tmp_path / "scene.toml").write_text(small_scene(8, 2, metal=False))
-    simulate = [sys.executable, "-m", "simulators", "simulate", tmp_path / "scene.toml", "--config", RIG]
+    simulate = [sys.executable, "-m", "polysight.simulators", "simulate", tmp_path / "scene.toml", "--config", RIG]
     subprocess.run([*simulate, "--out", tmp_path / "scan"], check=True, capture_output=True)
     done = polysight("scan/raw/RV/0001.bin")
     assert done.returncode == 0, done.stderr

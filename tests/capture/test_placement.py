@@ -10,9 +10,9 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from host.capture.dca1000 import encode_packet
-from host.capture.placed import Counters, Losses, Placed
-from host.capture.placement import Placement
+from polysight.host.capture.dca1000 import encode_packet
+from polysight.host.capture.placed import Counters, Losses, Placed
+from polysight.host.capture.placement import Placement
 
 FULL = 1456
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault

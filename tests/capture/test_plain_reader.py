@@ -12,16 +12,16 @@ from pathlib import Path
 import msgpack
 import numpy as np
 
-from host.capture.dca1000 import encode_packet
-from host.capture.receiver import ReceiverProcess
-from host.capture.segment import write_index
-from host.store.events import EventWriter
-from host.store.manifest import ManifestWriter
-from pi_controller.journal import Journal
-from shared.config import load_instrument
-from shared.messages import Capture, RunStopped, pack
-from simulators.scene import load_scene
-from simulators.simulate import simulate
+from polysight.host.capture.dca1000 import encode_packet
+from polysight.host.capture.receiver import ReceiverProcess
+from polysight.host.capture.segment import write_index
+from polysight.host.store.events import EventWriter
+from polysight.host.store.manifest import ManifestWriter
+from polysight.pi_controller.journal import Journal
+from polysight.shared.config import load_instrument
+from polysight.shared.messages import Capture, RunStopped, pack
+from polysight.simulators.scene import load_scene
+from polysight.simulators.simulate import simulate
 from tests.small_scene import small_scene
 
 FRAMES, SAMPLES = 96, 256

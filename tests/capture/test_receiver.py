@@ -15,19 +15,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.capture.dca1000 import Status, encode_packet
-from host.capture.end_of_record import Ending, record_ending
-from host.capture.receiver import ReceiverProcess
-from host.capture.receiver_words import Progress
-from host.capture.segment import read_index
-from host.capture.udp import (
+from polysight.host.capture.dca1000 import Status, encode_packet
+from polysight.host.capture.end_of_record import Ending, record_ending
+from polysight.host.capture.receiver import ReceiverProcess
+from polysight.host.capture.receiver_words import Progress
+from polysight.host.capture.segment import read_index
+from polysight.host.capture.udp import (
     BatchReceiver,
     bind_udp,
     enlarge_receive_buffer,
     kernel_drops,
 )
-from shared.config import Board
-from shared.errors import DeviceError
+from polysight.shared.config import Board
+from polysight.shared.errors import DeviceError
 
 FULL = 1456
 
@@ -180,7 +180,7 @@ def test_survives_ctrl_c_and_ends_with_its_host(board):
 
 def test_ends_when_its_host_is_killed(board, tmp_path):
     code = (
-        "import time\nfrom shared.config import Board\nfrom host.capture.receiver import ReceiverProcess\n"
+        "import time\nfrom polysight.shared.config import Board\nfrom polysight.host.capture.receiver import ReceiverProcess\n"
         f"r = ReceiverProcess(Board('RH', 'receive_h', '{board.card_address}', '{board.host_address}', 1, "
         f"{board.data_port}, ()), 1 << 20)\n"
         f"from pathlib import Path\nr.begin_row(0, 1, 4096, 4096, Path({str(tmp_path / 'a.part')!r}))\n"

@@ -6,10 +6,10 @@ import os
 
 import pytest
 
-from host.capture.receiver import ReceiverProcess
-from host.capture.scheduling import receiver_cores, take_core, take_priority
-from host.capture.udp import check_receive_buffer, usable_packets
-from shared.errors import DeviceError
+from polysight.host.capture.receiver import ReceiverProcess
+from polysight.host.capture.scheduling import receiver_cores, take_core, take_priority
+from polysight.host.capture.udp import check_receive_buffer, usable_packets
+from polysight.shared.errors import DeviceError
 
 FULL = 1456
 

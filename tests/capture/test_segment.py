@@ -7,8 +7,8 @@ import zlib
 import numpy as np
 import pytest
 
-from host.capture.segment import Segment, read_index
-from shared.errors import DataError, DeviceError
+from polysight.host.capture.segment import Segment, read_index
+from polysight.shared.errors import DataError, DeviceError
 
 
 def test_memory_is_taken_again_and_clean(tmp_path):

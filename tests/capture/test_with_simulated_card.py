@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.capture.card import CardClient
-from host.capture.dca1000 import Status
-from host.capture.receiver import ReceiverProcess
-from shared.config import Card
-from simulators.card_faults import Faults
+from polysight.host.capture.card import CardClient
+from polysight.host.capture.dca1000 import Status
+from polysight.host.capture.receiver import ReceiverProcess
+from polysight.shared.config import Card
+from polysight.simulators.card_faults import Faults
 
 SIZE = 300 * 4096 + 1300  # ends with a short packet
 FULL = 1456

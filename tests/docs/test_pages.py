@@ -8,10 +8,10 @@ import tomllib
 
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
-from host.materials.truth import truth_plates
-from host.radar.usb import PRODUCT, VENDOR
-from shared.errors import PolysightError
-from shared.faults import EXPLANATIONS, PiFault
+from polysight.host.materials.truth import truth_plates
+from polysight.host.radar.usb import PRODUCT, VENDOR
+from polysight.shared.errors import PolysightError
+from polysight.shared.faults import EXPLANATIONS, PiFault
 
 
 def test_links_and_commands():

@@ -12,14 +12,14 @@ import msgspec
 import pytest
 
 from docs.check.pages import ROOT, read_page
-from host.capture import dca1000
-from host.capture.eeprom import EepromSettings
-from host.radar import commands, events
-from host.radar.commands import Command, DeviceConfiguration
-from host.radar.messages import Direction, Kind, SubBlock, decode
-from host.radar.program import program
-from shared import messages, stage_line
-from shared.config import NativeRadar, Radar, load_instrument
+from polysight.host.capture import dca1000
+from polysight.host.capture.eeprom import EepromSettings
+from polysight.host.radar import commands, events
+from polysight.host.radar.commands import Command, DeviceConfiguration
+from polysight.host.radar.messages import Direction, Kind, SubBlock, decode
+from polysight.host.radar.program import program
+from polysight.shared import messages, stage_line
+from polysight.shared.config import NativeRadar, Radar, load_instrument
 
 SPEC = ROOT / "docs/spec"
 

@@ -17,14 +17,14 @@ import pytest
 import tomli_w
 import zmq
 
-from host.doctor.bench import Bench, System, Wanted
-from host.doctor.finding import Finding
-from host.doctor.walk import walk
-from host.scan.pi_client import PiClient
-from shared import messages as m
-from shared.config import Instrument, load_instrument
-from shared.tables import decode, to_builtins
-from simulators.loopback import on_free_subnet
+from polysight.host.doctor.bench import Bench, System, Wanted
+from polysight.host.doctor.finding import Finding
+from polysight.host.doctor.walk import walk
+from polysight.host.scan.pi_client import PiClient
+from polysight.shared import messages as m
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.loopback import on_free_subnet
 
 sys.path.insert(0, str(Path(__file__).parent))  # for doctor_case.py
 
@@ -146,7 +146,7 @@ class LiveRig:
             if entry.name.isdigit():
                 with suppress(OSError):
                     line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-                    if str(self.folder) in line and word in line and "simulators.rig" not in line:
+                    if str(self.folder) in line and word in line and "polysight.simulators.rig" not in line:
                         found.append(int(entry.name))
         assert len(found) == 1, (word, found)
         return found[0]
@@ -157,7 +157,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
     folder = tmp_path_factory.mktemp("d")
     (folder / "base.toml").write_text(tomli_w.dumps(to_builtins(programmed())))
     (folder / "scene.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "simulators.rig", "--config", str(folder / "base.toml"), "--with-pi"]
+    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(folder / "base.toml"), "--with-pi"]
     command += ["--scene", str(folder / "scene.toml"), "--dir", str(folder / "rig"), "--time-scale", "40"]
     log = folder / "rig.log"
     with log.open("wb") as out:

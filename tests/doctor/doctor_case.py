@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from host.calibration.direct_signal import find_direct
-from host.doctor.bench import Bench, System, Wanted
-from host.sync import BoardSetup
-from shared.config import Instrument, load_instrument
-from shared.tables import decode, to_builtins
-from simulators.radar import SimulatedRig
-from simulators.scene import decode_scene
+from polysight.host.calibration.direct_signal import find_direct
+from polysight.host.doctor.bench import Bench, System, Wanted
+from polysight.host.sync import BoardSetup
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import decode_scene
 
 REPO = Path(__file__).resolve().parents[2]
 QUICK = System(write_speed=lambda _folder: 200e6)

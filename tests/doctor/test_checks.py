@@ -8,19 +8,19 @@ import pytest
 import tomli_w
 from doctor_case import QUICK, RIG, bench_of, rig_with
 
-from host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
-from host.capture.hops import route_interface
-from host.cli import main
-from host.doctor import kernel
-from host.doctor.bench import Bench, System, Wanted
-from host.doctor.check_config import check_config
-from host.doctor.check_disk import check_disk, check_time
-from host.doctor.check_network import check_network
-from host.doctor.finding import Finding, error, ok
-from host.doctor.walk import CHECKS, _try, walk
-from shared.backends import GPIOD, GPIOMEM, WIRES
-from shared.messages import HelloReply
-from shared.tables import to_builtins
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.capture.hops import route_interface
+from polysight.host.cli import main
+from polysight.host.doctor import kernel
+from polysight.host.doctor.bench import Bench, System, Wanted
+from polysight.host.doctor.check_config import check_config
+from polysight.host.doctor.check_disk import check_disk, check_time
+from polysight.host.doctor.check_network import check_network
+from polysight.host.doctor.finding import Finding, error, ok
+from polysight.host.doctor.walk import CHECKS, _try, walk
+from polysight.shared.backends import GPIOD, GPIOMEM, WIRES
+from polysight.shared.messages import HelloReply
+from polysight.shared.tables import to_builtins
 
 # --- the command ---
 
@@ -196,7 +196,7 @@ def outcome(wrong):
     ],
 )
 def test_only_what_depends_on_a_broken_hop_is_left_out(monkeypatch, wrong, untried):
-    monkeypatch.setattr("host.doctor.walk.CHECKS", outcome({wrong}))
+    monkeypatch.setattr("polysight.host.doctor.walk.CHECKS", outcome({wrong}))
     found = {f.check: f for f in walk(Bench(Wanted(Path("x"))))}
     left_out = {n for n, f in found.items() if f.verdict == "not checked"}
     both = {f"{n} {b}" for n in untried for b in ("RH", "RV")}

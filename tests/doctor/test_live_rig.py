@@ -9,17 +9,17 @@ import time
 
 import pytest
 
-from host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
-from host.cli import main
-from host.doctor.bench import System
-from host.pipeline import Pipeline
-from host.scan.run import run_scan
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared.config import load_instrument
-from shared.errors import PolysightError
-from shared.messages import BeginRun
-from shared.raster import plan_raster
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.cli import main
+from polysight.host.doctor.bench import System
+from polysight.host.pipeline import Pipeline
+from polysight.host.scan.run import run_scan
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import PolysightError
+from polysight.shared.messages import BeginRun
+from polysight.shared.raster import plan_raster
 
 pytestmark = pytest.mark.xdist_group("doctor")
 QUICK = System(write_speed=lambda _folder: 200e6)
@@ -172,7 +172,7 @@ def test_a_trigger_wire_that_is_cut(live):
 
 def test_a_stage_that_is_silent(live):
     try:
-        with live.stopped("--trigger-line" if _stage_is_compiled() else "simulators.stage"):
+        with live.stopped("--trigger-line" if _stage_is_compiled() else "polysight.simulators.stage"):
             with live.pi() as pi:
                 _wait(lambda: pi.status().state == "fault")
             found = live.doctor(move=True)
@@ -186,7 +186,7 @@ def test_a_stage_that_is_silent(live):
 
 def _stage_is_compiled():
     """Whether the stage is the sketch itself, not its Python stand-in."""
-    from simulators.stage import compiler
+    from polysight.simulators.stage import compiler
 
     return compiler() is not None
 

@@ -2,12 +2,12 @@
 
 import pytest
 
-import shared
-from shared.messages import HelloReply
+from polysight.shared import __version__
+from polysight.shared.messages import HelloReply
 
 
 def reply(**changes):
-    said = {"pi_release": shared.__version__, "firmware": shared.__version__, "backend": "gpiod", "state": "homed"}
+    said = {"pi_release": __version__, "firmware": __version__, "backend": "gpiod", "state": "homed"}
     return HelloReply(**{**said, "scan_id": "", "last_seq": 0, "t_unix_ns": 0, **changes})
 
 

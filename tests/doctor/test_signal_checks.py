@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from doctor_case import FRAMES, RIG, bench_of, frames_of, rig_with, signal_of
 
-from host.doctor import check_direct_path, check_skew
-from host.doctor.capture import Captured
-from host.doctor.check_direct_path import check_direct_path as direct_path_of
-from host.doctor.check_level import check_level
-from host.doctor.check_stream import check_radar
+from polysight.host.doctor import check_direct_path, check_skew
+from polysight.host.doctor.capture import Captured
+from polysight.host.doctor.check_direct_path import check_direct_path as direct_path_of
+from polysight.host.doctor.check_level import check_level
+from polysight.host.doctor.check_stream import check_radar
 
 
 def judged(board="RH", rig=RIG, **disturbances):
@@ -19,7 +19,7 @@ def judged(board="RH", rig=RIG, **disturbances):
 
 def captured(words, **changes):
     valid = np.ones(len(words), bool)
-    from host.capture.receiver_words import RowCapture
+    from polysight.host.capture.receiver_words import RowCapture
 
     zeros = dict.fromkeys((f for f in RowCapture.__struct_fields__), 0)
     row = {**zeros, "missing": [], "located": True, "reason": "", "holes": [], "slipped": False}
@@ -51,7 +51,7 @@ def test_a_direct_path_beyond_the_band_is_called_an_alias_and_gets_an_offset(off
 
 
 def rig_offset_for_the_middle(name):
-    from host.radar.validator import direct_if_hz
+    from polysight.host.radar.validator import direct_if_hz
 
     return 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(rig_with(0.0), rig_with(0.0).by_name(name))
 

@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, load_instrument
-from shared.errors import PolysightError
-from shared.tables import decode, to_builtins
-from simulators.loopback import on_free_subnet
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import PolysightError
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.loopback import on_free_subnet
 from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]
@@ -183,7 +183,7 @@ class Rig(Bench):
         folder = self.folder
         (folder / "scene.toml").write_text(self._scene)
         self.simulators = self.start(
-            "python", "-m", "simulators.rig", "--config", REPO / "instrument.toml", "--scene", folder / "scene.toml",
+            "python", "-m", "polysight.simulators.rig", "--config", REPO / "instrument.toml", "--scene", folder / "scene.toml",
             "--dir", folder / "rig", "--time-scale", str(self._time_scale), env=self._env,
         )  # fmt: skip
         base = Path(self.simulators.wait_ready())

@@ -7,8 +7,8 @@ from typing import Any
 
 import tomli_w
 
-from shared.config import Instrument, load_instrument
-from shared.tables import to_builtins
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import to_builtins
 
 from .conftest import REPO
 
@@ -29,7 +29,7 @@ def start_rig(bench, table: dict[str, Any], *faults: str) -> tuple[Any, Instrume
     (bench.folder / "rig.toml").write_text(tomli_w.dumps(table))
     told = [word for fault in faults for word in ("--fault", fault)]
     rig = bench.start(
-        "python", "-m", "simulators.rig", "--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern",
+        "python", "-m", "polysight.simulators.rig", "--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern",
         "--time-scale", "40", "--with-pi", *told,
     )  # fmt: skip
     return rig, load_instrument(bench.folder / rig.wait_ready())

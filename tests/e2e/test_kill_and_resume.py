@@ -10,9 +10,9 @@ import resource
 
 import pytest
 
-from host.store.events import read_events
-from host.store.scanfolder import ScanFolder
-from shared.messages import RowStarted
+from polysight.host.store.events import read_events
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.messages import RowStarted
 
 pytestmark = pytest.mark.xdist_group("rig")
 

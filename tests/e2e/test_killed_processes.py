@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from host.pipeline import Pipeline
-from host.store import manifest
-from host.store.events import read_events
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared.messages import RowStarted
+from polysight.host.pipeline import Pipeline
+from polysight.host.store import manifest
+from polysight.host.store.events import read_events
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.messages import RowStarted
 from tests.small_scene import small_scene
 
 pytestmark = [pytest.mark.xdist_group("rig"), pytest.mark.slow]

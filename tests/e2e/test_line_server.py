@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from host.scan.run import run_scan
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared.config import Instrument
-from shared.tables import decode, to_builtins
+from polysight.host.scan.run import run_scan
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.config import Instrument
+from polysight.shared.tables import decode, to_builtins
 
 from .pattern_rig import counts, small_table, start_rig
 

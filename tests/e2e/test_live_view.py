@@ -14,7 +14,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from host.store.validate import validate
+from polysight.host.store.validate import validate
 from tests.small_scene import small_scene
 
 LIMIT_S = 120.0

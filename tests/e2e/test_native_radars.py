@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from host.scan.run import run_scan
-from host.store.validate import validate
+from polysight.host.scan.run import run_scan
+from polysight.host.store.validate import validate
 
 from .pattern_rig import COLUMNS, PULSES, ROWS, counts, small_table, start_rig
 

@@ -11,20 +11,31 @@ BLOCK = """
 import sys
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {absent}:
+        if {{name, name.partition(".")[0]}} & {absent}:
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Absent())
 """
-HOST_ONLY = ("numpy", "scipy", "sklearn", "skimage", "matplotlib", "jinja2", "rich", "gpiod", "host", "simulators")
+HOST_ONLY = (
+    "numpy",
+    "scipy",
+    "sklearn",
+    "skimage",
+    "matplotlib",
+    "jinja2",
+    "rich",
+    "gpiod",
+    "polysight.host",
+    "polysight.simulators",
+)
 EVERYTHING = """
 import importlib, pkgutil
-import pi_controller, shared
+from polysight import pi_controller, shared
 for package in (pi_controller, shared):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
 """
-HELP = "from pi_controller.cli import main\nmain({arguments})\n"
+HELP = "from polysight.pi_controller.cli import main\nmain({arguments})\n"
 
 
 def alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
@@ -51,7 +62,7 @@ def test_help(arguments):
 
 def test_gpio_without_gpiod_is_one_message():
     code = (
-        "from pi_controller.lines_gpiod import load_gpiod\nfrom shared.errors import PolysightError\n"
+        "from polysight.pi_controller.lines_gpiod import load_gpiod\nfrom polysight.shared.errors import PolysightError\n"
         "try:\n    load_gpiod()\nexcept PolysightError as e:\n    print(e)\n"
     )
     ended = alone(code, *HOST_ONLY)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from shared.tables import to_builtins
+from polysight.shared.tables import to_builtins
 from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]
@@ -104,7 +104,7 @@ def test_scene_file(bench, old, new, words):
 
 def test_simulated_rig(bench):
     """What its processes would refuse, the rig refuses before it starts them."""
-    rig = ("python", "-m", "simulators.rig", "--config", RIG, "--pattern", "--dir", "rig")
+    rig = ("python", "-m", "polysight.simulators.rig", "--config", RIG, "--pattern", "--dir", "rig")
     refused(bench.run(*rig, "--faults", "no.toml"), "no.toml: no such file", status=2)
     refused(bench.run(*rig, "--fault", "RH.los=0.1"), "faults of RH", "los", status=2)
     refused(bench.run(*rig, "--time-scale", "0"), "--time-scale", status=2)
@@ -127,7 +127,7 @@ def recorded(tmp_path_factory):
     """A simulated scan of nothing: no metal, no plates."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "scene.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "simulators", "simulate", folder / "scene.toml", "--config", RIG]
+    command = [sys.executable, "-m", "polysight.simulators", "simulate", folder / "scene.toml", "--config", RIG]
     subprocess.run([*command, "--out", folder / "scan"], check=True, capture_output=True)
     return folder / "scan"
 
@@ -257,7 +257,7 @@ def lonely(bench, lonely_instrument):
 def wires(bench):
     """Simulated wires."""
     path = bench.folder / "wires.sock"
-    bench.start("python", "-m", "simulators.wires", "--socket", path).wait_ready()
+    bench.start("python", "-m", "polysight.simulators.wires", "--socket", path).wait_ready()
     return path
 
 

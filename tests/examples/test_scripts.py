@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.materials import Library
-from shared.config import load_instrument
-from simulators.scene import decode_scene
-from simulators.simulate import simulate
+from polysight.host.materials import Library
+from polysight.shared.config import load_instrument
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import simulate
 
 REPO = Path(__file__).resolve().parents[2]
 SCRIPTS = REPO / "examples" / "scripts"

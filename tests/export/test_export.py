@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import scipy.io
 
-from host.cli import main
-from host.export import hdf5, material_columns, read_products
-from host.export.hdf5 import write_hdf5
-from host.export.matlab import write_mat
-from host.export.table import write_csv
-from host.report import write_image, write_json
-from shared.config import load_instrument
-from shared.tables import to_builtins
+from polysight.host.cli import main
+from polysight.host.export import hdf5, material_columns, read_products
+from polysight.host.export.hdf5 import write_hdf5
+from polysight.host.export.matlab import write_mat
+from polysight.host.export.table import write_csv
+from polysight.host.report import write_image, write_json
+from polysight.shared.config import load_instrument
+from polysight.shared.tables import to_builtins
 
 REPO = Path(__file__).resolve().parents[2]
 SEGMENTS = [
@@ -53,7 +53,7 @@ def folder(tmp_path):
     write_json(made / "materials.json", {"scan_id": "s", "simulated": True, "segments": SEGMENTS})
     write_json(made / "quality.json", {"boards": {"RH": {"frames_expected": 7}}})
     rig = to_builtins(load_instrument(REPO / "instrument.toml"))
-    versions = {"polysight-host": "0.1.0", "numpy": np.__version__}
+    versions = {"polysight": "0.1.0", "numpy": np.__version__}
     write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "versions": versions, "instrument": rig})
     return made
 
@@ -173,7 +173,7 @@ def test_without_h5py_the_message_names_the_extra(folder, tmp_path, monkeypatch,
     monkeypatch.setattr(hdf5, "import_module", absent)
     assert main(["export", str(folder), "--hdf5", "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'polysight-host[export]'" in said
+    assert "pip install 'polysight[export]'" in said
     assert not list((tmp_path / "out").iterdir())
 
 

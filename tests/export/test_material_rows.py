@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from host.cli import main
-from host.report import write_image, write_json
+from polysight.host.cli import main
+from polysight.host.report import write_image, write_json
 
 PATCH = {
     "label": 4, "name": "PET", "confidence": 0.75, "metal_reference": False, "metal_like": True,

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import tomli_w
 
-from host.cli import main
-from host.imaging.subbands import sub_bands
-from host.material_commands import parse_layer
-from host.materials.layers import Layer, Spectrum, predict
-from host.report import write_json
-from host.report.read import MATERIALS, SavedProducts, read_products
-from shared.config import load_instrument
-from shared.errors import DataError
-from shared.tables import to_builtins
+from polysight.host.cli import main
+from polysight.host.imaging.subbands import sub_bands
+from polysight.host.material_commands import parse_layer
+from polysight.host.materials.layers import Layer, Spectrum, predict
+from polysight.host.report import write_json
+from polysight.host.report.read import MATERIALS, SavedProducts, read_products
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError
+from polysight.shared.tables import to_builtins
 
 REPO = Path(__file__).resolve().parents[2]
 HERE = load_instrument(REPO / "instrument.toml")  # the rig file in the current folder

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from host.imaging import ChannelImages
-from host.materials import TruthPlate, read_truth
-from host.pipeline import Pipeline
-from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, load_instrument
-from simulators.scene import Scene, load_scene
-from simulators.simulate import simulate
+from polysight.host.imaging import ChannelImages
+from polysight.host.materials import TruthPlate, read_truth
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import Instrument, load_instrument
+from polysight.simulators.scene import Scene, load_scene
+from polysight.simulators.simulate import simulate
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import tomli_w
 
-from host.cli import main
-from host.pipeline import Pipeline
-from host.store.authors import AuthorsCube, open_scan
-from host.sync.cubes import recognise
-from shared.config import Image, load_instrument
-from shared.errors import DataError
-from shared.tables import to_builtins
-from simulators.authors_forms import write_cube
-from simulators.scene import decode_scene
-from simulators.simulate import simulate
+from polysight.host.cli import main
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.authors import AuthorsCube, open_scan
+from polysight.host.sync.cubes import recognise
+from polysight.shared.config import Image, load_instrument
+from polysight.shared.errors import DataError
+from polysight.shared.tables import to_builtins
+from polysight.simulators.authors_forms import write_cube
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import simulate
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from host.materials import Classifier, Library
-from host.materials.labels import labels_of, read_labels, write_labels
-from host.options import LIBRARY, Options
+from polysight.host.materials import Classifier, Library
+from polysight.host.materials.labels import labels_of, read_labels, write_labels
+from polysight.host.options import LIBRARY, Options
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 

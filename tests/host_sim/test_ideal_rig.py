@@ -2,8 +2,8 @@
 
 import pytest
 
-from host.materials import Classifier, Library
-from host.options import LIBRARY
+from polysight.host.materials import Classifier, Library
+from polysight.host.options import LIBRARY
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 

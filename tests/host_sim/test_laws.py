@@ -6,10 +6,10 @@ One worker runs them all (xdist_group), so that scans are simulated once.
 import numpy as np
 import pytest
 
-from host.materials import Classifier, Library, pixel_accuracy
-from host.materials.segment import axis_mm, box_mask
-from host.options import LIBRARY
-from host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
+from polysight.host.materials import Classifier, Library, pixel_accuracy
+from polysight.host.materials.segment import axis_mm, box_mask
+from polysight.host.options import LIBRARY
+from polysight.host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 

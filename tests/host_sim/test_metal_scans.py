@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.cli import main
-from host.material_commands import parse_layer
-from host.materials import read_truth
-from host.materials.layers import fit_layer
-from host.materials.subbands import bands_of_row
-from host.metal_scans import load_reference
-from host.offline import imaged
-from host.polarimetry import Leakage, PlaneReference
-from shared.config import Instrument
-from simulators.scene import decode_scene
-from simulators.simulate import simulate
+from polysight.host.cli import main
+from polysight.host.material_commands import parse_layer
+from polysight.host.materials import read_truth
+from polysight.host.materials.layers import fit_layer
+from polysight.host.materials.subbands import bands_of_row
+from polysight.host.metal_scans import load_reference
+from polysight.host.offline import imaged
+from polysight.host.polarimetry import Leakage, PlaneReference
+from polysight.shared.config import Instrument
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import simulate
 
 pytestmark = pytest.mark.xdist_group("metal_scans")
 

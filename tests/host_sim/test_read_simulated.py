@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.store.authors import open_scan
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared.config import load_instrument
-from simulators.radar import SimulatedRig
-from simulators.scene import decode_scene
-from simulators.simulate import lost_bytes, simulate
+from polysight.host.store.authors import open_scan
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.config import load_instrument
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import lost_bytes, simulate
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from host.polarimetry import multilayer
-from simulators.fresnel import layered
-from simulators.scene import Layer
+from polysight.host.polarimetry import multilayer
+from polysight.simulators.fresnel import layered
+from polysight.simulators.scene import Layer
 
 F = 78.5e9
 

@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.imaging.grid import Antennas, row_offsets_m
-from host.sync.chain import SyncedRow
-from shared.config import Board, Instrument, load_instrument
-from shared.raster import plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging.grid import Antennas, row_offsets_m
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.raster import plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 ROOT = Path(__file__).parents[2]
 

@@ -5,13 +5,13 @@ import importlib
 import numpy as np
 import pytest
 
-from host.imaging import backproject, project
-from host.imaging.aperture import Aperture
-from host.imaging.direct import DirectImager
-from host.imaging.grid import Antennas, image_grid, scan_offsets_m
-from host.imaging.incremental import IncrementalImager
-from host.imaging.spectral import SpectralImager
-from shared.errors import ConfigError
+from polysight.host.imaging import backproject, project
+from polysight.host.imaging.aperture import Aperture
+from polysight.host.imaging.direct import DirectImager
+from polysight.host.imaging.grid import Antennas, image_grid, scan_offsets_m
+from polysight.host.imaging.incremental import IncrementalImager
+from polysight.host.imaging.spectral import SpectralImager
+from polysight.shared.errors import ConfigError
 
 
 def _strict():

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host import offline
-from host.cli import main
-from host.imaging.focus import Focus
-from shared.config import load_instrument
-from simulators.scene import decode_scene
-from simulators.simulate import simulate
+from polysight.host import offline
+from polysight.host.cli import main
+from polysight.host.imaging.focus import Focus
+from polysight.shared.config import load_instrument
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import simulate
 
 ROOT = Path(__file__).parents[2]
 SCENE = {

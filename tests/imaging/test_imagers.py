@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from host.imaging import image_grid
-from host.imaging.aperture import Aperture, irregular
-from host.imaging.direct import DirectImager
-from host.imaging.grid import Antennas, scan_offsets_m
-from host.imaging.imager import choose_imager
-from host.imaging.incremental import IncrementalImager
-from host.imaging.kernels import forget
-from host.imaging.reduce import reduction, scene_gate_m
-from host.imaging.spectral import SpectralImager
-from shared.raster import plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging import image_grid
+from polysight.host.imaging.aperture import Aperture, irregular
+from polysight.host.imaging.direct import DirectImager
+from polysight.host.imaging.grid import Antennas, scan_offsets_m
+from polysight.host.imaging.imager import choose_imager
+from polysight.host.imaging.incremental import IncrementalImager
+from polysight.host.imaging.kernels import forget
+from polysight.host.imaging.reduce import reduction, scene_gate_m
+from polysight.host.imaging.spectral import SpectralImager
+from polysight.shared.raster import plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 IMAGERS = [SpectralImager, IncrementalImager, DirectImager]
 # columns, rows, steps (mm), pixels, pixel (mm): common lattices, none in x, coarser and finer pixels, full width.

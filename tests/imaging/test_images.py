@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from host.imaging import ImageBuilder, backproject, image_grid
-from host.imaging.footprint import mirror_samples
-from host.imaging.grid import Antennas, row_offsets_m
-from host.imaging.reduce import reduction, scene_gate_m
-from host.materials.spectrum import Spectrum
-from host.polarimetry import multilayer
-from host.sync import BoardSetup, synchronise_row
-from shared.errors import DataError
-from shared.geometry import specular_midpoint_m
-from shared.raster import plan_raster
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging import ImageBuilder, backproject, image_grid
+from polysight.host.imaging.footprint import mirror_samples
+from polysight.host.imaging.grid import Antennas, row_offsets_m
+from polysight.host.imaging.reduce import reduction, scene_gate_m
+from polysight.host.materials.spectrum import Spectrum
+from polysight.host.polarimetry import multilayer
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.shared.errors import DataError
+from polysight.shared.geometry import specular_midpoint_m
+from polysight.shared.raster import plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 
 def _build(rig, rows, **options):

@@ -2,10 +2,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.imaging import ImageBuilder
-from host.imaging.facts import board_facts
-from host.imaging.resolution import point_response
-from shared.geometry import specular_midpoint_m
+from polysight.host.imaging import ImageBuilder
+from polysight.host.imaging.facts import board_facts
+from polysight.host.imaging.resolution import point_response
+from polysight.shared.geometry import specular_midpoint_m
 
 
 def _full(rig, **options):

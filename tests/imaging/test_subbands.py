@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.imaging.subbands import LEAST_SAMPLES, sub_bands
-from host.materials.layers import Spectrum
-from shared.config import load_instrument
-from shared.errors import ConfigError
+from polysight.host.imaging.subbands import LEAST_SAMPLES, sub_bands
+from polysight.host.materials.layers import Spectrum
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError
 
 CHIRP = load_instrument(Path(__file__).parents[2] / "instrument.toml").chirp
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from host import many
-from host.cli import main
-from host.cli_process import table
-from host.many import MARK, Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
-from shared.errors import ConfigError
+from polysight.host import many
+from polysight.host.cli import main
+from polysight.host.cli_process import table
+from polysight.host.many import MARK, Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
+from polysight.shared.errors import ConfigError
 
 WORKER = """
 import json, os, pickle, sys, time
@@ -182,7 +182,7 @@ def test_without_dask_the_line_that_installs_it_is_told(tmp_path, monkeypatch, c
     scans(tmp_path / "in", "a")
     command = ["process", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--dask", "tcp://127.0.0.1:1"]
     assert main(command) == 2
-    assert "pip install 'polysight-host[dask]'" in capsys.readouterr().err
+    assert "pip install 'polysight[dask]'" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("worker")
@@ -204,9 +204,9 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 @pytest.mark.timeout(900)
 def test_real_scans_end_to_end(tmp_path, capsys):
     """A simulated scan and a damaged one by the real program; then the mark holds."""
-    from shared.config import load_instrument
-    from simulators.scene import decode_scene
-    from simulators.simulate import simulate
+    from polysight.shared.config import load_instrument
+    from polysight.simulators.scene import decode_scene
+    from polysight.simulators.simulate import simulate
 
     rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
     scene = {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from host.materials import TruthPlate, analyse
+from polysight.host.materials import TruthPlate, analyse
 
 THETA = np.radians(55.0)
 NINE = {

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from host.materials.authors_labels import (
+from polysight.host.materials.authors_labels import (
     PIXELS,
     TURNS,
     entries_of_boxes,
@@ -14,9 +14,9 @@ from host.materials.authors_labels import (
     reading_of,
     told_angle,
 )
-from host.polarimetry import ratio_from_permittivity
-from shared.errors import DataError
-from simulators.authors_forms import Errors, Material, write_labels
+from polysight.host.polarimetry import ratio_from_permittivity
+from polysight.shared.errors import DataError
+from polysight.simulators.authors_forms import Errors, Material, write_labels
 
 MATERIALS = {
     "Copper plate": Material("copper", None),

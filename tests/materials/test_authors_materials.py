@@ -6,9 +6,9 @@ import pickle
 import numpy as np
 import pytest
 
-from host.materials import Entry
-from host.materials.authors import read_material, read_materials, read_pickle, write_materials
-from shared.errors import DataError
+from polysight.host.materials import Entry
+from polysight.host.materials.authors import read_material, read_materials, read_pickle, write_materials
+from polysight.shared.errors import DataError
 
 RNG = np.random.default_rng(1)
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from host.cli import main
-from host.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
-from host.materials.models import DISCRIMINANT, MODELS, PAPER
-from host.materials.patches import PATCHES, match_patches, pack_patches, read_patches
-from host.report.assemble import classifier_sentence
-from host.reproduce.patches import Errors, draw, groups
-from shared.errors import DataError
+from polysight.host.cli import main
+from polysight.host.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
+from polysight.host.materials.models import DISCRIMINANT, MODELS, PAPER
+from polysight.host.materials.patches import PATCHES, match_patches, pack_patches, read_patches
+from polysight.host.report.assemble import classifier_sentence
+from polysight.host.reproduce.patches import Errors, draw, groups
+from polysight.shared.errors import DataError
 
 ANGLES = (55.0, 60.0)
 
@@ -175,7 +175,7 @@ def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):
     """It loads for a second or two, which nobody waits for who does not use it."""
     powders.save(tmp_path / "l.npz")
     code = (
-        "import sys; from pathlib import Path; from host.materials import Classifier, Library;"
+        "import sys; from pathlib import Path; from polysight.host.materials import Classifier, Library;"
         f"Classifier(Library.load(Path({str(tmp_path / 'l.npz')!r})), model='discriminant', angles_deg=[55.0]);"
         "sys.exit('sklearn' in sys.modules)"
     )
@@ -183,6 +183,6 @@ def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):
 
 
 def test_every_short_name_is_a_model():
-    from host.materials.models import SHORT
+    from polysight.host.materials.models import SHORT
 
     assert set(SHORT.values()) <= set(MODELS)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from host.materials import Entry, Library
-from host.materials.concentration import Line, concentrations, fit_concentration, polarisation_angle_rad
-from shared.errors import DataError
+from polysight.host.materials import Entry, Library
+from polysight.host.materials.concentration import Line, concentrations, fit_concentration, polarisation_angle_rad
+from polysight.shared.errors import DataError
 
 SUGAR = {"water": 0.0, "sugar (1.3%)": 1.3, "sugar (3.8%)": 3.8, "sugar (5.1%)": 5.1, "sugar (7.4%)": 7.4}
 

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from host.cli import main
-from host.materials import Classifier, Entry, Library
-from host.materials.discriminant import REJECTED, ErrorDiscriminant
-from host.materials.fit import fit_samples
-from host.materials.judge import score, strangers
-from host.materials.knn import fit_weights
-from host.materials.models import DISCRIMINANT, MODELS, PAPER
-from host.materials.samples import Samples, feature_matrix
-from host.report.assemble import classifier_sentence
-from shared.errors import DataError
+from polysight.host.cli import main
+from polysight.host.materials import Classifier, Entry, Library
+from polysight.host.materials.discriminant import REJECTED, ErrorDiscriminant
+from polysight.host.materials.fit import fit_samples
+from polysight.host.materials.judge import score, strangers
+from polysight.host.materials.knn import fit_weights
+from polysight.host.materials.models import DISCRIMINANT, MODELS, PAPER
+from polysight.host.materials.samples import Samples, feature_matrix
+from polysight.host.report.assemble import classifier_sentence
+from polysight.shared.errors import DataError
 
 MEANS = np.array([[-0.6, -2.0, 0.1], [-0.55, -1.9, 0.2], [-0.5, -2.2, 3.1], [-0.4, -1.5, -3.1], [-0.3, -1.2, 0.5]])
 """ln|H|, ln|V| and arg P of five materials; two of them lie on either side of 180 degrees."""
@@ -211,6 +211,6 @@ def test_the_report_and_the_table_of_models_name_what_was_not_judged(tmp_path, m
     told = classifier_sentence(Classifier(library))
     assert "Of its 6 materials 1 could not be judged, because one scan alone holds them: lonely." in told
     library.save(tmp_path / "library.npz")
-    monkeypatch.setattr("host.materials.models.MODELS", {DISCRIMINANT: MODELS[DISCRIMINANT]})
+    monkeypatch.setattr("polysight.host.materials.models.MODELS", {DISCRIMINANT: MODELS[DISCRIMINANT]})
     assert main(["classify", str(tmp_path / "library.npz")]) == 0
     assert "not judged with scans left out, because one scan alone holds them: lonely" in capsys.readouterr().out

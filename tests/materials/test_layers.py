@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.materials.layers import Bands, Layer, LayerFit, Spectrum, fit_layer, predict
-from host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
-from shared.config import load_instrument
-from shared.errors import DataError, PolysightError
+from polysight.host.materials.layers import Bands, Layer, LayerFit, Spectrum, fit_layer, predict
+from polysight.host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError, PolysightError
 
 THETA = np.radians(55.0)
 WATER = 9.37 - 18.0j

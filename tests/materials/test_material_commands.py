@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.cli import main
-from host.material_commands import parse_layer
-from host.materials import Entry, Library
-from host.materials.authors import write_materials
-from host.materials.layers import Layer, Spectrum, predict
-from shared.config import load_instrument
+from polysight.host.cli import main
+from polysight.host.material_commands import parse_layer
+from polysight.host.materials import Entry, Library
+from polysight.host.materials.authors import write_materials
+from polysight.host.materials.layers import Layer, Spectrum, predict
+from polysight.shared.config import load_instrument
 
 RIG = Path(__file__).parents[2] / "instrument.toml"
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)

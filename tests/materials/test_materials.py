@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from host.materials import (
+from polysight.host.materials import (
     UNKNOWN,
     Classifier,
     Library,
@@ -22,11 +22,11 @@ from host.materials import (
     read_truth,
     table2,
 )
-from host.materials.decision import majority
-from host.materials.knn import ratio_distance
-from host.materials.library import FORMAT
-from host.polarimetry import fresnel
-from shared.errors import DataError
+from polysight.host.materials.decision import majority
+from polysight.host.materials.knn import ratio_distance
+from polysight.host.materials.library import FORMAT
+from polysight.host.polarimetry import fresnel
+from polysight.shared.errors import DataError
 
 THETA = np.radians(55.0)
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from host.materials.decision import Model
-from host.materials.judge import best_model, score, splits
-from host.materials.knn import PaperKnn, Weights, fit_weights
-from host.materials.models import DISCRIMINANT, MODELS, OWN_SPREAD, PAPER, SLOW
-from host.materials.samples import CHANNELS, Samples, feature_matrix
-from shared.errors import DataError
+from polysight.host.materials.decision import Model
+from polysight.host.materials.judge import best_model, score, splits
+from polysight.host.materials.knn import PaperKnn, Weights, fit_weights
+from polysight.host.materials.models import DISCRIMINANT, MODELS, OWN_SPREAD, PAPER, SLOW
+from polysight.host.materials.samples import CHANNELS, Samples, feature_matrix
+from polysight.shared.errors import DataError
 
 QUICK = [m for m in MODELS if m != SLOW]
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from host.materials.permittivity import bootstrap_permittivity_std, estimate_permittivity
-from host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
+from polysight.host.materials.permittivity import bootstrap_permittivity_std, estimate_permittivity
+from polysight.host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)
 

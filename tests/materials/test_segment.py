@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from host.materials import (
+from polysight.host.materials import (
     SegmentSettings,
     find_metal,
     metal_by_label,
@@ -16,9 +16,9 @@ from host.materials import (
     truth_labels,
     write_labels,
 )
-from host.materials.segment import box_mask
-from host.materials.truth import match
-from shared.errors import DataError
+from polysight.host.materials.segment import box_mask
+from polysight.host.materials.truth import match
+from polysight.shared.errors import DataError
 
 
 @pytest.mark.parametrize("seed", range(6))

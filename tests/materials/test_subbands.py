@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.imaging import ChannelImages
-from host.imaging.subbands import SubBand
-from host.materials.layers import Bands, Layer, fit_layer
-from host.materials.subbands import band_rows, bands_of_row
-from host.polarimetry import fresnel, ratio_from_permittivity
-from shared.config import load_instrument
+from polysight.host.imaging import ChannelImages
+from polysight.host.imaging.subbands import SubBand
+from polysight.host.materials.layers import Bands, Layer, fit_layer
+from polysight.host.materials.subbands import band_rows, bands_of_row
+from polysight.host.polarimetry import fresnel, ratio_from_permittivity
+from polysight.shared.config import load_instrument
 
 THETA = np.radians(55.0)
 BAND = SubBand((0, 96), 76.3e9, 78.0e9)

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from host.materials.analyse import analyse, smooth_inside
-from host.materials.labels import patches_from_labels, patches_from_plates
-from host.materials.truth import TruthPlate
-from host.polarimetry import fresnel
+from polysight.host.materials.analyse import analyse, smooth_inside
+from polysight.host.materials.labels import patches_from_labels, patches_from_plates
+from polysight.host.materials.truth import TruthPlate
+from polysight.host.polarimetry import fresnel
 
 X_M, Y_M = np.arange(60) * 2e-3, np.arange(40) * 2e-3
 THETA = np.radians(55.0)

@@ -17,9 +17,9 @@ from fake_stage import FakeStage
 from host_side import HostSide
 from mini_hub import MiniHub
 
-from pi_controller.service import Options, Service
-from shared.config import Instrument, load_instrument
-from shared.tables import to_builtins
+from polysight.pi_controller.service import Options, Service
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import to_builtins
 
 ROOT = Path(__file__).parents[2]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable
 
-from pi_controller.trigger_lines import Edge
-from shared.errors import DeviceError
+from polysight.pi_controller.trigger_lines import Edge
+from polysight.shared.errors import DeviceError
 
 
 class FakeLines:

@@ -16,10 +16,10 @@ import time
 import tty
 from pathlib import Path
 
-from shared.errors import PolysightError, ProtocolError
-from shared.faults import StageError
-from shared.stage_line import Command, Immediate, Reply
-from shared.wires import WireClient, WireEdge
+from polysight.shared.errors import PolysightError, ProtocolError
+from polysight.shared.faults import StageError
+from polysight.shared.stage_line import Command, Immediate, Reply
+from polysight.shared.wires import WireClient, WireEdge
 
 STEPS_PER_MM = 200
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import zmq
 
-from shared import messages as m
-from shared.config import Instrument
-from shared.raster import plan_raster
-from shared.sockets import requester, subscriber
+from polysight.shared import messages as m
+from polysight.shared.config import Instrument
+from polysight.shared.raster import plan_raster
+from polysight.shared.sockets import requester, subscriber
 
 LIMIT_S = 60.0
 

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PROGRAM = (sys.executable, "-m", "pi_controller")
+PROGRAM = (sys.executable, "-m", "polysight.pi_controller")
 
 
 class Process:

@@ -8,13 +8,13 @@ import msgspec
 import pytest
 from host_side import HostSide
 
-from pi_controller import service
-from pi_controller.lines_gpiod import GpiodLines
-from pi_controller.lines_gpiomem import GpiomemLines
-from pi_controller.lines_wires import WireLines
-from pi_controller.service import Options, Service
-from shared import messages as m
-from shared.backends import is_simulated
+from polysight.pi_controller import service
+from polysight.pi_controller.lines_gpiod import GpiodLines
+from polysight.pi_controller.lines_gpiomem import GpiomemLines
+from polysight.pi_controller.lines_wires import WireLines
+from polysight.pi_controller.service import Options, Service
+from polysight.shared import messages as m
+from polysight.shared.backends import is_simulated
 
 
 def test_lines_of_pins_are_hardware_and_all_others_are_simulated():

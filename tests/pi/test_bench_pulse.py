@@ -4,9 +4,9 @@ from itertools import pairwise
 
 import pytest
 
-from shared import messages as m
-from shared.faults import PiFault
-from shared.wires import WireClient, WireEdge
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault
+from polysight.shared.wires import WireClient, WireEdge
 
 
 def rises(radar, pulses):

@@ -8,11 +8,11 @@ from fake_lines import FakeLines, gone
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_burst
-from pi_controller.trigger_lines import Edge
-from pi_controller.trigger_loop import BurstSent, Counts, LoopFault, RowJob, TriggerLoop
-from shared.faults import PiFault
-from shared.sync_in import MIN_PERIOD_NS
+from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_burst
+from polysight.pi_controller.trigger_lines import Edge
+from polysight.pi_controller.trigger_loop import BurstSent, Counts, LoopFault, RowJob, TriggerLoop
+from polysight.shared.faults import PiFault
+from polysight.shared.sync_in import MIN_PERIOD_NS
 
 PERIOD = 1_500_000
 SPEC = BurstSpec(16, PERIOD, 1000)

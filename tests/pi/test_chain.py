@@ -16,8 +16,8 @@ from host_side import HostSide
 from processes import ROOT, Process
 from wires_log import WiresLog
 
-from shared import messages as m
-from simulators import gpio, uno
+from polysight.shared import messages as m
+from polysight.simulators import gpio, uno
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing() + uno.missing():
@@ -48,8 +48,18 @@ def board(rig, write_config, tmp_path):
     config, hub = write_config(rig), tmp_path / "wires"
     started = []
     for command in (
-        ["simulators.wires", "--socket", hub],
-        ["simulators.uno", "--config", config, "--wires", hub, "--link", rig.stage.port, "--time-scale", SPEED],
+        ["polysight.simulators.wires", "--socket", hub],
+        [
+            "polysight.simulators.uno",
+            "--config",
+            config,
+            "--wires",
+            hub,
+            "--link",
+            rig.stage.port,
+            "--time-scale",
+            SPEED,
+        ],
     ):
         process = subprocess.Popen(
             [sys.executable, "-m", *map(str, command)], cwd=ROOT, stdout=subprocess.PIPE, text=True

@@ -12,10 +12,10 @@ import msgspec
 import pytest
 from processes import run
 
-from pi_controller import checks
-from pi_controller.checks_lines import check_lines
-from pi_controller.keys import make_keys
-from simulators import gpio
+from polysight.pi_controller import checks
+from polysight.pi_controller.checks_lines import check_lines
+from polysight.pi_controller.keys import make_keys
+from polysight.simulators import gpio
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 replace = msgspec.structs.replace

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.config import load_instrument
+from polysight.shared.config import load_instrument
 
 ROOT = Path(__file__).parents[2]
 PI = ROOT / "pi_controller"

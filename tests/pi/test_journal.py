@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pi_controller import journal as journal_module
-from pi_controller.journal import (
+from polysight.pi_controller import journal as journal_module
+from polysight.pi_controller.journal import (
     CAPTURE_BYTES,
     DAMAGED,
     MAGIC,
@@ -18,9 +18,9 @@ from pi_controller.journal import (
     JournalFolder,
     JournalFullError,
 )
-from pi_controller.ledger import Ledger
-from shared.errors import ConfigError, DataError, DeviceError
-from shared.raster import RasterPlan
+from polysight.pi_controller.ledger import Ledger
+from polysight.shared.errors import ConfigError, DataError, DeviceError
+from polysight.shared.raster import RasterPlan
 
 payloads = st.lists(st.binary(max_size=40), max_size=12)
 

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import msgspec
 
-from pi_controller import journal as journal_module
-from pi_controller.client import replay_events
-from shared import messages as m
-from shared.faults import PiFault
+from polysight.pi_controller import journal as journal_module
+from polysight.pi_controller.client import replay_events
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault
 
 
 def full(*_):

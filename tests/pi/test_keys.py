@@ -9,15 +9,15 @@ import pytest
 import zmq
 from zmq.auth import load_certificate
 
-from pi_controller import checks
-from pi_controller.cli import main
-from pi_controller.finding import attempt
-from pi_controller.keys import COPY, make_keys
-from pi_controller.server import Server
-from shared.config import load_instrument
-from shared.errors import ConfigError
-from shared.sockets import HOST_KEYS, requester
-from shared.tables import decode, to_builtins
+from polysight.pi_controller import checks
+from polysight.pi_controller.cli import main
+from polysight.pi_controller.finding import attempt
+from polysight.pi_controller.keys import COPY, make_keys
+from polysight.pi_controller.server import Server
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.sockets import HOST_KEYS, requester
+from polysight.shared.tables import decode, to_builtins
 
 ROOT = Path(__file__).parents[2]
 ELSEWHERE = "tcp://192.0.2.1:5601"

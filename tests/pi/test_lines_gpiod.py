@@ -8,11 +8,11 @@ pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip in
 from fake_gpiod import FakeChip
 from gpiod import line
 
-from pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_burst
-from pi_controller.lines_gpiod import EVENT_BUFFER, GpiodLines, find_chip, load_gpiod
-from pi_controller.trigger_loop import Counts, RowJob, TriggerLoop
-from shared.errors import DeviceError
-from shared.faults import PiFault
+from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_burst
+from polysight.pi_controller.lines_gpiod import EVENT_BUFFER, GpiodLines, find_chip, load_gpiod
+from polysight.pi_controller.trigger_loop import Counts, RowJob, TriggerLoop
+from polysight.shared.errors import DeviceError
+from polysight.shared.faults import PiFault
 
 SPEC = BurstSpec(4, 1_500_000, 1000)
 

@@ -9,20 +9,20 @@ from fake_lines import FakeLines
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pi_controller.burst import BurstSpec
-from pi_controller.machine import Machine
-from pi_controller.row_ending import Parts
-from pi_controller.rows import RefusedError
-from pi_controller.stage_driver import SILENT_HEARTBEATS, STATUS_PER_HEARTBEAT, read_slice_s
-from pi_controller.states import MOVES
-from pi_controller.supervision import StatusWatch, TriggerWatch
-from pi_controller.trigger_lines import Edge
-from pi_controller.trigger_loop import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop
-from shared import messages as m
-from shared.config import Stage
-from shared.faults import PiFault, StageError
-from shared.raster import Row
-from shared.stage_line import Immediate, Reply
+from polysight.pi_controller.burst import BurstSpec
+from polysight.pi_controller.machine import Machine
+from polysight.pi_controller.row_ending import Parts
+from polysight.pi_controller.rows import RefusedError
+from polysight.pi_controller.stage_driver import SILENT_HEARTBEATS, STATUS_PER_HEARTBEAT, read_slice_s
+from polysight.pi_controller.states import MOVES
+from polysight.pi_controller.supervision import StatusWatch, TriggerWatch
+from polysight.pi_controller.trigger_lines import Edge
+from polysight.pi_controller.trigger_loop import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop
+from polysight.shared import messages as m
+from polysight.shared.config import Stage
+from polysight.shared.faults import PiFault, StageError
+from polysight.shared.raster import Row
+from polysight.shared.stage_line import Immediate, Reply
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)

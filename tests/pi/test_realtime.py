@@ -14,8 +14,8 @@ import msgspec
 import pytest
 from processes import PROGRAM, ROOT, Process
 
-from pi_controller.realtime import OTHERS_PRIORITY, PRIORITY
-from simulators import gpio
+from polysight.pi_controller.realtime import OTHERS_PRIORITY, PRIORITY
+from polysight.simulators import gpio
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing():

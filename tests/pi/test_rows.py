@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.plan.timing import row_motion_s
-from pi_controller.rows import RefusedError, check_pulses, check_run
-from shared import messages as m
-from shared.config import Burst, load_instrument
-from shared.faults import PiFault
-from shared.raster import plan_raster
-from shared.sync_in import MIN_PERIOD_US, WIDTH_US
+from polysight.host.plan.timing import row_motion_s
+from polysight.pi_controller.rows import RefusedError, check_pulses, check_run
+from polysight.shared import messages as m
+from polysight.shared.config import Burst, load_instrument
+from polysight.shared.faults import PiFault
+from polysight.shared.raster import plan_raster
+from polysight.shared.sync_in import MIN_PERIOD_US, WIDTH_US
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 replace = msgspec.structs.replace

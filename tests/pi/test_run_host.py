@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_machine import FakeDriver
 
-from pi_controller.executor import REPLAYED_IN_A_ROW, Executor, Request
-from pi_controller.journal import JournalFolder
-from pi_controller.ledger import Ledger
-from pi_controller.trigger_loop import TriggerLoop
-from shared import messages as m
-from shared.faults import PiFault
-from shared.raster import RasterPlan
-from shared.stage_line import Reply
+from polysight.pi_controller.executor import REPLAYED_IN_A_ROW, Executor, Request
+from polysight.pi_controller.journal import JournalFolder
+from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.trigger_loop import TriggerLoop
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault
+from polysight.shared.raster import RasterPlan
+from polysight.shared.stage_line import Reply
 
 HEARTBEAT_S = 0.1
 LIMIT_S = 4 * HEARTBEAT_S

@@ -6,13 +6,13 @@ import msgspec
 import pytest
 from host_side import HostSide
 
-from host.scan.heartbeat import HostHeartbeat
-from pi_controller.service import Options, Service
-from shared import messages as m
-from shared.errors import DeviceError
-from shared.faults import PiFault, StageError
-from shared.stage_line import Immediate
-from shared.wires import WireClient, WireEdge
+from polysight.host.scan.heartbeat import HostHeartbeat
+from polysight.pi_controller.service import Options, Service
+from polysight.shared import messages as m
+from polysight.shared.errors import DeviceError
+from polysight.shared.faults import PiFault, StageError
+from polysight.shared.stage_line import Immediate
+from polysight.shared.wires import WireClient, WireEdge
 
 
 def test_a_row_is_captured_completely_and_in_order(pi, hub, instrument):
@@ -318,7 +318,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(inst
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr("threading.excepthook", lambda _: None)
-    monkeypatch.setattr("pi_controller.machine.Machine.take_burst", fail)
+    monkeypatch.setattr("polysight.pi_controller.machine.Machine.take_burst", fail)
     service = Service(instrument, Options(wires=hub, stage_port=stage.port))
     with ThreadPoolExecutor(1) as pool:
         served = pool.submit(service.serve)

@@ -5,10 +5,10 @@ import queue
 import pytest
 from fake_stage import FakeStage
 
-from pi_controller.bringup import bench_stage
-from pi_controller.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
-from shared.faults import StageError
-from shared.stage_line import Command, Immediate, Reply
+from polysight.pi_controller.bringup import bench_stage
+from polysight.pi_controller.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
+from polysight.shared.faults import StageError
+from polysight.shared.stage_line import Command, Immediate, Reply
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_a_pulled_cable_is_a_lost_stage(dry_stage):
 def test_no_port_and_another_protocol(tmp_path, dry_stage, monkeypatch):
     with pytest.raises(StageLostError, match="cannot be opened"):
         StageLink(str(tmp_path / "none"), 115200, lambda _: None)
-    monkeypatch.setattr("pi_controller.stage_link.PROTOCOL_VERSION", 9)
+    monkeypatch.setattr("polysight.pi_controller.stage_link.PROTOCOL_VERSION", 9)
     with pytest.raises(StageLostError, match="speaks protocol 1, this program speaks 9"):
         connect(dry_stage)
 

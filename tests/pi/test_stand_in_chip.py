@@ -18,10 +18,10 @@ from host_side import HostSide
 from processes import ROOT, Process, run
 from wires_log import WiresLog
 
-from shared import messages as m
-from shared.faults import PiFault
-from shared.wires import WireEdge
-from simulators import gpio
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault
+from polysight.shared.wires import WireEdge
+from polysight.simulators import gpio
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing():
@@ -218,8 +218,8 @@ import os, sys
 from datetime import timedelta
 from pathlib import Path
 import gpiod, msgspec
-from pi_controller.lines_gpiod import GpiodLines, find_chip
-from shared.config import load_instrument
+from polysight.pi_controller.lines_gpiod import GpiodLines, find_chip
+from polysight.shared.config import load_instrument
 chip = Path(os.environ["GPIOSHIM_CHIP"])
 assert find_chip("pinctrl-bcm2835", gpiod, chip.parent) == str(chip)
 rig = load_instrument(Path("instrument.toml"))

@@ -11,12 +11,12 @@ pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip in
 
 from fake_gpiod import FakeChip
 
-from pi_controller.burst import BurstSpec, send_burst
-from pi_controller.lines_gpiomem import GPCLR0, GPFSEL0, GPSET0, GpiomemLines, GpioRegisters
-from pi_controller.service import open_lines
-from pi_controller.wiring import check_wiring, pi_generation, read_model, skew_in_if_hz
-from shared.config import Pi
-from shared.errors import ConfigError, DeviceError
+from polysight.pi_controller.burst import BurstSpec, send_burst
+from polysight.pi_controller.lines_gpiomem import GPCLR0, GPFSEL0, GPSET0, GpiomemLines, GpioRegisters
+from polysight.pi_controller.service import open_lines
+from polysight.pi_controller.wiring import check_wiring, pi_generation, read_model, skew_in_if_hz
+from polysight.shared.config import Pi
+from polysight.shared.errors import ConfigError, DeviceError
 
 PI_4, PI_5 = "Raspberry Pi 4 Model B Rev 1.4", "Raspberry Pi 5 Model B Rev 1.0"
 LINES = (22, 23, 24)

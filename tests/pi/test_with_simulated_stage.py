@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from host_side import HostSide
 
-from pi_controller.service import Options, Service
-from shared import messages as m
-from shared.faults import PiFault
+from polysight.pi_controller.service import Options, Service
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault
 
-pytest.importorskip("simulators.stage", reason="the simulated stage is not installed")
+pytest.importorskip("polysight.simulators.stage", reason="the simulated stage is not installed")
 ROOT = Path(__file__).parents[2]
 
 
@@ -21,8 +21,8 @@ ROOT = Path(__file__).parents[2]
 def simulated(tmp_path):
     """Wires and stage; gives (hub, port)."""
     hub, port = tmp_path / "w", tmp_path / "tty"
-    wires = ["simulators.wires", "--socket", hub]
-    stage = ["simulators.stage", "--config", "instrument.toml", "--wires", hub, "--link", port]
+    wires = ["polysight.simulators.wires", "--socket", hub]
+    stage = ["polysight.simulators.stage", "--config", "instrument.toml", "--wires", hub, "--link", port]
     stage += ["--time-scale", "30", "--python"]
     processes = []
     for command in (wires, stage):

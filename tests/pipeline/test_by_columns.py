@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import tomli_w
 
-from host.options import Options
-from host.pipeline import Pipeline
-from host.store.authors import open_scan
-from shared.tables import to_builtins
+from polysight.host.options import Options
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.authors import open_scan
+from polysight.shared.tables import to_builtins
 
 from .conftest import COPPER, PET, content, rig_of, scene_of, told_by
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from host.calibration.files import SourceScan
-from host.calibration.metal import write_metal
-from host.metal_scans import load_reference
-from host.store import manifest
-from host.store.scanfolder import MANIFEST
+from polysight.host.calibration.files import SourceScan
+from polysight.host.calibration.metal import write_metal
+from polysight.host.metal_scans import load_reference
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import MANIFEST
 
 from .conftest import EVERYWHERE, content, scene_of, told_by
 

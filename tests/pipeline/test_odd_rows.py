@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from host.pipeline import Pipeline
-from host.report.context import ReportContext
-from host.report.coverage import masked_positions
-from host.store.scanfolder import ScanFolder
-from host.store.source import RowData
+from polysight.host.pipeline import Pipeline
+from polysight.host.report.context import ReportContext
+from polysight.host.report.coverage import masked_positions
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.source import RowData
 
 from .conftest import EVERYWHERE, scene_of
 

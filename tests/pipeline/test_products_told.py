@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 
-from host.many import MARK
-from host.store import manifest
-from host.store.scanfolder import MANIFEST
+from polysight.host.many import MARK
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import MANIFEST
 
 from .conftest import content, told_by
 

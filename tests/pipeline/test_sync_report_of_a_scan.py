@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
-from shared.geometry import rx_positions_m, tx_position_m
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.shared.geometry import rx_positions_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 from .conftest import EVERYWHERE, content, rig_of, scene_of, told_by
 
@@ -33,7 +33,7 @@ def scan(scan_of, tmp_path_factory):
 
 def _believe_programmed(scan):
     """The scan's rig file says what the published one does of the filters."""
-    from host.store import manifest
+    from polysight.host.store import manifest
 
     facts = manifest.read(scan / "manifest.jsonl").facts
     facts[0]["instrument"]["chirp"] |= {"hpf1_khz": 175.0, "hpf2_khz": 350.0}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from host.cli import main
-from host.materials import Library
-from shared.tables import to_builtins
+from polysight.host.cli import main
+from polysight.host.materials import Library
+from polysight.shared.tables import to_builtins
 
 from .conftest import COPPER, PET, rig_of, scene_of, told_by
 

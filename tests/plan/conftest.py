@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument, load_instrument
 
 REPO = Path(__file__).resolve().parents[2]
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from host.imaging import ImageBuilder, backproject
-from host.imaging.facts import board_facts
-from host.imaging.grid import Antennas
-from host.plan import Changes, Noise, field_limits, forecast, propose
-from host.plan.field import PhaseSlope
-from host.plan.forecast import aperture_of, burst_facts, cautions, noise_facts
-from shared.errors import ConfigError
-from shared.geometry import specular_midpoint_m
+from polysight.host.imaging import ImageBuilder, backproject
+from polysight.host.imaging.facts import board_facts
+from polysight.host.imaging.grid import Antennas
+from polysight.host.plan import Changes, Noise, field_limits, forecast, propose
+from polysight.host.plan.field import PhaseSlope
+from polysight.host.plan.forecast import aperture_of, burst_facts, cautions, noise_facts
+from polysight.shared.errors import ConfigError
+from polysight.shared.geometry import specular_midpoint_m
 
 
 def test_without_changes_the_rig_file_stays(rig):

@@ -5,10 +5,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from host.doctor.bench import Bench, Wanted
-from host.doctor.check_library import check_library
-from host.plan import forecast
-from shared.geometry import incidence_deg
+from polysight.host.doctor.bench import Bench, Wanted
+from polysight.host.doctor.check_library import check_library
+from polysight.host.plan import forecast
+from polysight.shared.geometry import incidence_deg
 
 
 def at(rig, distance_mm):

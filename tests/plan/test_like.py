@@ -6,15 +6,15 @@ import json
 
 import pytest
 
-from host.cli import main
-from host.plan import Changes
-from host.store import manifest
-from host.store.events import EventWriter
-from host.store.scanfolder import EVENTS, MANIFEST
-from shared.messages import Capture
-from shared.raster import plan_raster
-from simulators.scene import decode_scene
-from simulators.simulate import simulate
+from polysight.host.cli import main
+from polysight.host.plan import Changes
+from polysight.host.store import manifest
+from polysight.host.store.events import EventWriter
+from polysight.host.store.scanfolder import EVENTS, MANIFEST
+from polysight.shared.messages import Capture
+from polysight.shared.raster import plan_raster
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import simulate
 
 from .conftest import REPO
 

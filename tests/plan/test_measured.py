@@ -10,17 +10,17 @@ import msgspec
 import pytest
 import tomli_w
 
-from host.plan import Changes, Noise
-from host.plan.measured import noise_of, row_overhead_of
-from host.plan.timing import row_motion_s, scan_time, turn_s, whole_packets
-from host.store.events import read_events
-from host.store.scanfolder import EVENTS, ScanFolder
-from shared.config import load_instrument
-from shared.errors import DataError
-from shared.messages import Capture
-from shared.tables import to_builtins
-from simulators.scene import decode_scene
-from simulators.simulate import simulate
+from polysight.host.plan import Changes, Noise
+from polysight.host.plan.measured import noise_of, row_overhead_of
+from polysight.host.plan.timing import row_motion_s, scan_time, turn_s, whole_packets
+from polysight.host.store.events import read_events
+from polysight.host.store.scanfolder import EVENTS, ScanFolder
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError
+from polysight.shared.messages import Capture
+from polysight.shared.tables import to_builtins
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import simulate
 
 
 def small_scan(rig, folder, pulses, snr_db):
@@ -55,13 +55,28 @@ def scanned(rig, tmp_path_factory):
     rig = Changes(columns=13, rows=3, pulses=7, speed_mm_s=40.0).apply(rig)
     rig = msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, centre_x_mm=120.0, centre_y_mm=60.0))
     (folder / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig)))
-    command = [sys.executable, "-m", "simulators.rig", "--config", folder / "rig.toml", "--dir", folder / "rig"]
+    command = [
+        sys.executable,
+        "-m",
+        "polysight.simulators.rig",
+        "--config",
+        folder / "rig.toml",
+        "--dir",
+        folder / "rig",
+    ]
     command += ["--pattern", "--time-scale", "40", "--with-pi"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             ready = process.stdout.readline()
             assert ready.startswith("ready "), ready
-            scan = [sys.executable, "-m", "host.cli", "scan", "--config", ready.removeprefix("ready ").strip()]
+            scan = [
+                sys.executable,
+                "-m",
+                "polysight.host.cli",
+                "scan",
+                "--config",
+                ready.removeprefix("ready ").strip(),
+            ]
             subprocess.run([*scan, "--out", folder / "scan", "--no-process"], check=True, timeout=240)
         finally:
             process.terminate()

@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.plan import Changes, row_motion_s, scan_time, straight_move_s
-from host.plan.timing import TAIL_S, tail_s, turn_s, whole_packets
-from pi_controller.rows import stage_row
-from shared.config import Instrument
-from shared.raster import plan_raster
-from shared.stage_line import Command, Parameter
-from shared.wires import WireEdge
-from simulators.stage_motion import TICK_HZ
-from simulators.stage_python import PythonStage, Rig
+from polysight.host.plan import Changes, row_motion_s, scan_time, straight_move_s
+from polysight.host.plan.timing import TAIL_S, tail_s, turn_s, whole_packets
+from polysight.pi_controller.rows import stage_row
+from polysight.shared.config import Instrument
+from polysight.shared.raster import plan_raster
+from polysight.shared.stage_line import Command, Parameter
+from polysight.shared.wires import WireEdge
+from polysight.simulators.stage_motion import TICK_HZ
+from polysight.simulators.stage_python import PythonStage, Rig
 
 
 class Stage:

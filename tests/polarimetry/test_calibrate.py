@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.polarimetry import (
+from polysight.host.polarimetry import (
     axial_ratio_from_known,
     calibrate,
     calibrate_by_reference,
@@ -19,9 +19,9 @@ from host.polarimetry import (
     smooth,
     specular_incidence_rad,
 )
-from shared.config import load_instrument
-from shared.errors import DataError, PolysightError
-from shared.geometry import incidence_deg, specular_midpoint_m
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError, PolysightError
+from polysight.shared.geometry import incidence_deg, specular_midpoint_m
 
 ROOT = Path(__file__).resolve().parents[2]
 THETA = np.radians(55.0)

@@ -5,9 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.polarimetry import brewster_angle_rad, fresnel, multilayer, permittivity_from_ratio, ratio_from_permittivity
-from shared.errors import PolysightError
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.polarimetry import (
+    brewster_angle_rad,
+    fresnel,
+    multilayer,
+    permittivity_from_ratio,
+    ratio_from_permittivity,
+)
+from polysight.shared.errors import PolysightError
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 real_part = st.floats(1.05, 60.0)
 loss = st.floats(0.0, 40.0)

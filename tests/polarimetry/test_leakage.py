@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.polarimetry import (
+from polysight.host.polarimetry import (
     Leakage,
     Standard,
     common_direction,
@@ -14,10 +14,10 @@ from host.polarimetry import (
     leakage_from_images,
     strips_wave,
 )
-from host.polarimetry.leakage import PLATE
-from shared.errors import DataError, PolysightError
-from simulators.fresnel import strips
-from simulators.scene import decode_scene
+from polysight.host.polarimetry.leakage import PLATE
+from polysight.shared.errors import DataError, PolysightError
+from polysight.simulators.fresnel import strips
+from polysight.simulators.scene import decode_scene
 
 THETA = np.radians(55.0)
 UPRIGHT, LYING = 0.0, np.pi / 2

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.polarimetry import fresnel, plane_reference
-from shared.errors import DataError
+from polysight.host.polarimetry import fresnel, plane_reference
+from polysight.shared.errors import DataError
 
 THETA = np.radians(55.0)
 X, Y = np.arange(60) * 2e-3, np.arange(50) * 2e-3

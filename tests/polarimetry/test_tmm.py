@@ -10,8 +10,8 @@ import tmm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.polarimetry import fresnel, multilayer
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.polarimetry import fresnel, multilayer
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 media = st.tuples(st.floats(1.0, 12.0), st.floats(0.0, 20.0)).map(lambda e: complex(e[0], -e[1]))
 lossless = st.floats(1.0, 12.0).map(complex)

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from host.preview.serve import server
-from host.preview.server import make_app
-from host.preview.watch import Watch
-from host.scan.control import ALIVE, CONTROL
-from host.store import manifest
-from host.store.scanfolder import EVENTS, MANIFEST, utc_now
+from polysight.host.preview.serve import server
+from polysight.host.preview.server import make_app
+from polysight.host.preview.watch import Watch
+from polysight.host.scan.control import ALIVE, CONTROL
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import EVENTS, MANIFEST, utc_now
 
 LIMIT_S = 60.0
 

@@ -9,13 +9,13 @@ import pytest
 from looking import wait_for
 from small_scan import SmallScan
 
-from host.scan import run as host_run
-from host.scan.control import ALIVE, CONTROL, ControlDesk, Wish, ask, last_sign_of_life
-from host.scan.stop import StopRequest
-from host.store import manifest
-from host.store.scanfolder import MANIFEST, ScanFolder
-from host.store.validate import validate
-from shared.errors import ScanError
+from polysight.host.scan import run as host_run
+from polysight.host.scan.control import ALIVE, CONTROL, ControlDesk, Wish, ask, last_sign_of_life
+from polysight.host.scan.stop import StopRequest
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.errors import ScanError
 
 
 @pytest.fixture

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.preview.follow import EventTail, ManifestTail
-from host.store import manifest
-from host.store.events import read_events
-from host.store.scanfolder import EVENTS, MANIFEST
+from polysight.host.preview.follow import EventTail, ManifestTail
+from polysight.host.store import manifest
+from polysight.host.store.events import read_events
+from polysight.host.store.scanfolder import EVENTS, MANIFEST
 
 CUTS = st.lists(st.floats(0, 1), max_size=12)
 

@@ -16,11 +16,11 @@ import zmq
 from looking import wait_for
 from zmq.utils.monitor import recv_monitor_message
 
-from host.preview.listener import PiListener
-from shared import messages as m
-from shared.config import load_instrument
-from shared.raster import plan_raster
-from shared.sockets import EVENT_TOPIC, publisher
+from polysight.host.preview.listener import PiListener
+from polysight.shared import messages as m
+from polysight.shared.config import load_instrument
+from polysight.shared.raster import plan_raster
+from polysight.shared.sockets import EVENT_TOPIC, publisher
 
 RIG = load_instrument(Path(__file__).resolve().parents[2] / "instrument.toml")
 OF = {"scan_id": "mine", "t_mono_ns": 1}
@@ -114,7 +114,7 @@ def test_without_keys_the_view_is_deaf_and_says_so(tmp_path):
 LOOKER = """
 import sys, zmq
 from pathlib import Path
-from shared.sockets import observer
+from polysight.shared.sockets import observer
 socket = observer(zmq.Context(), sys.argv[1], Path())
 while True:
     socket.recv_multipart()

@@ -9,10 +9,10 @@ import pytest
 from chromium import DESK, PHONE, Browser
 from looking import LIMIT_S, GrowingScan, served, wait_for
 
-from host.scan.control import ALIVE, CONTROL, ControlDesk
-from host.scan.stop import StopRequest
-from shared.config import load_instrument
-from simulators.loopback import on_free_subnet
+from polysight.host.scan.control import ALIVE, CONTROL, ControlDesk
+from polysight.host.scan.stop import StopRequest
+from polysight.shared.config import load_instrument
+from polysight.simulators.loopback import on_free_subnet
 
 REPO = Path(__file__).resolve().parents[2]
 TOKEN = "0123456789"

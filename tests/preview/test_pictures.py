@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from host.imaging import ChannelImages
-from host.preview.pictures import PHASE, colour_bar, draw
-from host.preview.rows import range_profile_db
-from host.sync.chain import SyncedRow
-from shared.config import load_instrument
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.imaging import ChannelImages
+from polysight.host.preview.pictures import PHASE, colour_bar, draw
+from polysight.host.preview.rows import range_profile_db
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.config import load_instrument
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 NY, NX = 8, 11
 REPO = Path(__file__).resolve().parents[2]

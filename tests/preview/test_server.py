@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from looking import LIMIT_S, served, wait_for
 
-from host.cli import build_parser
-from host.preview.serve import is_loopback
-from host.preview.server import STATIC, TOKEN_HEADER
-from host.scan.control import ALIVE, CONTROL, ControlDesk, Wish
-from host.scan.stop import StopRequest
+from polysight.host.cli import build_parser
+from polysight.host.preview.serve import is_loopback
+from polysight.host.preview.server import STATIC, TOKEN_HEADER
+from polysight.host.scan.control import ALIVE, CONTROL, ControlDesk, Wish
+from polysight.host.scan.stop import StopRequest
 
 TOKEN = "the-right-token"
 

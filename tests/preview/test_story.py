@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from host.preview.snapshot import remaining
-from host.preview.story import Story, seconds
-from host.store import manifest
-from host.store.events import read_events
-from host.store.scanfolder import EVENTS, MANIFEST, ScanFolder
-from shared.messages import Capture, Fault
+from polysight.host.preview.snapshot import remaining
+from polysight.host.preview.story import Story, seconds
+from polysight.host.store import manifest
+from polysight.host.store.events import read_events
+from polysight.host.store.scanfolder import EVENTS, MANIFEST, ScanFolder
+from polysight.shared.messages import Capture, Fault
 
 UTC = "2026-05-01T02:{:02d}:{:02d}.000+00:00"
 

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from host.preview.listener import Heard
-from host.preview.rows import Shown
-from host.preview.story import Story
-from host.preview.verdict import Signs, judge, no_scan
-from host.preview.words import of_fault
-from host.scan.control import Wish
-from host.store import manifest
-from host.store.scanfolder import MANIFEST
-from shared.faults import EXPLANATIONS, PiFault
-from shared.messages import Fault
+from polysight.host.preview.listener import Heard
+from polysight.host.preview.rows import Shown
+from polysight.host.preview.story import Story
+from polysight.host.preview.verdict import Signs, judge, no_scan
+from polysight.host.preview.words import of_fault
+from polysight.host.scan.control import Wish
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import MANIFEST
+from polysight.shared.faults import EXPLANATIONS, PiFault
+from polysight.shared.messages import Fault
 
 FOLDER = Path("scans/one")
 LIVELY = Signs(alive=True, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)

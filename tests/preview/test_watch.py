@@ -8,10 +8,10 @@ import shutil
 import pytest
 from looking import LIMIT_S, GrowingScan, wait_for
 
-from host.pipeline import Pipeline
-from host.preview.pictures import draw
-from host.preview.watch import Watch
-from host.store.scanfolder import ScanFolder
+from polysight.host.pipeline import Pipeline
+from polysight.host.preview.pictures import draw
+from polysight.host.preview.watch import Watch
+from polysight.host.store.scanfolder import ScanFolder
 
 
 def told(watch: Watch) -> dict:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from host.cli import build_parser, main
-from host.cli_options import joined
-from host.options import LIBRARY
-from host.report import write_json
+from polysight.host.cli import build_parser, main
+from polysight.host.cli_options import joined
+from polysight.host.options import LIBRARY
+from polysight.host.report import write_json
 
 REPO = Path(__file__).resolve().parents[2]
 E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from host.cli import main
-from host.materials import Library
-from host.options import LIBRARY
-from host.store import manifest
-from host.store.scanfolder import MANIFEST, ScanFolder
-from shared.config import load_instrument
-from shared.tables import to_builtins
-from simulators.scene import load_scene
-from simulators.simulate import simulate
+from polysight.host.cli import main
+from polysight.host.materials import Library
+from polysight.host.options import LIBRARY
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.shared.config import load_instrument
+from polysight.shared.tables import to_builtins
+from polysight.simulators.scene import load_scene
+from polysight.simulators.simulate import simulate
 
 REPO = Path(__file__).resolve().parents[2]
 RIG = REPO / "instrument.toml"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from host import products_folder
-from host.products_folder import check_products_folder, making_products
-from host.report import write_json
-from shared.errors import ConfigError, DataError, DeviceError
+from polysight.host import products_folder
+from polysight.host.products_folder import check_products_folder, making_products
+from polysight.host.report import write_json
+from polysight.shared.errors import ConfigError, DataError, DeviceError
 
 OLD = {"image.npz": b"old", "report.html": b"old page", "figures/h.png": b"old h", "figures/p.png": b"old p"}
 NEW = {"image.npz": b"new", "quality.json": b"{}", "figures/h.png": b"new h"}

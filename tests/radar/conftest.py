@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from shared.config import Instrument, NativeRadar, Radar, load_instrument
-from simulators.radar_board import FUNCTIONAL, RadarBoard
+from polysight.shared.config import Instrument, NativeRadar, Radar, load_instrument
+from polysight.simulators.radar_board import FUNCTIONAL, RadarBoard
 
 RIG_FILE = Path(__file__).resolve().parents[2] / "instrument.toml"
 

@@ -6,13 +6,13 @@ import struct
 
 import pytest
 
-from host.radar.board import TRANSITIONS, RadarBoard, State
-from host.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameControl
-from host.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
-from host.radar.program import program
-from shared.errors import DeviceError
-from simulators import radar_board as simulated
-from simulators.radar_board import Fault
+from polysight.host.radar.board import TRANSITIONS, RadarBoard, State
+from polysight.host.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameControl
+from polysight.host.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
+from polysight.host.radar.program import program
+from polysight.shared.errors import DeviceError
+from polysight.simulators import radar_board as simulated
+from polysight.simulators.radar_board import Fault
 
 FRAMES = 32
 PERIOD_S = 1.5e-3

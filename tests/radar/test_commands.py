@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.radar.commands import (
+from polysight.host.radar.commands import (
     GET_MAIN_VERSION,
     GET_RF_VERSION,
     GET_TEMPERATURES,
@@ -42,8 +42,8 @@ from host.radar.commands import (
     slope_code,
     start_code,
 )
-from host.radar.firmware import file_chunks
-from host.radar.messages import command, decode, encode
+from polysight.host.radar.firmware import file_chunks
+from polysight.host.radar.messages import command, decode, encode
 
 PUBLISHED = Profile(76.01e9, 38.816929e12, 100.0, 7.0, 128.5, 256, 2.15e6, 175.0, 350.0, 30, 30)
 OTHER = Profile(76.01087e9, 38.816929e12, 100.0, 6.5, 128.5, 512, 5e6, 350.0, 2800.0, 40, 36, 3)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from host.radar.board import RadarBoard, State
-from host.radar.commands import Chirp, LdoBypass, LowPower
-from host.radar.program import program
-from host.radar.spi import Link
-from shared.errors import DeviceError
-from simulators.radar_board import Fault
-from simulators.radar_board import RadarBoard as Simulated
+from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.commands import Chirp, LdoBypass, LowPower
+from polysight.host.radar.program import program
+from polysight.host.radar.spi import Link
+from polysight.shared.errors import DeviceError
+from polysight.simulators.radar_board import Fault
+from polysight.simulators.radar_board import RadarBoard as Simulated
 
 from .conftest import BoardWords, VirtualClock, native_rig
 

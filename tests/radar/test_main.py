@@ -1,4 +1,4 @@
-"""`python -m host.radar`: the plan without a board, and its refusals."""
+"""`python -m polysight.host.radar`: the plan without a board, and its refusals."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import msgspec
 import pytest
 import tomli_w
 
-from host.radar.__main__ import main
-from host.radar.messages import decode
-from host.radar.program import program
-from shared.tables import to_builtins
+from polysight.host.radar.__main__ import main
+from polysight.host.radar.messages import decode
+from polysight.host.radar.program import program
+from polysight.shared.tables import to_builtins
 
 
 @pytest.fixture
@@ -45,14 +45,14 @@ def test_a_broken_constraint_shows_in_the_plan_and_keeps_boards_untouched(rig, r
     path = rig_file(msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=31)))
     assert run(monkeypatch, "plan", path) == 0
     assert "BROKEN  RX gain step" in capsys.readouterr().out
-    monkeypatch.setattr("host.radar.__main__.open_board", lambda serial: pytest.fail(f"{serial} was opened"))
+    monkeypatch.setattr("polysight.host.radar.__main__.open_board", lambda serial: pytest.fail(f"{serial} was opened"))
     assert run(monkeypatch, "check", path, "RH") == 2
     assert "RX gain step" in capsys.readouterr().err
 
 
 def test_a_board_is_checked_and_gets_firmware(rig_file, words, board, clock, monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("host.radar.__main__.open_board", lambda serial: words if serial == "FTRH" else None)
-    monkeypatch.setattr("host.radar.__main__.SystemClock", lambda: clock)
+    monkeypatch.setattr("polysight.host.radar.__main__.open_board", lambda serial: words if serial == "FTRH" else None)
+    monkeypatch.setattr("polysight.host.radar.__main__.SystemClock", lambda: clock)
     board.patch = False
     assert run(monkeypatch, "check", rig_file(), "RH") == 5
     assert "no patch" in capsys.readouterr().err

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from host.radar.board import RadarBoard, State
-from host.radar.mpsse import UsbWords, read_words, set_up_spi, write_words
-from host.radar.program import program
-from shared.errors import DeviceError
-from simulators import radar_board as simulated
-from simulators.radar_usb import UsbChip
+from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.mpsse import UsbWords, read_words, set_up_spi, write_words
+from polysight.host.radar.program import program
+from polysight.shared.errors import DeviceError
+from polysight.simulators import radar_board as simulated
+from polysight.simulators.radar_usb import UsbChip
 
 
 @pytest.fixture

@@ -7,15 +7,15 @@ import json
 import msgspec
 import pytest
 
-from host.radar.backends import radar_control
-from host.radar.interface import RadarState
-from host.radar.native import NativeRadars
-from host.store.manifest import decode_line, encode_line
-from shared.config import Instrument, NativeRadar, Radar
-from shared.errors import ConfigError, DeviceError
-from shared.tables import decode, to_builtins
-from simulators.radar_board import RadarBoard
-from simulators.radar_usb import UsbChip
+from polysight.host.radar.backends import radar_control
+from polysight.host.radar.interface import RadarState
+from polysight.host.radar.native import NativeRadars
+from polysight.host.store.manifest import decode_line, encode_line
+from polysight.shared.config import Instrument, NativeRadar, Radar
+from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.radar_board import RadarBoard
+from polysight.simulators.radar_usb import UsbChip
 from tests.radar.conftest import BoardWords
 
 PERIOD_S = 1.5e-3
@@ -137,7 +137,7 @@ def test_a_board_that_fails_at_the_start_closes_the_others(rig, clock, boards):
 
 
 def test_three_boards_behind_usb(rig, clock, boards):
-    from host.radar.mpsse import UsbWords
+    from polysight.host.radar.mpsse import UsbWords
 
     chips = {s: UsbChip(b) for s, b in boards.by_serial.items()}
     with NativeRadars(
@@ -161,6 +161,8 @@ def test_the_rig_file_must_name_every_board_and_each_serial_once(rig):
 
 
 def test_the_backend_is_chosen_by_the_rig_file(rig, monkeypatch):
-    monkeypatch.setattr("host.radar.native.NativeRadars.__init__", lambda self, rig: setattr(self, "rig", rig))
+    monkeypatch.setattr(
+        "polysight.host.radar.native.NativeRadars.__init__", lambda self, rig: setattr(self, "rig", rig)
+    )
     made = radar_control(rig)
     assert isinstance(made, NativeRadars)

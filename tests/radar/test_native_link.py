@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from host.radar.interface import RadarState
-from host.radar.native import NativeRadars
-from shared.errors import DeviceError
-from simulators.radar_board import RadarBoard
+from polysight.host.radar.interface import RadarState
+from polysight.host.radar.native import NativeRadars
+from polysight.shared.errors import DeviceError
+from polysight.simulators.radar_board import RadarBoard
 from tests.radar.conftest import BoardWords
 
 FRAMES = 24
@@ -104,7 +104,7 @@ def test_a_link_that_stays_away_is_a_fault_of_that_board_until_it_is_back(radars
 
 def test_a_fatal_event_while_arming_is_no_error_of_the_scan(radars, usb, monkeypatch):
     """The board faults as it is told to start; told a second time it does what it should."""
-    from host.radar import board as boards
+    from polysight.host.radar import board as boards
 
     arm, failed = boards.RadarBoard.arm, []
 

@@ -12,18 +12,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.radar.board import RadarBoard, State
-from host.radar.native import open_board
-from host.radar.program import program
-from host.radar.spi import SystemClock
-from host.radar.validator import constraints
-from shared.config import load_instrument
-from shared.errors import DeviceError
-from simulators.radar import SimulatedRig
-from simulators.radar_board import RadarBoard as Simulated
-from simulators.radar_socket import RadarSocket
-from simulators.rig import derive
-from simulators.scene import decode_scene
+from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.native import open_board
+from polysight.host.radar.program import program
+from polysight.host.radar.spi import SystemClock
+from polysight.host.radar.validator import constraints
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DeviceError
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.radar_board import RadarBoard as Simulated
+from polysight.simulators.radar_socket import RadarSocket
+from polysight.simulators.rig import derive
+from polysight.simulators.scene import decode_scene
 
 from .conftest import RIG_FILE
 

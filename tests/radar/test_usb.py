@@ -8,9 +8,9 @@ from types import ModuleType
 
 import pytest
 
-from host.radar.mpsse import set_up_interrupt, set_up_spi
-from host.radar.usb import PRODUCT, VENDOR, open_usb
-from shared.errors import ConfigError, DeviceError
+from polysight.host.radar.mpsse import set_up_interrupt, set_up_spi
+from polysight.host.radar.usb import PRODUCT, VENDOR, open_usb
+from polysight.shared.errors import ConfigError, DeviceError
 
 
 class FakeFtdi:
@@ -125,4 +125,4 @@ def test_without_pyftdi_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyftdi.ftdi", None)
     with pytest.raises(ConfigError, match="pyftdi") as caught:
         open_usb("FT1")
-    assert "polysight-host[radar]" in str(caught.value)
+    assert "polysight[radar]" in str(caught.value)

@@ -7,10 +7,10 @@ import math
 import msgspec
 import pytest
 
-from host.radar.validator import constraints, direct_if_hz, require
-from shared.config import Instrument, NativeRadar
-from shared.errors import ConfigError
-from shared.geometry import direct_path_m
+from polysight.host.radar.validator import constraints, direct_if_hz, require
+from polysight.shared.config import Instrument, NativeRadar
+from polysight.shared.errors import ConfigError
+from polysight.shared.geometry import direct_path_m
 
 FRAMES = 5600
 
@@ -82,7 +82,7 @@ def test_frame_counts(rig, frames, holds):
 
 
 def test_pulse_gap(rig, monkeypatch):
-    monkeypatch.setattr("host.radar.program.TRIGGER_MARGIN_US", 149.0)
+    monkeypatch.setattr("polysight.host.radar.program.TRIGGER_MARGIN_US", 149.0)
     assert broken(rig) == {"pulse gap"}
 
 

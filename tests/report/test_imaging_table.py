@@ -1,5 +1,5 @@
-from host.report.imaging import imaging_table
-from host.report.quality import quality_tables
+from polysight.host.report.imaging import imaging_table
+from polysight.host.report.quality import quality_tables
 
 BOARD = {
     "masked_positions": 12,

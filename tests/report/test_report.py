@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from host.quality import masked_runs
-from host.report import (
+from polysight.host.quality import masked_runs
+from polysight.host.report import (
     ReportContext,
     banner_png,
     plain,
@@ -21,12 +21,12 @@ from host.report import (
     write_json,
     write_report,
 )
-from host.report.coverage import coverage_figure, masked_positions
-from host.report.figures import colours_of, png
-from host.report.quality import pretty, text
-from host.report.report import render
-from shared.errors import DataError
-from shared.raster import RasterPlan
+from polysight.host.report.coverage import coverage_figure, masked_positions
+from polysight.host.report.figures import colours_of, png
+from polysight.host.report.quality import pretty, text
+from polysight.host.report.report import render
+from polysight.shared.errors import DataError
+from polysight.shared.raster import RasterPlan
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from host.imaging import ChannelImages
-from host.report.scan_facts import SCAN, write_scan_facts
-from shared.config import load_instrument
-from shared.tables import decode, to_builtins
+from polysight.host.imaging import ChannelImages
+from polysight.host.report.scan_facts import SCAN, write_scan_facts
+from polysight.shared.config import load_instrument
+from polysight.shared.tables import decode, to_builtins
 
 
 @pytest.fixture

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.cli import main
-from host.materials import Library, knn, table2
-from host.polarimetry import ratio_from_permittivity
-from host.reproduce import authors_items
-from host.reproduce.authors import text_of
-from host.reproduce.authors_data import IMAGES, LABELS, MATERIALS, read_authors
-from host.reproduce.authors_items import Judgements, authors_fig20, paired, repeated, task_samples
-from host.reproduce.authors_names import read_names, row_of
-from host.reproduce.authors_table2 import authors_recipe, without_leakage
-from host.reproduce.item import Table
-from shared.errors import DataError
-from simulators.authors_forms import Errors, Material, write_labels, write_material
+from polysight.host.cli import main
+from polysight.host.materials import Library, knn, table2
+from polysight.host.polarimetry import ratio_from_permittivity
+from polysight.host.reproduce import authors_items
+from polysight.host.reproduce.authors import text_of
+from polysight.host.reproduce.authors_data import IMAGES, LABELS, MATERIALS, read_authors
+from polysight.host.reproduce.authors_items import Judgements, authors_fig20, paired, repeated, task_samples
+from polysight.host.reproduce.authors_names import read_names, row_of
+from polysight.host.reproduce.authors_table2 import authors_recipe, without_leakage
+from polysight.host.reproduce.item import Table
+from polysight.shared.errors import DataError
+from polysight.simulators.authors_forms import Errors, Material, write_labels, write_material
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
 ERRORS = Errors(0.004, 0.01, leakage=0.05)

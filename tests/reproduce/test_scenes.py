@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.polarimetry import specular_incidence_rad
-from host.reproduce import catalogue
-from host.reproduce.front_on import front_on
-from host.reproduce.images import FIG13_DISTANCE_MM, PLACES_MM
-from host.reproduce.item import Run
-from host.reproduce.location import APART_MM, REACH_MM, places
-from host.reproduce.receiver import tones
-from host.reproduce.scenes import plate, scanned
-from shared.config import load_instrument
-from shared.errors import ScanError
+from polysight.host.polarimetry import specular_incidence_rad
+from polysight.host.reproduce import catalogue
+from polysight.host.reproduce.front_on import front_on
+from polysight.host.reproduce.images import FIG13_DISTANCE_MM, PLACES_MM
+from polysight.host.reproduce.item import Run
+from polysight.host.reproduce.location import APART_MM, REACH_MM, places
+from polysight.host.reproduce.receiver import tones
+from polysight.host.reproduce.scenes import plate, scanned
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ScanError
 
 RIG = Path(__file__).parents[2] / "instrument.toml"
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import zmq
 
-from shared import messages as m
-from shared.config import Board, Instrument, load_instrument
-from shared.raster import Row
-from shared.tables import decode, to_builtins
-from simulators.loopback import on_free_subnet
+from polysight.shared import messages as m
+from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.raster import Row
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.loopback import on_free_subnet
 
 REPO = Path(__file__).resolve().parents[2]
 FULL = 1456

@@ -6,7 +6,7 @@ import struct
 import threading
 import time
 
-from shared.config import Board
+from polysight.shared.config import Board
 
 from .conftest import FULL, FakeCard, payload_of
 

@@ -10,7 +10,9 @@ def receivers() -> list[int]:
     """Their process ids, in the order of the recorded boards."""
     children = Path(f"/proc/self/task/{threading.main_thread().native_id}/children").read_text().split()
     return sorted(
-        int(pid) for pid in children if b"host.capture.receiver_process" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        int(pid)
+        for pid in children
+        if b"polysight.host.capture.receiver_process" in Path(f"/proc/{pid}/cmdline").read_bytes()
     )
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from host.capture.dca1000 import Code
-from host.scan.capture_rig import CaptureRig
-from host.scan.run import run_scan
-from host.store.validate import validate
+from polysight.host.capture.dca1000 import Code
+from polysight.host.scan.capture_rig import CaptureRig
+from polysight.host.scan.run import run_scan
+from polysight.host.store.validate import validate
 
 from .conftest import FULL, FakeRig
 from .late_card import LateCard

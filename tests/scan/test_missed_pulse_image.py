@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.pipeline import Pipeline
-from host.scan.missed_pulses import place_frames
-from host.store.scanfolder import ScanFolder
-from host.store.source import RowData
-from shared.config import load_instrument
-from simulators.scene import load_scene
-from simulators.simulate import simulate
+from polysight.host.pipeline import Pipeline
+from polysight.host.scan.missed_pulses import place_frames
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.source import RowData
+from polysight.shared.config import load_instrument
+from polysight.simulators.scene import load_scene
+from polysight.simulators.simulate import simulate
 from tests.small_scene import small_scene
 
 from .arrival_model import PAYLOAD, Load, pulse_times, receive

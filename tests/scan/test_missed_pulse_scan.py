@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.scan.run import run_scan
-from host.store.validate import validate
+from polysight.host.scan.run import run_scan
+from polysight.host.store.validate import validate
 
 POINTS, PULSES = 8, 6
 

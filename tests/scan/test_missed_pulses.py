@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.capture.receiver import ReceiverProcess
-from host.capture.segment import read_index, write_index
-from host.scan.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from host.scan.slipped_row import describe, write_in_place
+from polysight.host.capture.receiver import ReceiverProcess
+from polysight.host.capture.segment import read_index, write_index
+from polysight.host.scan.missed_pulses import PlacedFrames, place_frames, slipped_frames
+from polysight.host.scan.slipped_row import describe, write_in_place
 
 from .arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
 
@@ -154,7 +154,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
 
 
 def _capture(expected, holes):
-    from host.capture.receiver_words import RowCapture
+    from polysight.host.capture.receiver_words import RowCapture
 
     zeros = dict.fromkeys(RowCapture.__struct_fields__, 0)
     return RowCapture(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from host.scan.pi_stage import UNTOLD
-from host.scan.run import resume_scan, run_scan
-from host.scan.stop import StopRequest
-from host.store.scanfolder import ScanFolder
-from shared.errors import ScanError
+from polysight.host.scan.pi_stage import UNTOLD
+from polysight.host.scan.run import resume_scan, run_scan
+from polysight.host.scan.stop import StopRequest
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.errors import ScanError
 
 
 @pytest.mark.parametrize("key", ["steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2"])

@@ -7,8 +7,8 @@ import re
 
 from rich.console import Console
 
-from host.progress import ScanBar
-from host.scan.run import ScanProgress
+from polysight.host.progress import ScanBar
+from polysight.host.scan.run import ScanProgress
 
 ROWS = 20
 

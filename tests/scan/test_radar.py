@@ -12,16 +12,16 @@ import time
 import msgspec
 import pytest
 
-from host.radar.backends import Endless, radar_control
-from host.radar.interface import BoardState, RadarControl, RadarState
-from host.radar.line_server import LINE, LineServers
-from host.scan.run import run_scan
-from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, Radar
-from shared.errors import ConfigError, DeviceError, ScanError
-from shared.tables import decode, to_builtins
-from simulators.card_faults import Faults
-from simulators.line_server import LineServer
+from polysight.host.radar.backends import Endless, radar_control
+from polysight.host.radar.interface import BoardState, RadarControl, RadarState
+from polysight.host.radar.line_server import LINE, LineServers
+from polysight.host.scan.run import run_scan
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import Instrument, Radar
+from polysight.shared.errors import ConfigError, DeviceError, ScanError
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.card_faults import Faults
+from polysight.simulators.line_server import LineServer
 
 
 class Server:
@@ -120,8 +120,8 @@ def test_unknown_host_is_named():
 
 HALF_OPEN = """
 import socket, subprocess
-from host.radar.line_server import LineServers
-from shared.errors import DeviceError
+from polysight.host.radar.line_server import LineServers
+from polysight.shared.errors import DeviceError
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 listener = socket.create_server(("127.0.0.1", 5000))
 radars = LineServers({"RH": "127.0.0.1:5000"}, 0.5)

@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 
-from host.doctor.check_disk import check_time
-from host.plan.forecast import forecast
-from host.scan import ready
-from host.scan.ready import check_disk, make_ready
-from host.scan.stop import StopRequest
-from shared.errors import ScanError
-from shared.faults import PiFault
-from shared.stage_line import HOMING_LIMIT_S
+from polysight.host.doctor.check_disk import check_time
+from polysight.host.plan.forecast import forecast
+from polysight.host.scan import ready
+from polysight.host.scan.ready import check_disk, make_ready
+from polysight.host.scan.stop import StopRequest
+from polysight.shared.errors import ScanError
+from polysight.shared.faults import PiFault
+from polysight.shared.stage_line import HOMING_LIMIT_S
 
 
 class HomingPi:
@@ -65,7 +65,7 @@ def test_a_pi_that_never_ends_homing_is_not_waited_for_for_ever(monkeypatch):
 
 
 def test_the_machine_and_the_host_wait_by_the_same_limit():
-    from pi_controller import bringup, machine
+    from polysight.pi_controller import bringup, machine
 
     assert machine.HOMING_LIMIT_S == bringup.MOTION_LIMIT_S == HOMING_LIMIT_S < ready._HOMING_LIMIT_S
 

@@ -7,9 +7,9 @@ import struct
 import msgspec
 import pytest
 
-from host.scan.run import run_scan
-from host.store.scanfolder import ScanFolder
-from shared.errors import DeviceError
+from polysight.host.scan.run import run_scan
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.errors import DeviceError
 
 DDR_FULL, LVDS_BUFFER_FULL = 1 << 7, 1 << 9
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from host.capture import receiver_words
-from host.capture.dca1000 import Code
-from host.radar.interface import RadarControl, RadarState
-from host.scan.states import TRANSITIONS, RowState, RowTransaction
-from shared import messages
-from shared.config import Radar
-from shared.errors import ScanError
+from polysight.host.capture import receiver_words
+from polysight.host.capture.dca1000 import Code
+from polysight.host.radar.interface import RadarControl, RadarState
+from polysight.host.scan.states import TRANSITIONS, RowState, RowTransaction
+from polysight.shared import messages
+from polysight.shared.config import Radar
+from polysight.shared.errors import ScanError
 
 SPEC = (Path(__file__).resolve().parents[2] / "docs/spec/row.md").read_text(encoding="utf-8")
 

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import tomli_w
 
-from host.scan.run import resume_scan, run_scan
-from host.scan.running import takes_so_far
-from host.scan.stop import StopRequest
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared.errors import DeviceError, ScanError
-from shared.tables import to_builtins
+from polysight.host.scan.run import resume_scan, run_scan
+from polysight.host.scan.running import takes_so_far
+from polysight.host.scan.stop import StopRequest
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.errors import DeviceError, ScanError
+from polysight.shared.tables import to_builtins
 
 
 def digests(scan: ScanFolder) -> dict[str, str]:
@@ -205,8 +205,8 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, payload, tmp_path):
     """SIGKILL within row 2, of which half has come. The Pi goes on and ends the row; that end is not the new take's."""
     (tmp_path / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     code = (
-        "import sys\nfrom pathlib import Path\nfrom shared.config import load_instrument\n"
-        "from host.scan.run import run_scan\nrun_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
+        "import sys\nfrom pathlib import Path\nfrom polysight.shared.config import load_instrument\n"
+        "from polysight.host.scan.run import run_scan\nrun_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
     )
     rig.pi.hang_at = {2}
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "rig.toml"), str(tmp_path / "s")]) as host:

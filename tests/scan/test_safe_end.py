@@ -16,19 +16,19 @@ import msgspec
 import pytest
 import tomli_w
 
-from host import live, progress
-from host.options import Options
-from host.scan import running
-from host.scan.pi_client import PiClient
-from host.scan.ready import make_ready
-from host.scan.run import resume_scan, run_scan
-from host.scan.stop import StopRequest, hangups_pass
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared import messages as m
-from shared.errors import DeviceError, PolysightError, ScanError, os_error
-from shared.faults import explain
-from shared.tables import to_builtins
+from polysight.host import live, progress
+from polysight.host.options import Options
+from polysight.host.scan import running
+from polysight.host.scan.pi_client import PiClient
+from polysight.host.scan.ready import make_ready
+from polysight.host.scan.run import resume_scan, run_scan
+from polysight.host.scan.stop import StopRequest, hangups_pass
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared import messages as m
+from polysight.shared.errors import DeviceError, PolysightError, ScanError, os_error
+from polysight.shared.faults import explain
+from polysight.shared.tables import to_builtins
 
 from .processes_of_scan import receiver_of
 

@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from host.capture.segment import write_index
-from host.store import manifest
-from host.store.events import EventWriter, read_events
-from host.store.manifest import ManifestWriter, encode_line, parse
-from host.store.scanfolder import ScanFolder, new_scan_id
-from host.store.source import ScanSource
-from host.store.validate import to_json, validate
-from shared.errors import ConfigError, DataError, DeviceError, PolysightError
-from shared.messages import Fault, RunStarted
-from shared.raster import plan_raster
+from polysight.host.capture.segment import write_index
+from polysight.host.store import manifest
+from polysight.host.store.events import EventWriter, read_events
+from polysight.host.store.manifest import ManifestWriter, encode_line, parse
+from polysight.host.store.scanfolder import ScanFolder, new_scan_id
+from polysight.host.store.source import ScanSource
+from polysight.host.store.validate import to_json, validate
+from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight.shared.messages import Fault, RunStarted
+from polysight.shared.raster import plan_raster
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from host.capture.dca1000 import Status
-from host.preview.words import CAUSES, of_rejection
-from host.radar.interface import BoardState, RadarControl, RadarState
-from host.scan.run import run_scan
-from host.scan.stop import StopRequest
-from host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
-from shared.faults import PiFault, explain
+from polysight.host.capture.dca1000 import Status
+from polysight.host.preview.words import CAUSES, of_rejection
+from polysight.host.radar.interface import BoardState, RadarControl, RadarState
+from polysight.host.scan.run import run_scan
+from polysight.host.scan.stop import StopRequest
+from polysight.host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
+from polysight.shared.faults import PiFault, explain
 
 SPEC = Path(__file__).resolve().parents[2] / "docs/spec/scan-folder.md"
 HELD = "held on the way: some positions were passed below full speed"

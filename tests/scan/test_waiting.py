@@ -15,14 +15,14 @@ import msgspec
 import pytest
 import zmq
 
-from host.scan import ready, row, running
-from host.scan.processing import NICE
-from host.scan.run import resume_scan, run_scan
-from host.scan.stop import StopRequest
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared import messages as m
-from shared.errors import DeviceError, ScanError
+from polysight.host.scan import ready, row, running
+from polysight.host.scan.processing import NICE
+from polysight.host.scan.run import resume_scan, run_scan
+from polysight.host.scan.stop import StopRequest
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared import messages as m
+from polysight.shared.errors import DeviceError, ScanError
 
 
 def limited(instrument, **limits):
@@ -35,7 +35,7 @@ def receivers() -> list[int]:
     found = []
     for pid in children:
         line = Path(f"/proc/{pid}/cmdline").read_bytes()
-        if b"host.capture.receiver_process" in line:
+        if b"polysight.host.capture.receiver_process" in line:
             found.append(int(pid))
     return found
 

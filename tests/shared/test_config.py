@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError
-from shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.tables import decode, read_toml, to_builtins
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.tables import decode, read_toml, to_builtins
 
 RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
 

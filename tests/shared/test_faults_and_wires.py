@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.errors import DeviceError, ProtocolError
-from shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
-from shared.wires import WireClient, WireEdge, WireMotion, encode, parse
+from polysight.shared.errors import DeviceError, ProtocolError
+from polysight.shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
+from polysight.shared.wires import WireClient, WireEdge, WireMotion, encode, parse
 
 ROOT = Path(__file__).resolve().parents[2]
 

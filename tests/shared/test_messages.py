@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared import messages as m
-from shared.errors import ProtocolError
-from shared.raster import RasterPlan, Row
+from polysight.shared import messages as m
+from polysight.shared.errors import ProtocolError
+from polysight.shared.raster import RasterPlan, Row
 
 n = st.integers(0, 2**62)
 text = st.text(max_size=40)

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.config import Burst, Grid, Stage
-from shared.errors import ConfigError
-from shared.raster import check_burst_fits, mean_burst_travel_mm, plan_raster
+from polysight.shared.config import Burst, Grid, Stage
+from polysight.shared.errors import ConfigError
+from polysight.shared.raster import check_burst_fits, mean_burst_travel_mm, plan_raster
 
 grids = st.builds(
     Grid,

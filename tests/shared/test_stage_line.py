@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.errors import ProtocolError
-from shared.stage_line import Command, Immediate, Reply, crc16, seal, unseal
+from polysight.shared.errors import ProtocolError
+from polysight.shared.stage_line import Command, Immediate, Reply, crc16, seal, unseal
 
 commands = st.builds(
     Command,

@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 import tomli_w
 
-from shared.config import Instrument, load_instrument
-from shared.tables import to_builtins
-from shared.wires import WireClient, WireEdge, WireMotion
-from simulators.card_faults import Faults
-from simulators.card_sender import ReceiveQueue, bound_udp
-from simulators.fault_draws import NetworkFaults
-from simulators.loopback import is_free, on_free_subnet, on_subnet
-from simulators.pattern import pattern_frames
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import to_builtins
+from polysight.shared.wires import WireClient, WireEdge, WireMotion
+from polysight.simulators.card_faults import Faults
+from polysight.simulators.card_sender import ReceiveQueue, bound_udp
+from polysight.simulators.fault_draws import NetworkFaults
+from polysight.simulators.loopback import is_free, on_free_subnet, on_subnet
+from polysight.simulators.pattern import pattern_frames
 
 ROOT = Path(__file__).parents[2]
 TIME_SCALE = 20.0
@@ -114,9 +114,9 @@ def start(rig: Instrument, tmp_path: Path) -> Iterator[Start]:
         def begin(*arguments: str, boards: str = "RH,RV") -> dict[str, HostSide]:
             config = tmp_path / "rig.toml"
             config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-            launch("simulators.wires", "--socket", str(tmp_path / "w.sock"))
+            launch("polysight.simulators.wires", "--socket", str(tmp_path / "w.sock"))
             common = ("--config", str(config), "--wires", str(tmp_path / "w.sock"), "--boards", boards, "--pattern")
-            launch("simulators.cards", *common, "--time-scale", str(TIME_SCALE), *arguments)
+            launch("polysight.simulators.cards", *common, "--time-scale", str(TIME_SCALE), *arguments)
             return {name: HostSide(rig, name, sockets) for name in boards.split(",")}
 
         begin.processes = running  # type: ignore[attr-defined]
@@ -283,7 +283,15 @@ def test_wrong_arguments_are_told_in_one_message(
 ) -> None:
     config = tmp_path / "rig.toml"
     config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-    command = [sys.executable, "-m", "simulators.cards", "--config", str(config), "--wires", str(tmp_path / "w.sock")]
+    command = [
+        sys.executable,
+        "-m",
+        "polysight.simulators.cards",
+        "--config",
+        str(config),
+        "--wires",
+        str(tmp_path / "w.sock"),
+    ]
     done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2
     assert words in done.stderr

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared.config import Instrument, load_instrument
-from shared.errors import DeviceError
-from simulators.card_endpoint import CardEndpoint
-from simulators.card_faults import Faults, read_faults
-from simulators.card_sender import CardSender, Pace, bound_udp
-from simulators.dca1000 import Network
-from simulators.loopback import on_free_subnet
-from simulators.pattern import PatternSource, pattern_frames
-from simulators.simulated_card import SimulatedCard
-from simulators.sync_in import StageTrack
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import DeviceError
+from polysight.simulators.card_endpoint import CardEndpoint
+from polysight.simulators.card_faults import Faults, read_faults
+from polysight.simulators.card_sender import CardSender, Pace, bound_udp
+from polysight.simulators.dca1000 import Network
+from polysight.simulators.loopback import on_free_subnet
+from polysight.simulators.pattern import PatternSource, pattern_frames
+from polysight.simulators.simulated_card import SimulatedCard
+from polysight.simulators.sync_in import StageTrack
 
 ROOT = Path(__file__).parents[2]
 FRAME, PERIOD_NS = 4096, 1_500_000

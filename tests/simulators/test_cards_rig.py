@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from shared.config import load_instrument
-from simulators.card_sender import bound_udp
-from simulators.rig import card_groups, derive
-from simulators.scene import load_scene
+from polysight.shared.config import load_instrument
+from polysight.simulators.card_sender import bound_udp
+from polysight.simulators.rig import card_groups, derive
+from polysight.simulators.scene import load_scene
 from tests.small_scene import small_scene
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +29,7 @@ def launch(tmp_path: Path) -> Iterator[Launch]:
     started: list[subprocess.Popen[str]] = []
 
     def begin(*arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "simulators.rig", "--config", str(ROOT / "instrument.toml")]
+        command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(ROOT / "instrument.toml")]
         command += ["--dir", str(tmp_path / "rig"), *arguments]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         started.append(process)
@@ -46,7 +46,7 @@ def children(process: subprocess.Popen[str]) -> dict[str, int]:
     found = {}
     for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split():
         words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-        found[next((w for w in words if w.startswith("simulators.")), words[0])] = int(pid)
+        found[next((w for w in words if w.startswith("polysight.simulators.")), words[0])] = int(pid)
     return found
 
 
@@ -111,7 +111,7 @@ def test_a_process_that_dies_ends_the_rig_and_is_named(launch: Launch, tmp_path:
     assert process.stderr is not None
     assert process.stdout.readline().startswith("ready")
     pids = children(process)
-    os.kill(pids["simulators.wires"], signal.SIGKILL)
+    os.kill(pids["polysight.simulators.wires"], signal.SIGKILL)
     assert process.wait(15) == 5
     message = process.stderr.read()
     assert "process ended with status" in message

@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError
-from shared.raster import plan_raster
-from shared.wires import WireMotion
-from simulators.radar import SimulatedRig
-from simulators.scene import decode_scene
-from simulators.simulate import row_offsets_mm
-from simulators.sync_in import Pulse, StageTrack, SyncInput, sync_line
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.raster import plan_raster
+from polysight.shared.wires import WireMotion
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import row_offsets_mm
+from polysight.simulators.sync_in import Pulse, StageTrack, SyncInput, sync_line
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 DEAD_NS = 278_500  # ramp end 128.5 us + 150 us

@@ -6,11 +6,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.config import load_instrument
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.fresnel import half_space, layered, plate_reflection, slab
-from simulators.optics import board_reflectivity
-from simulators.scene import Layer, Plate, Scene
+from polysight.shared.config import load_instrument
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.fresnel import half_space, layered, plate_reflection, slab
+from polysight.simulators.optics import board_reflectivity
+from polysight.simulators.scene import Layer, Plate, Scene
 
 permittivities = st.builds(lambda e, loss: complex(e, -loss), st.floats(1.1, 20.0), st.floats(0.0, 20.0))
 angles = st.floats(0.01, 1.5)

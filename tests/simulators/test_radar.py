@@ -7,12 +7,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from shared.config import load_instrument
-from shared.units import SPEED_OF_LIGHT_M_S
-from simulators.optics import antennas, field_exact
-from simulators.radar import SimulatedRig, reference_cube, sample_frequencies_hz
-from simulators.receiver import high_pass, power_on, pulse_uniform, sync_delay_s
-from simulators.scene import decode_scene
+from polysight.shared.config import load_instrument
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.optics import antennas, field_exact
+from polysight.simulators.radar import SimulatedRig, reference_cube, sample_frequencies_hz
+from polysight.simulators.receiver import high_pass, power_on, pulse_uniform, sync_delay_s
+from polysight.simulators.scene import decode_scene
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")

@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.config import load_instrument
-from simulators.card_endpoint import CardEndpoint
-from simulators.card_faults import Faults
-from simulators.card_sender import Pace, bound_udp
-from simulators.dca1000 import Network
-from simulators.loopback import on_free_subnet
-from simulators.replay import Player, Recording, scan_rows
-from simulators.simulated_card import MAC
+from polysight.shared.config import load_instrument
+from polysight.simulators.card_endpoint import CardEndpoint
+from polysight.simulators.card_faults import Faults
+from polysight.simulators.card_sender import Pace, bound_udp
+from polysight.simulators.dca1000 import Network
+from polysight.simulators.loopback import on_free_subnet
+from polysight.simulators.replay import Player, Recording, scan_rows
+from polysight.simulators.simulated_card import MAC
 
 OK = {code: bytes.fromhex(f"5aa5{code:02x}000000aaee") for code in range(1, 15)}
 START, STOP = "5aa505000000aaee", "5aa506000000aaee"
@@ -100,7 +100,7 @@ def play() -> Iterator[Play]:
         def begin(source: Path, *arguments: str) -> Client:
             subnet = free_subnet()
             addresses = ("--card-address", f"{subnet}.180", "--host-address", f"{subnet}.30")
-            command = [sys.executable, "-m", "simulators.replay", str(source), *addresses, *arguments]
+            command = [sys.executable, "-m", "polysight.simulators.replay", str(source), *addresses, *arguments]
             player = sockets.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
             sockets.callback(player.kill)
             players.append(player)
@@ -220,7 +220,7 @@ def test_wrong_arguments_are_told_in_one_message(
     recording: Path, arguments: list[str], words: str, status: int
 ) -> None:
     filled = [a.format(folder=recording.parent, file=recording) for a in arguments]
-    command = [sys.executable, "-m", "simulators.replay", *filled]
+    command = [sys.executable, "-m", "polysight.simulators.replay", *filled]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert (done.returncode, "Traceback" in done.stderr) == (status, False)
     assert words in done.stderr

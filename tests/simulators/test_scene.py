@@ -6,9 +6,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError
-from simulators.scene import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError
+from polysight.simulators.scene import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
 
 ROOT = Path(__file__).parents[2]
 

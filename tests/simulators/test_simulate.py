@@ -9,14 +9,14 @@ import msgpack
 import numpy as np
 import pytest
 
-from shared.config import load_instrument
-from shared.errors import ConfigError, DataError
-from shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
-from shared.raster import FIRST_PULSE_DELAY_S, plan_raster
-from simulators.__main__ import main
-from simulators.radar import SimulatedRig
-from simulators.scene import decode_scene
-from simulators.simulate import lost_bytes, row_offsets_mm, simulate
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
+from polysight.shared.raster import FIRST_PULSE_DELAY_S, plan_raster
+from polysight.simulators.__main__ import main
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.simulate import lost_bytes, row_offsets_mm, simulate
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from shared.errors import ConfigError, DeviceError
-from shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
-from simulators.wires import WireHub
+from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.wires import WireClient, WireEdge, WireMessage, WireMotion, encode
+from polysight.simulators.wires import WireHub
 
 Serve = Callable[..., Path]
 Join = Callable[..., WireClient]

@@ -13,10 +13,10 @@ from types import ModuleType
 
 import pytest
 
-from shared.errors import DeviceError
-from shared.wires import WireEdge, WireMessage, WireMotion
-from simulators.stage import SKETCH_DIR, build, compiler
-from simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
+from polysight.shared.errors import DeviceError
+from polysight.shared.wires import WireEdge, WireMessage, WireMotion
+from polysight.simulators.stage import SKETCH_DIR, build, compiler
+from polysight.simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
 
 
 def _module(name: str) -> ModuleType:
@@ -154,7 +154,7 @@ def simulated_port(tmp_path: Path) -> Iterator[Callable[[float], str]]:
 
         def start(time_scale: float) -> str:
             port = str(tmp_path / "ttySTAGE")
-            command = [sys.executable, "-m", "simulators.stage", "--config", str(ROOT / "instrument.toml")]
+            command = [sys.executable, "-m", "polysight.simulators.stage", "--config", str(ROOT / "instrument.toml")]
             command += ["--link", port, "--time-scale", repr(time_scale)]
             stage = started.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT))
             started.callback(stage.terminate)

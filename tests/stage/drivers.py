@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import serial
 
-from shared.errors import ProtocolError
-from shared.stage_line import Command, Immediate, Reply
-from shared.wires import WireMessage, parse
-from simulators.stage_motion import NS_PER_TICK, TICK_HZ
-from simulators.stage_python import PythonStage, Rig
-from simulators.uno import HZ, EmulatedUno
+from polysight.shared.errors import ProtocolError
+from polysight.shared.stage_line import Command, Immediate, Reply
+from polysight.shared.wires import WireMessage, parse
+from polysight.simulators.stage_motion import NS_PER_TICK, TICK_HZ
+from polysight.simulators.stage_python import PythonStage, Rig
+from polysight.simulators.uno import HZ, EmulatedUno
 
 LIMIT_S = 60.0
 LIMIT_TICKS = 600 * TICK_HZ

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from shared.stage_line import Command
+from polysight.shared.stage_line import Command
 
 
 @pytest.mark.parametrize(

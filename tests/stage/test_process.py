@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 import serial
 
-from shared.stage_line import Command, Immediate, Reply
-from shared.wires import WireEdge, WireMessage, WireMotion, parse
+from polysight.shared.stage_line import Command, Immediate, Reply
+from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 60.0
@@ -89,7 +89,14 @@ class Host:
 class Simulator:
     def __init__(self, folder: Path, extra: list[str], time_scale: float) -> None:
         self.link, self.wires = folder / "ttySTAGE", Wires(folder / "wires")
-        command = [sys.executable, "-m", "simulators.stage", "--config", str(ROOT / "instrument.toml"), "--wires"]
+        command = [
+            sys.executable,
+            "-m",
+            "polysight.simulators.stage",
+            "--config",
+            str(ROOT / "instrument.toml"),
+            "--wires",
+        ]
         command += [str(folder / "wires"), "--link", str(self.link), "--time-scale", str(time_scale), *extra]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
         assert self.process.stdout is not None
@@ -196,7 +203,7 @@ def test_dies_with_its_parent(tmp_path: Path):
     wires = Wires(tmp_path / "wires")
     program = (
         "import subprocess, sys, time\n"
-        "p = subprocess.Popen([sys.executable, '-m', 'simulators.stage', *sys.argv[1:]], stdout=subprocess.PIPE)\n"
+        "p = subprocess.Popen([sys.executable, '-m', 'polysight.simulators.stage', *sys.argv[1:]], stdout=subprocess.PIPE)\n"
         "p.stdout.readline()\nprint(p.pid, flush=True)\ntime.sleep(600)\n"
     )
     arguments = ["--config", str(ROOT / "instrument.toml"), "--wires", str(tmp_path / "wires"), "--link"]

@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from shared.stage_line import Immediate
+from polysight.shared.stage_line import Immediate
 
 MM = 200  # steps
 UM = 5  # per step

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from shared import stage_line
-from shared.config import Stage
-from shared.faults import EXPLANATIONS, StageError, c_header
-from shared.stage_line import Immediate, Parameter, Reply
-from simulators import stage_logic, stage_motion, stage_python
+from polysight.shared import stage_line
+from polysight.shared.config import Stage
+from polysight.shared.faults import EXPLANATIONS, StageError, c_header
+from polysight.shared.stage_line import Immediate, Parameter, Reply
+from polysight.simulators import stage_logic, stage_motion, stage_python
 
 ROOT = Path(__file__).parents[2]
 SKETCH = ROOT / "arduino_stage"

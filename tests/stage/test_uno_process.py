@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.wires import WireEdge, WireMessage, WireMotion, parse
+from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
 
 ROOT = Path(__file__).parents[2]
 SPEED = 4.0
@@ -28,7 +28,7 @@ ROW_POINTS = [(5 * x, 5000) for x in range(20_000, 22_000, 400)] + [(5 * x, 7000
 # reset late (it sees that its port was opened when it is scheduled) hears nothing meanwhile: HELLO is said again.
 PEER = """
 import os, select, sys, threading, time
-from shared.stage_line import Command
+from polysight.shared.stage_line import Command
 port = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
 def until(word, wait_s=60):
     seen, limit = b"", time.monotonic() + wait_s
@@ -62,7 +62,7 @@ time.sleep(600)
 
 
 class Board:
-    """`python -m simulators.uno` with a listener at its wires, who keeps all that comes."""
+    """`python -m polysight.simulators.uno` with a listener at its wires, who keeps all that comes."""
 
     def __init__(self, folder: Path, time_scale: float) -> None:
         self.port = folder / "tty"
@@ -71,7 +71,7 @@ class Board:
             listener.bind(str(folder / "wires"))
             listener.listen()
             listener.settimeout(LIMIT_S)
-            command = [sys.executable, "-m", "simulators.uno", "--config", str(ROOT / "instrument.toml")]
+            command = [sys.executable, "-m", "polysight.simulators.uno", "--config", str(ROOT / "instrument.toml")]
             command += ["--wires", str(folder / "wires"), "--link", str(self.port), "--time-scale", str(time_scale)]
             self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
             self._wires, _ = listener.accept()

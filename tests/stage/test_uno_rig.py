@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from host.store.scanfolder import ScanFolder
-from shared.config import load_instrument
-from shared.tables import to_builtins
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import load_instrument
+from polysight.shared.tables import to_builtins
 
 ROOT = Path(__file__).parents[2]
 LIMIT_S = 200
@@ -42,7 +42,16 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     config, scene = tmp_path / "rig.toml", tmp_path / "scene.toml"
     config.write_text(tomli_w.dumps(to_builtins(rig)))
     scene.write_text(SCENE)
-    command = [sys.executable, "-m", "simulators.rig", "--config", str(config), "--scene", str(scene), "--with-pi"]
+    command = [
+        sys.executable,
+        "-m",
+        "polysight.simulators.rig",
+        "--config",
+        str(config),
+        "--scene",
+        str(scene),
+        "--with-pi",
+    ]
     command += ["--dir", str(tmp_path / "rig"), "--uno", "--time-scale", "2"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
@@ -56,7 +65,7 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     run(
         sys.executable,
         "-m",
-        "simulators",
+        "polysight.simulators",
         "simulate",
         str(scene),
         "--config",
@@ -75,7 +84,7 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
 
 
 def test_a_time_scale_its_heartbeat_cannot_follow_is_refused(tmp_path: Path):
-    command = [sys.executable, "-m", "simulators.rig", "--config", str(ROOT / "instrument.toml"), "--pattern"]
+    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(ROOT / "instrument.toml"), "--pattern"]
     command += ["--dir", str(tmp_path / "rig"), "--uno", "--time-scale", "5"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=ROOT)
     assert done.returncode == 2

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from shared.stage_line import Immediate, Parameter
-from simulators.uno import HZ
+from polysight.shared.stage_line import Immediate, Parameter
+from polysight.simulators.uno import HZ
 
 SKETCH = Path(__file__).parents[2] / "arduino_stage"
 US, MS = HZ // 1_000_000, HZ // 1000

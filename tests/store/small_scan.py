@@ -16,23 +16,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from host.capture.receiver_words import RowCapture
-from host.capture.segment import Segment, write_index
-from host.pipeline import Pipeline
-from host.scan import run as host_run
-from host.scan.run import ScanProgress, ScanResult, resume_scan, run_scan
-from host.store import manifest
-from host.store.scanfolder import MANIFEST, PART, ScanFolder
-from pi_controller.journal import JournalFolder, JournalFullError
-from pi_controller.ledger import Ledger
-from shared import messages as m
-from shared.config import Instrument, load_instrument
-from shared.errors import PolysightError
-from shared.raster import plan_raster
-from shared.tables import decode, to_builtins
-from simulators.radar import SimulatedRig
-from simulators.scene import load_scene
-from simulators.simulate import row_offsets_mm
+from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.segment import Segment, write_index
+from polysight.host.pipeline import Pipeline
+from polysight.host.scan import run as host_run
+from polysight.host.scan.run import ScanProgress, ScanResult, resume_scan, run_scan
+from polysight.host.store import manifest
+from polysight.host.store.scanfolder import MANIFEST, PART, ScanFolder
+from polysight.pi_controller.journal import JournalFolder, JournalFullError
+from polysight.pi_controller.ledger import Ledger
+from polysight.shared import messages as m
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import PolysightError
+from polysight.shared.raster import plan_raster
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.radar import SimulatedRig
+from polysight.simulators.scene import load_scene
+from polysight.simulators.simulate import row_offsets_mm
 from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]

@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.store.authors import AuthorsCube, AuthorsScan, open_scan
-from shared.config import load_instrument
-from shared.errors import DataError
-from shared.geometry import rx_positions_m, tx_position_m
+from polysight.host.store.authors import AuthorsCube, AuthorsScan, open_scan
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError
+from polysight.shared.geometry import rx_positions_m, tx_position_m
 
 ROOT = Path(__file__).parents[2]
 COLUMNS, ROWS, PULSES, SAMPLES = 7, 4, 4, 256

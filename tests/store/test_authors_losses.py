@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.store.authors import RowLosses, open_scan
-from host.store.authors_settings import mirrored
-from shared.config import Burst, Grid, load_instrument
-from shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
-from shared.raster import plan_raster
-from simulators.authors_layout import AuthorsLayout
+from polysight.host.store.authors import RowLosses, open_scan
+from polysight.host.store.authors_settings import mirrored
+from polysight.shared.config import Burst, Grid, load_instrument
+from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
+from polysight.shared.raster import plan_raster
+from polysight.simulators.authors_layout import AuthorsLayout
 
 ROOT = Path(__file__).parents[2]
 COLUMNS, ROWS, PULSES = 9, 4, 3

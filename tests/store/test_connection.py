@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 import tomli_w
 
-from host.cli import main
-from host.preview.story import Story
-from host.scan.run import resume_scan
-from host.store.connection import ADDRESSES, check_same_scan, connection_of, reconnected
-from host.store.scanfolder import ScanFolder
-from shared.config import Instrument, load_instrument
-from shared.errors import ConfigError
-from shared.tables import decode, to_builtins
+from polysight.host.cli import main
+from polysight.host.preview.story import Story
+from polysight.host.scan.run import resume_scan
+from polysight.host.store.connection import ADDRESSES, check_same_scan, connection_of, reconnected
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError
+from polysight.shared.tables import decode, to_builtins
 
 REPO = Path(__file__).resolve().parents[2]
 

@@ -12,12 +12,12 @@ import msgpack
 import pytest
 from small_scan import SmallScan
 
-from host.store.events import read_events
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from pi_controller.journal import records
-from shared.errors import DataError
-from shared.messages import RowStarted
+from polysight.host.store.events import read_events
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.pi_controller.journal import records
+from polysight.shared.errors import DataError
+from polysight.shared.messages import RowStarted
 
 pytestmark = pytest.mark.timeout(3600)  # with --long
 PAGE = bytes(4096)

@@ -9,9 +9,9 @@ import pytest
 from faulty_disk import GROWS, FaultyDisk
 from small_scan import Samples, SmallScan
 
-from host.store.scanfolder import ScanFolder
-from host.store.validate import validate
-from shared.errors import PolysightError
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.errors import PolysightError
 
 
 def needs_space(samples: Samples, folder: Path, whose: str) -> list[int]:

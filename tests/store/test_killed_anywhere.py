@@ -12,8 +12,8 @@ import pytest
 from faulty_disk import FaultyDisk, Killed
 from small_scan import Samples, SmallScan
 
-from host.store.scanfolder import ScanFolder
-from host.store.validate import Finding, validate
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.validate import Finding, validate
 
 POWER_CUTS = 4  # draws of what is left, for each place
 pytestmark = [

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from host.dropping import drop_raw, processed_digests
-from host.live import resume
-from host.options import Options
-from host.store.appending import AppendFile
-from host.store.raw import drop, droppable, dropped_files, require_raw
-from host.store.scanfolder import MANIFEST, ScanFolder
-from host.store.validate import damaged_rows, validate
-from shared.errors import ConfigError, DataError, DeviceError, ScanError
+from polysight.host.dropping import drop_raw, processed_digests
+from polysight.host.live import resume
+from polysight.host.options import Options
+from polysight.host.store.appending import AppendFile
+from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
+from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.validate import damaged_rows, validate
+from polysight.shared.errors import ConfigError, DataError, DeviceError, ScanError
 from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]
@@ -36,7 +36,7 @@ def processed(tmp_path_factory) -> Path:
     """A simulated scan with its images."""
     folder = tmp_path_factory.mktemp("processed")
     (folder / "scene.toml").write_text(SCENE)
-    simulate = [sys.executable, "-m", "simulators", "simulate", folder / "scene.toml"]
+    simulate = [sys.executable, "-m", "polysight.simulators", "simulate", folder / "scene.toml"]
     config = ["--config", REPO / "instrument.toml", "--out", folder / "scan"]
     subprocess.run([*simulate, *config], check=True, capture_output=True)
     assert polysight("image", folder / "scan", "--out", folder / "scan" / "products").returncode == 0

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from host.store import appending, validate
-from host.store.manifest import ManifestWriter
-from host.store.scanfolder import ScanFolder
-from shared.errors import DeviceError
+from polysight.host.store import appending, validate
+from polysight.host.store.manifest import ManifestWriter
+from polysight.host.store.scanfolder import ScanFolder
+from polysight.shared.errors import DeviceError
 
 
 def test_lock_that_another_program_holds_is_told_from_a_disk_without_locks(tmp_path, monkeypatch):

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from host.capture.decode import raw_words
-from host.sync.align import AlignedRow, align_row
-from shared.config import Board, Instrument, load_instrument
-from shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.capture.decode import raw_words
+from polysight.host.sync.align import AlignedRow, align_row
+from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,11 +4,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.sync import BoardSetup, synchronise_row
-from host.sync.hpf import high_pass
-from host.sync.tone import estimate_tone
-from shared.errors import DataError
-from shared.units import SPEED_OF_LIGHT_M_S
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.host.sync.hpf import high_pass
+from polysight.host.sync.tone import estimate_tone
+from polysight.shared.errors import DataError
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 POSITIONS, PULSES = 9, 6
 

@@ -12,7 +12,7 @@ pytest.importorskip("numba", reason="numba is not installed")
 ROOT = Path(__file__).parents[2]
 CALL = """
 import numpy as np
-from host.sync import compiled
+from polysight.host.sync import compiled
 tone = compiled._interpolated(np.ones(4, np.float32), np.ones(4, np.float32), np.arange(4), 1, 8)
 print(abs(tone[1]), sum(compiled._interpolated.stats.cache_hits.values()))
 """
@@ -34,15 +34,15 @@ def call(folder):
 
 
 def test_a_changed_kernel_is_compiled_anew_also_where_it_was_inlined(tmp_path):
-    for package in ("host/sync", "shared"):
-        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "host" / "__init__.py").write_text("", encoding="utf-8")
+    for package in ("host", "shared"):
+        shutil.copytree(ROOT / package, tmp_path / "polysight" / package, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "polysight" / "__init__.py").write_text("", encoding="utf-8")
     first, hits = call(tmp_path)
     assert (first, hits) == (pytest.approx(2**0.5), 0)
     again, hits = call(tmp_path)
     assert (again, hits) == (first, 1)
 
-    kernels = tmp_path / "host" / "sync" / "kernels.py"
+    kernels = tmp_path / "polysight" / "host" / "sync" / "kernels.py"
     source = kernels.read_text(encoding="utf-8")
     changed = source.replace("return 1 - 2 * s * s, 2 * s * c", "return 3 * (1 - 2 * s * s), 3 * (2 * s * c)")
     assert changed != source

@@ -2,8 +2,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from host.sync.hpf import Equaliser, HighPass, filtered, fit_high_pass, high_pass
-from shared.errors import DataError
+from polysight.host.sync.hpf import Equaliser, HighPass, filtered, fit_high_pass, high_pass
+from polysight.shared.errors import DataError
 
 
 def test_each_section_is_3_db_down_and_45_degrees_ahead_at_its_corner():

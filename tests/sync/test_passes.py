@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from host.sync import plain
-from host.sync.align import align_row
-from host.sync.hpf import Equaliser, high_pass
-from host.sync.passes import passes_for
+from polysight.host.sync import plain
+from polysight.host.sync.align import align_row
+from polysight.host.sync.hpf import Equaliser, high_pass
+from polysight.host.sync.passes import passes_for
 
-compiled = pytest.importorskip("host.sync.compiled", reason="numba is not installed")
+compiled = pytest.importorskip("polysight.host.sync.compiled", reason="numba is not installed")
 
 
 @pytest.fixture(scope="module")

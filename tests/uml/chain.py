@@ -24,9 +24,9 @@ sys.path += [str(Path(__file__).parent), str(ROOT / "tests" / "pi")]
 from gpio_sim import Change, SimChip  # noqa: E402
 from host_side import HostSide  # noqa: E402
 
-from shared import messages as m  # noqa: E402
-from shared.config import load_instrument  # noqa: E402
-from shared.wires import WireEdge, parse  # noqa: E402
+from polysight.shared import messages as m  # noqa: E402
+from polysight.shared.config import load_instrument  # noqa: E402
+from polysight.shared.wires import WireEdge, parse  # noqa: E402
 
 LINES = 28
 LIMIT_S = 600.0
@@ -63,8 +63,10 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     """Home, run the row, end the Pi's program; what it told."""
     rig = load_instrument(config)
     python = [sys.executable, "-m"]
-    uno = start(*python, "simulators.uno", "--config", str(config), "--wires", str(WIRES), "--link", str(PORT))
-    pi = start(*python, "pi_controller", "run", "--config", str(config), "--stage-port", str(PORT))
+    uno = start(
+        *python, "polysight.simulators.uno", "--config", str(config), "--wires", str(WIRES), "--link", str(PORT)
+    )
+    pi = start(*python, "polysight.pi_controller", "run", "--config", str(config), "--stage-port", str(PORT))
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
     host.accepted(host.begin())
     host.accepted(m.Home())

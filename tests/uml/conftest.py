@@ -15,9 +15,9 @@ import msgspec
 import pytest
 import tomli_w
 
-from shared.config import Instrument, load_instrument
-from shared.tables import to_builtins
-from simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import to_builtins
+from polysight.simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

@@ -1,0 +1,17 @@
+"""Files that come with the package: the rig file `instrument.toml` and the scenes of `examples/`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+
+
+def packaged(path: Path) -> Path:
+    """`path` where it exists; otherwise the file of that name that comes with the package, if there is one.
+
+    So `instrument.toml` and `examples/nine-materials.toml` are found from any folder, and a file of one's own comes
+    first.
+    """
+    ours = FOLDER / path
+    return ours if not path.is_absolute() and not path.exists() and ours.is_file() else path

@@ -81,7 +81,7 @@ def _train(args: argparse.Namespace) -> int:
             "give one of them",
         )
     if args.authors is not None:
-        from polysight.host.reproduce.authors_library import train_authors
+        from polysight.papers.sensys2026.dataset import train_authors
 
         return train_authors(args.authors, args.config, args.out)
     from polysight.host.offline import train

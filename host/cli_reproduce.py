@@ -15,13 +15,13 @@ def _reproduce(args: argparse.Namespace) -> int:
     if args.config != RIG:
         load_instrument(args.config)  # a wrong one is told now, not with the first item that needs it
     if args.authors is not None:
-        from polysight.host.reproduce.authors import reproduce_authors
+        from polysight.papers.sensys2026.dataset_run import reproduce_authors
 
         return reproduce_authors(args.authors, args.out, args.config, args.items, args.images, args.names)
     if args.images is not None or args.names is not None:
         raise ConfigError("--images and --names say how to read the published files", "no --authors was given")
-    from polysight.host.reproduce.item import Run
-    from polysight.host.reproduce.run import reproduce
+    from polysight.papers.sensys2026.item import Run
+    from polysight.papers.sensys2026.run import reproduce
 
     return reproduce(args.out, args.items, Run(args.quick, args.config))
 

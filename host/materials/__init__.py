@@ -9,7 +9,6 @@ from polysight.host.materials.library import Entry, Library
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
 from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
 from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, segment
-from polysight.host.materials.table2 import Published, table2
 from polysight.host.materials.train import TrainingScan, entries_of, make_library
 from polysight.host.materials.truth import TruthPlate, read_truth, truth_labels, truth_plates
 
@@ -25,7 +24,6 @@ __all__ = [
     "Patch",
     "PatchResult",
     "Permittivity",
-    "Published",
     "SegmentSettings",
     "Segmentation",
     "TrainingScan",
@@ -49,7 +47,6 @@ __all__ = [
     "read_labels",
     "read_truth",
     "segment",
-    "table2",
     "truth_labels",
     "truth_plates",
     "write_labels",

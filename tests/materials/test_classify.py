@@ -13,7 +13,7 @@ from polysight.host.materials import UNKNOWN, Classifier, Library, TrainingScan,
 from polysight.host.materials.models import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.patches import PATCHES, match_patches, pack_patches, read_patches
 from polysight.host.report.assemble import classifier_sentence
-from polysight.host.reproduce.patches import Errors, draw, groups
+from polysight.papers.sensys2026.patches import Errors, draw, groups
 from polysight.shared.errors import DataError
 
 ANGLES = (55.0, 60.0)

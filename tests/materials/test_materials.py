@@ -20,12 +20,12 @@ from polysight.host.materials import (
     median_ratio,
     pixel_accuracy,
     read_truth,
-    table2,
 )
 from polysight.host.materials.decision import majority
 from polysight.host.materials.knn import ratio_distance
 from polysight.host.materials.library import FORMAT
 from polysight.host.polarimetry import fresnel
+from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.errors import DataError
 
 THETA = np.radians(55.0)

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 
 from polysight.host.cli import main
-from polysight.host.materials import Library, knn, table2
+from polysight.host.materials import Library, knn
 from polysight.host.polarimetry import ratio_from_permittivity
-from polysight.host.reproduce import authors_items
-from polysight.host.reproduce.authors import text_of
-from polysight.host.reproduce.authors_data import IMAGES, LABELS, MATERIALS, read_authors
-from polysight.host.reproduce.authors_items import Judgements, authors_fig20, paired, repeated, task_samples
-from polysight.host.reproduce.authors_names import read_names, row_of
-from polysight.host.reproduce.authors_table2 import authors_recipe, without_leakage
-from polysight.host.reproduce.item import Table
+from polysight.papers.sensys2026 import dataset_figures as authors_items
+from polysight.papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, read_authors, read_names, row_of
+from polysight.papers.sensys2026.dataset_figures import Judgements, authors_fig20, paired, repeated, task_samples
+from polysight.papers.sensys2026.dataset_run import authors_recipe, text_of, without_leakage
+from polysight.papers.sensys2026.item import Table
+from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.errors import DataError
 from polysight.simulators.authors_forms import Errors, Material, write_labels, write_material
 

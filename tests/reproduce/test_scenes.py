@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from polysight.host.polarimetry import specular_incidence_rad
-from polysight.host.reproduce import catalogue
-from polysight.host.reproduce.front_on import front_on
-from polysight.host.reproduce.images import FIG13_DISTANCE_MM, PLACES_MM
-from polysight.host.reproduce.item import Run
-from polysight.host.reproduce.location import APART_MM, REACH_MM, places
-from polysight.host.reproduce.receiver import tones
-from polysight.host.reproduce.scenes import plate, scanned
+from polysight.papers.sensys2026 import run as catalogue
+from polysight.papers.sensys2026.images import FIG13_DISTANCE_MM, PLACES_MM, front_on
+from polysight.papers.sensys2026.item import Run
+from polysight.papers.sensys2026.permittivities import APART_MM, REACH_MM, places
+from polysight.papers.sensys2026.scenes import plate, scanned
+from polysight.papers.sensys2026.synchronisation import tones
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ScanError
 

@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from polysight.host.materials import Library, table2
+from polysight.host.materials import Library
 from polysight.host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
 from polysight.host.materials.judge import Score, score
 from polysight.host.materials.models import DISCRIMINANT, PAPER
 from polysight.host.materials.samples import CHANNELS, Samples
 from polysight.host.report.figures import INK, PALETTE
-from polysight.host.reproduce.authors_data import AuthorsData
-from polysight.host.reproduce.confusion import confusion_figure
-from polysight.host.reproduce.item import Item, Picture, Table, dress, new_figure, percent
-from polysight.host.reproduce.patches import groups
-from polysight.host.reproduce.published import published
-from polysight.host.reproduce.sugar import WATER
+from polysight.papers.sensys2026.classification import confusion_figure
+from polysight.papers.sensys2026.concentration import WATER
+from polysight.papers.sensys2026.dataset import AuthorsData
+from polysight.papers.sensys2026.item import Item, Picture, Table, dress, new_figure, percent
+from polysight.papers.sensys2026.patches import groups
+from polysight.papers.sensys2026.table2 import published, table2
 from polysight.shared.errors import DataError
 
 SECOND_ANGLE_DEG = 55.0

@@ -20,12 +20,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from polysight.host.materials import Entry, Library, Published, table2
+from polysight.host.materials import Entry, Library
 from polysight.host.materials.judge import score
 from polysight.host.materials.models import PAPER
 from polysight.host.materials.samples import Samples, feature_matrix
 from polysight.host.polarimetry import fresnel
-from polysight.host.reproduce.published import published
+from polysight.papers.sensys2026.table2 import Published, published, table2
 
 Complex = npt.NDArray[np.complex128]
 SCANS, PIXELS = 8, 12

@@ -5,16 +5,20 @@ Each source is judged on its own. Materials carry the names of Table 2's rows, w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from polysight.host.materials import Entry, Library, table2
+from polysight.host.materials import Entry, Library, fit_library
 from polysight.host.materials.authors import read_material
 from polysight.host.materials.authors_labels import (
+    METALS,
     LabelledScan,
     entries_of_boxes,
     label_folders,
@@ -22,8 +26,9 @@ from polysight.host.materials.authors_labels import (
     reading_of,
     told_angle,
 )
-from polysight.host.reproduce.authors_names import read_names, rows_of
+from polysight.host.polarimetry import correct_leakage
 from polysight.host.store.authors_settings import COLLECTION, read_settings, rig_of
+from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import incidence_deg
@@ -208,3 +213,133 @@ def _named(
         )
     meaning = {f"{n}, {t:g} mm" if t else n: number for (n, t), number in rows.items()}
     return dict(sorted(meaning.items())), sources
+
+
+_FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
+_ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
+_CONTAINERS = {"glass", "plastic"}
+_ENOUGH = 0.5
+
+
+def words(name: str) -> frozenset[str]:
+    """Words and numbers of a name, lower case; a metal's name is "metal"."""
+    text = re.sub(r"\\?\bw/?\s", " with ", name.lower().replace("_", " "))
+    out: list[str] = []
+    for word in re.findall(r"[a-z]+|\d+(?:\.\d+)?", text):
+        if word in _FILLING:
+            continue
+        if word[0].isdigit():
+            number = f"0.{word[1:]}" if re.fullmatch(r"0\d+", word) else word  # "pet_05mm"
+            out.append(f"{float(number):g}")
+        else:
+            out += ["metal"] if word in METALS else str(_ALIASES.get(word, word)).split()
+    return frozenset(out)
+
+
+def _alike(theirs: frozenset[str], row: Published) -> float:
+    """Shared words and numbers over all of them; a row's container need not be named."""
+    ours = words(row.name)
+    optional = ours & _CONTAINERS if " with " in row.name or "(with" in row.name else frozenset()
+    union = (ours | theirs) - (optional - theirs)
+    return len(ours & theirs) / len(union) if union else 0.0
+
+
+def row_of(name: str, thickness_mm: float | None = None) -> int | None:
+    """Number of the row of Table 2 that a name means, or None."""
+    theirs = words(name)
+    if "metal" in theirs:
+        return 1
+    tries = [theirs]
+    if thickness_mm is not None:
+        tries.insert(0, theirs | {f"{thickness_mm:g}"})
+    best = sorted(((max(_alike(t, row) for t in tries), row.number) for row in table2()), key=lambda b: -b[0])
+    (first, number), (second, _) = best[:2]
+    return number if first >= _ENOUGH and first > second else None
+
+
+def read_names(path: Path) -> dict[str, int]:
+    """A file that says what names mean: JSON, {their name: row of Table 2}. Raises DataError."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        given = {str(name): int(number) for name, number in content.items()}
+    except (OSError, ValueError, AttributeError, TypeError) as e:
+        raise DataError(f"{path}: not a list of names: {e}", 'expected JSON, {"their name": row of Table 2}') from None
+    wrong = [n for n in given.values() if not 1 <= n <= len(table2())]
+    if wrong:
+        raise DataError(f"{path}: Table 2 has no row {wrong[0]}", f"its rows are 1 to {len(table2())}")
+    return given
+
+
+def rows_of(
+    names: Iterable[tuple[str, float | None]], given: Mapping[str, int] | None = None
+) -> dict[tuple[str, float | None], int]:
+    """Rows of names with their thicknesses; those that mean none are left out."""
+    found = {(n, t): (given or {}).get(n) or row_of(n, t) for n, t in set(names)}
+    return {key: number for key, number in found.items() if number is not None}
+
+
+PIXELS = 16
+"""Of a patch, at even intervals: as in a library that is trained here."""
+
+
+def train_authors(folder: Path, config: Path, out: Path) -> int:
+    """Make a library from `materials/` and `labels/`, fitted for each incidence angle; returns the exit status.
+
+    Raises
+    ------
+    DataError
+        when nothing can be used, or no angle has scans enough to choose a model with.
+    """
+    data = read_authors(folder, config)
+    for notice in data.notices:
+        sys.stderr.write(f"note: {notice}\n")
+    library = authors_library(data)
+    fits: dict[str, Any] = {}
+    fitted: list[Entry] = []
+    for angle in library.angles_deg:
+        own = library.at(angle)
+        try:
+            fits |= fit_library(own).fit["angles"]
+            fitted += own.entries
+        except DataError as e:
+            sys.stderr.write(f"note: {angle:g} degrees left out: {e.what}\n")
+    if not fitted:
+        raise DataError(
+            f"{folder}: no angle has scans enough", "models are chosen with whole scans left out", "add more scans"
+        )
+    library = Library(tuple(fitted), {"angles": fits}, library.note)
+    library.save(out)
+    told = {a: {k: f[k] for k in ("model", "pixel_accuracy", "patch_accuracy")} for a, f in fits.items()}
+    sys.stdout.write(
+        f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans\n"
+        f"{json.dumps(told, indent=1)}\n"
+    )
+    return 0
+
+
+def authors_library(data: AuthorsData) -> Library:
+    """Patches of all sources but images made here, without leakage; one that two sources hold counts once."""
+    a, b = complex(*data.base.polarimetry.leakage_h), complex(*data.base.polarimetry.leakage_v)
+    kept: dict[tuple[str, str, int], list[Entry]] = {}
+    for source, library in data.sources.items():
+        if source == IMAGES:
+            continue
+        found: dict[tuple[str, str, int], list[Entry]] = {}
+        for e in library.entries:
+            found.setdefault((e.name, e.scan, round(e.incidence_deg)), []).append(_without_leakage(e, a, b))
+        kept = {**kept, **found}
+    entries = tuple(e for group in kept.values() for e in group)
+    return Library(entries, {}, f"{'simulated files' if data.simulated else 'files'} of {data.folder.name}")
+
+
+def _without_leakage(entry: Entry, leak_hv: complex, leak_vh: complex) -> Entry:
+    """An entry's pixels without cross-polar leakage, at most `PIXELS` of them."""
+    at = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
+    v = entry.v[at].astype(np.complex128)  # the phase that H and V have in common does not matter
+    h, v = correct_leakage(entry.p[at] * v, v, leak_hv, leak_vh)
+    return replace(
+        entry,
+        h=np.abs(h).astype(np.float32),
+        v=np.abs(v).astype(np.float32),
+        p=(h / v).astype(np.complex64),
+    )

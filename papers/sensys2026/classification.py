@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from functools import cache
+from textwrap import fill
 
 import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
 
 from polysight.host.materials.judge import Score, best_model, score, strangers
 from polysight.host.materials.models import DISCRIMINANT, PAPER
 from polysight.host.materials.samples import CHANNELS, Samples
-from polysight.host.report.figures import PALETTE
-from polysight.host.reproduce.bound import pixel_bound
-from polysight.host.reproduce.confusion import confusion_figure
-from polysight.host.reproduce.item import Item, Picture, Run, Table, dress, new_figure, percent
-from polysight.host.reproduce.patches import calibrated_errors, draw, groups
-from polysight.host.reproduce.published import published
+from polysight.host.polarimetry import fresnel
+from polysight.host.report.figures import INK, PALETTE
+from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, percent
+from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups
+from polysight.papers.sensys2026.table2 import Published, published
 
 SECOND_ANGLE_DEG = 55.0
 CHOICE, RESULT = 17, 20
@@ -246,3 +248,97 @@ def fig20(run: Run) -> Item:
         {"channels": Picture(fig, "Published and simulated accuracy of each channel.")},
         data,
     )
+
+
+Panel = tuple[Score, npt.NDArray[np.float64], str]
+
+
+def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) -> Figure:
+    """One panel for each score and matrix, with its title."""
+    n = len(materials)
+    many = n > 12
+    fig = new_figure(11.5, 11.0 if many else 4.5)
+    size = 7.5 if many else 8.0
+    axes = (fig.subplots(2, 2) if many else fig.subplots(1, len(panels), squeeze=False)).ravel()
+    if many:
+        axes[3].set_axis_off()
+        axes[3].text(0.02, 0.98, _confused(panels[1:]), va="top", fontsize=9, color=INK, linespacing=1.5)
+    shown = None
+    for ax, (found, table, title) in zip(axes[: len(panels)], panels, strict=True):
+        order = [found.names.index(m.name) for m in materials]
+        shares = table[np.ix_(order, order)]
+        shown = ax.imshow(100 * shares, cmap="cividis", vmin=0, vmax=100, interpolation="nearest")
+        first = ax in (axes[0], axes[2] if many else axes[0])
+        lines = [fill(line, 60 if many else 36) for line in title.splitlines()]
+        dress(ax, "\n".join(lines), "named", "true" if first else "")
+        ax.title.set_fontsize(9.5)
+        ax.grid(visible=False)
+        ax.set_xticks(range(n), [str(m.number) for m in materials], fontsize=size)
+        ax.set_yticks(range(n), [f"{m.name}  {m.number}" if first else str(m.number) for m in materials], fontsize=size)
+        for i, j in zip(*np.nonzero(shares > 0.005), strict=True):
+            colour = INK if shares[i, j] > 0.6 else "w"
+            text = f"{100 * shares[i, j]:.0f}"
+            ax.text(j, i, text, ha="center", va="center", fontsize=size - 1.5, color=colour)
+    if shown is not None:
+        bar = fig.colorbar(shown, ax=list(axes), fraction=0.02, pad=0.01)
+        bar.set_label("% of pixels", fontsize=8)
+        bar.ax.tick_params(labelsize=7)
+    return fig
+
+
+def _confused(panels: Sequence[Panel], shown: int = 5) -> str:
+    """The largest confusions of each panel."""
+    lines = []
+    for found, table, title in panels:
+        apart = table * (1 - np.eye(len(table)))
+        lines.append(f"Most confused, {title.splitlines()[0].rpartition(':')[0]}:")
+        for at in np.argsort(apart, axis=None)[::-1][:shown]:
+            i, j = np.unravel_index(at, apart.shape)
+            if apart[i, j] > 0:
+                lines.append(f"   {found.names[i]} named {found.names[j]}: {100 * apart[i, j]:.0f} %")
+        lines += [""] if apart.any() else ["   none", ""]
+    return "\n".join(lines)
+
+
+TRIALS = 4000
+
+
+@cache
+def pixel_bound(
+    materials: tuple[Published, ...], angles_deg: Sequence[float], errors: Errors, reference: bool, pixels: int
+) -> float:
+    """Share of pixels that Bayes' rule names right when it knows every material's mean and the errors' sizes.
+
+    On ln|H|, ln|V| and arg P the errors are normal up to their second order, and the same for all materials: Bayes'
+    rule is the nearest mean. Found by drawing, `TRIALS` a material.
+
+    Parameters
+    ----------
+    materials, angles_deg, errors
+        As they are drawn.
+    reference
+        Whether the error of the scan's metal reference is in the pixels, or known and taken off.
+    pixels
+        Pixels a decision is taken from: their own errors average out, those of the patch do not.
+    """
+    eps = np.array([m.permittivity for m in materials])
+    variance = errors.shared * (2 if reference else 1) + (1 - errors.shared) / pixels
+    columns, std = [], []
+    for angle in angles_deg:
+        r_s, r_p = fresnel(eps, np.radians(angle))
+        p = r_s / r_p
+        columns += [np.log(np.abs(r_s)), np.log(np.abs(r_p)), p / np.abs(p)]
+        std += [errors.amplitude, errors.amplitude, errors.phase_rad * np.sqrt(2)]
+    mean = np.stack(columns, axis=1)
+    rng, right = np.random.default_rng(0), []
+    for k in range(len(materials)):
+        cost = np.zeros((TRIALS, len(materials)))
+        for c, s in enumerate(std):
+            noise = s * np.sqrt(variance) * rng.standard_normal((TRIALS, 1))
+            if c % 3 == 2:  # a direction: its angle to that of every material
+                apart = np.angle(mean[k, c] * np.exp(1j * noise) / mean[None, :, c])
+            else:
+                apart = np.real(mean[k, c]) + noise - np.real(mean[None, :, c])
+            cost += (apart / s) ** 2
+        right.append((cost.argmin(axis=1) == k).mean())
+    return float(np.mean(right))

@@ -6,13 +6,12 @@ from dataclasses import asdict
 
 import numpy as np
 
-from polysight.host.materials import table2
 from polysight.host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
 from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.report.figures import INK, PALETTE
-from polysight.host.reproduce.item import Item, Picture, Run, Table, dress, new_figure
-from polysight.host.reproduce.patches import calibrated_errors, draw, groups
-from polysight.host.reproduce.published import published
+from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
+from polysight.papers.sensys2026.patches import calibrated_errors, draw, groups
+from polysight.papers.sensys2026.table2 import published, table2
 
 WATER = "Water (with glass)"
 

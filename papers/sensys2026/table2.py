@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from importlib import resources
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,16 @@ class Published:
 
 def table2() -> tuple[Published, ...]:
     """The 36 rows of the paper's Table 2, in its order."""
-    raw = json.loads(resources.files("polysight.host.materials").joinpath("table2.json").read_text(encoding="utf-8"))
+    raw = json.loads(resources.files("polysight.papers.sensys2026").joinpath("table2.json").read_text(encoding="utf-8"))
     return tuple(
         Published(m["number"], m["name"], complex(m["real"], -(m["loss"] or 0.0)), m["thickness_mm"], m["note"])
         for m in raw["materials"]
+    )
+
+
+@cache
+def published() -> dict[str, Any]:
+    """Content of `published.json`; percentages as the paper prints them."""
+    return json.loads(
+        resources.files("polysight.papers.sensys2026").joinpath("published.json").read_text(encoding="utf-8")
     )

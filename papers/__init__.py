@@ -1,0 +1,1 @@
+"""What reproduces published papers with this instrument, one folder a paper."""

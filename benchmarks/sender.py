@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.signal_block import PACKETS, make_block, make_packets, number
+from polysight.host.capture.network import _Header, _IoVec, _Message
 from polysight.host.capture.scheduling import take_priority
-from polysight.host.capture.udp import _Header, _IoVec, _Message
 from polysight.shared.config import load_instrument
 
 BEHIND_S = 0.005  # a card never catches up on more than its own buffer: what is later than this is sent later

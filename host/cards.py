@@ -9,8 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.host.capture.card import CardClient
-from polysight.host.capture.eeprom import EepromSettings, program_eeprom
+from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.host.capture.survey import CardSurvey, HopFinding, survey_cards
 from polysight.host.confirm import typed
 from polysight.shared.config import Board, Instrument, load_instrument

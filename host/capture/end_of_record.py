@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 from polysight.host.capture.dca1000 import Status
-from polysight.host.capture.receiver_words import Progress
+from polysight.host.capture.receiver import Progress
 
 TAIL_S = 2.0
 """Silence after which a card sends what does not fill a packet (seen)."""

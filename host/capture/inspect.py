@@ -7,28 +7,159 @@ What is not known is guessed from the statistics, and called a guess. `inspect_p
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture.dca1000 import Status
-from polysight.host.capture.packets_in_file import packets_in_file, place_packets
-from polysight.host.capture.placed import Placed
-from polysight.host.capture.shape import (
-    DRAW,
-    SAMPLES_TRIED,
-    Shape,
-    best_shape,
-    candidates,
-    decode,
-    is_mirrored,
-    is_offset_binary,
-    spectra,
-    spectral_disorder,
-)
+from polysight.host.capture import dca1000
+from polysight.host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
+from polysight.host.capture.decode import decode_real, decode_row, decode_two_lane
+from polysight.host.capture.placement import Placed, Placement
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
+
+Samples = NDArray[np.complex64] | NDArray[np.float32]
+SAMPLES_TRIED = (256, 512, 128, 1024, 64)
+DRAW = 0.02
+"""Layouts whose disorder differs by less are not told apart: the likelier one is taken."""
+_MOST_CHIRPS = 4096  # enough for the statistics
+_CHIRPS_TRIED = 512
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Layout of a recording: LVDS lanes, complex or real samples, samples of a chirp, antennas."""
+
+    lanes: int
+    is_complex: bool
+    samples: int
+    rx: int = 4
+
+    @staticmethod
+    def of_instrument(rig: Instrument) -> Shape:
+        """What a rig file makes the card send."""
+        return Shape(4, rig.chirp.if_mode.startswith("complex"), rig.chirp.samples)
+
+    @property
+    def chirp_bytes(self) -> int:
+        """Bytes of one chirp of all antennas."""
+        return self.samples * self.rx * (4 if self.is_complex else 2)
+
+    def __str__(self) -> str:
+        return f"{self.lanes}-lane {'complex' if self.is_complex else 'real'}, {self.samples} samples x {self.rx} RX"
+
+
+def decode(payload: NDArray[np.uint8], shape: Shape, q_first: bool = False, most: int = _MOST_CHIRPS) -> Samples:
+    """The first chirps in a layout: complex64 or float32 [rx, chirp, sample]."""
+    chirps = min(payload.size // shape.chirp_bytes, most)
+    if not shape.is_complex:
+        return decode_real(payload, shape.lanes, chirps, shape.samples, shape.rx)
+    if shape.lanes == 4:
+        return decode_row(payload, None, chirps, shape.samples, shape.rx, q_first)[0]
+    return decode_two_lane(payload, chirps, shape.samples, shape.rx, q_first)
+
+
+def candidates(
+    lanes: int | None, is_complex: bool | None, samples: int | None, rx: int, payload_bytes: int
+) -> list[Shape]:
+    """Every layout that agrees with what is known and fits into the payload, the likeliest first."""
+    shapes = (
+        Shape(k, c, n, rx)
+        for n, c, k in product(
+            SAMPLES_TRIED if samples is None else (samples,),
+            (True, False) if is_complex is None else (is_complex,),
+            (4, 2) if lanes is None else (lanes,),
+        )
+    )
+    return [s for s in shapes if s.chirp_bytes <= payload_bytes]
+
+
+def best_shape(payload: NDArray[np.uint8], shapes: list[Shape]) -> Shape:
+    """The layout with the least disorder; the earlier, likelier one wins a draw."""
+    best, least = shapes[0], np.inf
+    for shape in shapes:
+        disorder = spectral_disorder(payload, shape)
+        if disorder < least - DRAW:
+            best, least = shape, disorder
+    return best
+
+
+def spectral_disorder(payload: NDArray[np.uint8], shape: Shape) -> float:
+    """Entropy of the chirps' spectra over its largest value, 0..1: the right layout has the fewest bins occupied.
+
+    The mean of every chirp is removed, or a constant would make any layout look ordered. Values in the wrong place
+    alternate between antennas, between I and Q, or between chirps, which spreads a tone over several lines.
+    """
+    power = spectra(decode(payload, shape, most=_CHIRPS_TRIED), remove_mean=True)
+    share = power / np.maximum(power.sum(axis=-1, keepdims=True), 1e-12)
+    return float(-(share * np.log(share + 1e-15)).sum(axis=-1).mean() / np.log(power.shape[-1]))
+
+
+def spectra(cube: Samples, remove_mean: bool = False) -> NDArray[np.float64]:
+    """Power spectra, Hann window: float64 [rx, chirp, bin], half as many bins for real samples."""
+    if remove_mean:
+        cube = cube - cube.mean(axis=-1, keepdims=True)
+    windowed = cube * np.hanning(cube.shape[-1])
+    transform = np.fft.fft(windowed, axis=-1) if np.iscomplexobj(cube) else np.fft.rfft(windowed, axis=-1)[..., :-1]
+    return np.abs(transform) ** 2
+
+
+def is_mirrored(power: NDArray[np.float64]) -> bool:
+    """Whether a complex spectrum, float64 [bin], lies at negative frequencies: I and Q are in the other order.
+
+    Where IF up to 0.9 sample rates is kept (complex 1x) the upper half is no proof; much more power in the last quarter
+    than in the first is, because returns come from near. The bins next to zero are left out.
+    """
+    n, rim = power.size, 3
+    return bool(power[n - n // 4 : n - rim].sum() > 4 * power[rim + 1 : n // 4 + 1].sum())
+
+
+def is_offset_binary(words: NDArray[np.int16]) -> bool:
+    """Whether the values spread far less once their sign bit is turned round."""
+    some = words[: 1 << 20]
+    return bool(some.size and (some ^ np.int16(-0x8000)).std() < some.std() / 4)
+
+
+_LOOKED_AT = 16
+
+
+def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
+    """The packets of a file that holds full packets one after another, the last perhaps short; none of any other.
+
+    Some programs write packets to a file as they come: each 1456 bytes of payload then begin with ten of counters.
+    """
+    count = min(_LOOKED_AT, payload.size // MAX_PACKET_BYTES)
+    if count < 2:
+        return []
+    some = payload[: count * MAX_PACKET_BYTES].reshape(count, MAX_PACKET_BYTES)
+    heads = [dca1000.decode_packet_header(row.tobytes()) for row in some]
+    (sequence, byte_count), k = heads[0], range(count)
+    if heads != [(sequence + i, byte_count + i * MAX_PAYLOAD_BYTES) for i in k]:
+        return []
+    pieces = [payload[a : a + MAX_PACKET_BYTES].tobytes() for a in range(0, payload.size, MAX_PACKET_BYTES)]
+    return [piece for piece in pieces if len(piece) > dca1000.PACKET_HEADER_BYTES]
+
+
+def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
+    """Place a record whose length is not known: it reaches from the lowest to the highest byte count.
+
+    Returns its bytes, uint8 [n], and what became of the packets. Raises DataError when they are not of one record.
+    """
+    first = dca1000.decode_packet_header(packets[0])[1]
+    half, whole = 1 << (dca1000.BYTE_COUNT_BITS - 1), 1 << dca1000.BYTE_COUNT_BITS
+    ahead = [(dca1000.decode_packet_header(p)[1] - first + half) % whole - half for p in packets]
+    ends = [a + len(p) - dca1000.PACKET_HEADER_BYTES for a, p in zip(ahead, packets, strict=True)]
+    size = max(ends) - min(ahead)
+    if size > 1 << 34:
+        raise DataError(f"byte counts span {size} bytes: more than one record, or corrupted packets")
+    out = np.zeros(size, dtype=np.uint8)
+    placement = Placement(out)
+    for packet in packets:
+        placement.place_packet(packet)
+    return out, placement.finish()
+
 
 _FULL_SCALE = 32767
 _MUCH_DC = 0.05 * _FULL_SCALE

@@ -2,16 +2,91 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Code, Status
-from polysight.host.capture.inspect import CardReport, Known, Report, inspect_payload
-from polysight.host.capture.packets_in_file import place_packets
-from polysight.host.capture.pcap import read_pcap
+from polysight.host.capture.inspect import CardReport, Known, Report, inspect_payload, place_packets
 from polysight.shared.errors import DataError, ProtocolError
+
+_MAGIC = {0xA1B2C3D4: 1_000, 0xA1B23C4D: 1}  # microseconds or nanoseconds, as ns a tick
+_PCAPNG = 0x0A0D0D0A
+_AGAIN = "record again: let tcpdump end by itself, or stop it with Ctrl-C"
+_ETHERNET, _IPV4, _VLAN, _UDP = 1, 0x0800, 0x8100, 17
+
+
+class Datagram(NamedTuple):
+    """One UDP datagram and when it was seen."""
+
+    t_ns: int
+    source: tuple[str, int]
+    destination: tuple[str, int]
+    payload: bytes
+
+
+def is_pcap(head: bytes) -> bool:
+    """Whether a file that begins with these four bytes is a pcap or pcapng file, in either byte order."""
+    return len(head) >= 4 and any(struct.unpack_from(f"{order}I", head)[0] in (*_MAGIC, _PCAPNG) for order in "<>")
+
+
+def read_pcap(path: Path) -> Iterator[Datagram]:
+    """The UDP datagrams of a file, in order; other packets are passed over.
+
+    Raises
+    ------
+    DataError
+        when the file is not a classic pcap file of Ethernet packets, or ends within a packet.
+    """
+    try:
+        raw = path.read_bytes()
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read: {e.strerror}", "the path is wrong", "give a capture file") from None
+    for order in "<>":
+        if len(raw) >= 24 and (tick := _MAGIC.get(struct.unpack_from(order + "I", raw)[0])) is not None:
+            break
+    else:
+        newer = len(raw) >= 4 and struct.unpack_from("<I", raw)[0] == _PCAPNG
+        raise DataError(
+            f"{path}: not a pcap file",
+            "it is pcapng" if newer else "another kind of file",
+            f"`editcap -F pcap {path.name} converted.pcap` makes one" if newer else "record with `tcpdump -w`",
+        )
+    link = struct.unpack_from(order + "I", raw, 20)[0]
+    if link != _ETHERNET:
+        raise DataError(f"{path}: link type {link}, expected {_ETHERNET} (Ethernet)", "recorded on `-i any`?")
+    header = struct.Struct(order + "IIII")
+    position = 24
+    while position < len(raw):
+        if position + header.size > len(raw):
+            raise DataError(f"{path}: ends within a packet header at byte {position}", "truncated file", _AGAIN)
+        seconds, ticks, kept, _ = header.unpack_from(raw, position)
+        position += header.size
+        if position + kept > len(raw):
+            raise DataError(f"{path}: ends within a packet at byte {position}", "truncated file", _AGAIN)
+        found = _udp(raw[position : position + kept])
+        position += kept
+        if found is not None:
+            yield Datagram(seconds * 1_000_000_000 + ticks * tick, *found)
+
+
+def _udp(frame: bytes) -> tuple[tuple[str, int], tuple[str, int], bytes] | None:
+    """Source, destination and payload of an Ethernet frame with an unfragmented IPv4 UDP datagram."""
+    at, kind = 14, int.from_bytes(frame[12:14], "big")
+    if kind == _VLAN:
+        at, kind = 18, int.from_bytes(frame[16:18], "big")
+    if kind != _IPV4 or len(frame) < at + 28 or frame[at] >> 4 != 4 or frame[at + 9] != _UDP:
+        return None
+    if int.from_bytes(frame[at + 6 : at + 8], "big") & 0x3FFF:
+        return None
+    udp = at + (frame[at] & 0x0F) * 4
+    source_port, destination_port, length = struct.unpack_from(">HHH", frame, udp)
+    source, destination = (".".join(map(str, frame[at + k : at + k + 4])) for k in (12, 16))
+    return (source, source_port), (destination, destination_port), frame[udp + 8 : udp + length]
 
 
 def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> Report:  # noqa: B008 - immutable

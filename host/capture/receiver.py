@@ -9,17 +9,183 @@ import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from polysight.host.capture import receiver_words as words
-from polysight.host.capture.dca1000 import Status
-from polysight.host.capture.receiver_words import Progress, RowCapture
+import msgspec
+
+from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError
 
+
+class _Words(msgspec.Struct, frozen=True, tag=True):
+    pass
+
+
+class Open(_Words, frozen=True):
+    """Bind the data socket. Answered with Opened or Failed."""
+
+    board: str
+    host_address: str
+    data_port: int
+    card_address: str
+    buffer_bytes: int
+    core: int | None = None
+
+
+class BeginRow(_Words, frozen=True):
+    """Drop what is waiting, and place what comes from now on into the file at `path`. Answered with Began or Failed."""
+
+    row: int
+    take: int
+    expected_bytes: int
+    frame_bytes: int
+    path: str
+
+
+class EndRow(_Words, frozen=True):
+    """The row has ended: fetch what still waits, make the file durable. Answered with RowCapture or Failed.
+
+    `card_status` holds the bits the card reported since record start: some say that it lost data itself.
+    """
+
+    card_status: int = 0
+
+
+class Discard(_Words, frozen=True):
+    """Forget the running row and remove its file. Answered with Discarded."""
+
+
+class Report(_Words, frozen=True):
+    """Answered with Progress."""
+
+
+class Opened(_Words, frozen=True):
+    """The socket is bound. `scheduling` says where and how urgently the process runs, `warnings` what it may not."""
+
+    granted_bytes: int
+    data_port: int
+    scheduling: str = ""
+    warnings: list[str] = []
+
+
+class Began(_Words, frozen=True):
+    """Ready for the row; `stale` packets that came between rows were dropped."""
+
+    stale: int
+
+
+class Progress(_Words, frozen=True):
+    """How far the row is. Sent unasked when every expected byte is there, and when the short last packet came.
+
+    `ended`: the furthest packet is a short one, which only the last of a record is.
+    """
+
+    row: int
+    take: int
+    received: int
+    complete: bool
+    last_arrival_ns: int  # monotonic clock; 0 before the first packet
+    ended: bool = False
+
+
+class RowCapture(_Words, frozen=True):
+    """What one board's receiver got of one row.
+
+    `bytes` is what was placed, `missing` the byte ranges that are not (the whole row when `located` is false).
+    Arrival times are the host's monotonic clock, 0 when no packet came. Counts of packets as in
+    :class:`polysight.host.capture.placement.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
+    :class:`polysight.host.capture.placement.Losses`. `card_status` is what the card reported by itself during the row. `holes`
+    and `slipped` as in :class:`polysight.host.capture.placement.Placed`.
+    """
+
+    row: int
+    take: int
+    expected: int
+    bytes: int
+    missing: list[tuple[int, int]]
+    located: bool
+    reason: str
+    packets: int
+    duplicates: int
+    late: int
+    outside: int
+    disagreeing: int
+    malformed: int
+    short: int
+    strangers: int
+    stale: int
+    kernel_drops: int
+    first_arrival_ns: int
+    last_arrival_ns: int
+    crc32: int
+    index_crc32: int
+    leftover: int = 0
+    late_by_bytes: int = 0
+    head_bytes: int = 0
+    gaps: int = 0
+    gap_bytes: int = 0
+    tail_bytes: int = 0
+    card_status: int = 0
+    holes: list[tuple[int, int]] = []
+    slipped: bool = False
+
+    @property
+    def missing_bytes(self) -> int:
+        """Bytes of the row that are not there for certain."""
+        return sum(stop - start for start, stop in self.missing)
+
+    @property
+    def lost_before_packets(self) -> Status:
+        """The status bits by which the card said that it dropped data before numbering it; 0 when it did not."""
+        return Status(self.card_status) & LOST_BEFORE_PACKETS
+
+    @property
+    def complete(self) -> bool:
+        """Whether the row is there to the last byte."""
+        return self.located and not self.missing
+
+
+class Discarded(_Words, frozen=True):
+    """The row is forgotten."""
+
+
+class Failed(_Words, frozen=True):
+    """What was asked could not be done."""
+
+    what: str
+    why: str = ""
+    remedy: str = ""
+
+
+Request = Open | BeginRow | EndRow | Discard | Report
+Answer = Opened | Began | Progress | RowCapture | Discarded | Failed
+_encoder = msgspec.msgpack.Encoder()
+_requests: Any = msgspec.msgpack.Decoder(Request)
+_answers: Any = msgspec.msgpack.Decoder(Answer)
+
+
+def send(connection: Connection, words: Request | Answer) -> None:
+    """Send one message. Raises DeviceError when the other side is gone."""
+    try:
+        connection.send_bytes(_encoder.encode(words))
+    except OSError as e:
+        raise DeviceError(f"the receiver's pipe broke: {e}", "the other process ended") from None
+
+
+def next_request(connection: Connection) -> Request:
+    """The next request. Raises EOFError when the host is gone."""
+    return _requests.decode(connection.recv_bytes())
+
+
+def next_answer(connection: Connection) -> Answer:
+    """The next answer. Raises EOFError when the receiver is gone."""
+    return _answers.decode(connection.recv_bytes())
+
+
 _START_LIMIT_S = 30.0
 _ANSWER_LIMIT_S = 60.0  # ending a row waits for the disk
-A = TypeVar("A", bound=words.Answer)
+A = TypeVar("A", bound=Answer)
 
 
 class ReceiverProcess:
@@ -60,10 +226,8 @@ class ReceiverProcess:
             )
         self._connection = Connection(ours.detach())
         try:
-            request = words.Open(
-                board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, core
-            )
-            opened = self._ask(request, words.Opened, _START_LIMIT_S)
+            request = Open(board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, core)
+            opened = self._ask(request, Opened, _START_LIMIT_S)
         except DeviceError:
             self.close()
             raise
@@ -84,8 +248,8 @@ class ReceiverProcess:
 
         Raises DeviceError when the file cannot be made.
         """
-        request = words.BeginRow(row, take, expected_bytes, frame_bytes, str(path))
-        stale = self._ask(request, words.Began, _ANSWER_LIMIT_S).stale
+        request = BeginRow(row, take, expected_bytes, frame_bytes, str(path))
+        stale = self._ask(request, Began, _ANSWER_LIMIT_S).stale
         self._progress = Progress(row, take, 0, expected_bytes == 0, 0)
         return stale
 
@@ -97,7 +261,7 @@ class ReceiverProcess:
 
     def report(self) -> Progress:
         """How far the row is, asked for."""
-        return self._ask(words.Report(), Progress, _ANSWER_LIMIT_S)
+        return self._ask(Report(), Progress, _ANSWER_LIMIT_S)
 
     def end_row(self, card_status: Status | None = None) -> RowCapture:
         """End the row: its file is durable when this returns. Raises DeviceError.
@@ -105,11 +269,11 @@ class ReceiverProcess:
         `card_status` is what the card reported by itself since record start. With bits 7 or 9 in it the card dropped
         data before numbering it: the row is masked as a whole, and the reason says so.
         """
-        return self._ask(words.EndRow(int(card_status or 0)), RowCapture, _ANSWER_LIMIT_S)
+        return self._ask(EndRow(int(card_status or 0)), RowCapture, _ANSWER_LIMIT_S)
 
     def discard(self) -> None:
         """Forget the running row and remove its file."""
-        self._ask(words.Discard(), words.Discarded, _ANSWER_LIMIT_S)
+        self._ask(Discard(), Discarded, _ANSWER_LIMIT_S)
 
     def close(self) -> None:
         """End the process. Twice is once."""
@@ -128,15 +292,15 @@ class ReceiverProcess:
     ) -> None:
         self.close()
 
-    def _take(self, answer: words.Answer) -> None:
+    def _take(self, answer: Answer) -> None:
         if isinstance(answer, Progress):
             self._progress = answer
-        elif isinstance(answer, words.Failed):
+        elif isinstance(answer, Failed):
             raise DeviceError(answer.what, answer.why, answer.remedy)
 
-    def _next(self) -> words.Answer:
+    def _next(self) -> Answer:
         try:
-            return words.next_answer(self._connection)
+            return next_answer(self._connection)
         except (EOFError, OSError):
             raise DeviceError(
                 f"{self.board.name}: the receiving process ended with status {self._process.poll()}",
@@ -144,8 +308,8 @@ class ReceiverProcess:
                 "`dmesg` tells whether the kernel ended it, for want of memory",
             ) from None
 
-    def _ask(self, request: words.Request, kind: type[A], limit_s: float) -> A:
-        words.send(self._connection, request)
+    def _ask(self, request: Request, kind: type[A], limit_s: float) -> A:
+        send(self._connection, request)
         deadline = time.monotonic() + limit_s
         while self._connection.poll(max(0.0, deadline - time.monotonic())):
             answer = self._next()

@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Literal
 
 from polysight.host.capture.card import CardClient
-from polysight.host.capture.hops import Hop, route_interface, silent_hop, silent_radar
-from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.network import Hop, check_receive_buffer, route_interface, silent_hop, silent_radar
+from polysight.host.capture.receiver import ReceiverProcess, RowCapture
 from polysight.host.capture.scheduling import PRIORITY_REMEDY, receiver_cores
-from polysight.host.capture.udp import check_receive_buffer
 from polysight.shared.config import Board, Instrument
 from polysight.shared.errors import DeviceError
 

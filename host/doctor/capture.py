@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.capture.decode import row_words
-from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.receiver import RowCapture
 from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import BoardState
 from polysight.host.scan.capture_rig import CaptureRig

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from polysight.host.capture.hops import route_interface
+from polysight.host.capture.network import route_interface
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.finding import Finding, ok, warning
 from polysight.host.doctor.kernel import nic

@@ -5,7 +5,7 @@ Nothing moves. Radars that are armed transmit for as long as the pulses last, so
 
 from __future__ import annotations
 
-from polysight.host.capture.hops import silent_radar
+from polysight.host.capture.network import silent_radar
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
 from polysight.host.radar.interface import RadarState

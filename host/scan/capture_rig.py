@@ -11,10 +11,9 @@ from types import TracebackType
 from polysight.host.capture.card import CardClient
 from polysight.host.capture.dca1000 import Status, Version
 from polysight.host.capture.end_of_record import TAIL_S
-from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.capture.receiver_words import Progress, RowCapture
+from polysight.host.capture.network import check_receive_buffer
+from polysight.host.capture.receiver import Progress, ReceiverProcess, RowCapture
 from polysight.host.capture.scheduling import receiver_cores
-from polysight.host.capture.udp import check_receive_buffer
 from polysight.host.store.scanfolder import PART
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError

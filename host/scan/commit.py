@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from polysight.host.capture.decode import valid_frames
-from polysight.host.capture.hops import silent_radar
+from polysight.host.capture.network import silent_radar
 from polysight.host.scan.slipped_row import write_in_place
 from polysight.host.scan.take import Take
 from polysight.host.scan.take_faults import TakeFault, reasons

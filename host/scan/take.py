@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.receiver import RowCapture
 from polysight.host.radar.interface import BoardState, RadarState
 from polysight.host.scan.missed_pulses import PlacedFrames
 from polysight.host.scan.slipped_row import ToldCapture, describe

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.capture.card import CardClient
+from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.host.capture.dca1000 import Code, Status, decode_request, encode_reply
-from polysight.host.capture.eeprom import EepromSettings, program_eeprom
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.simulators.dca1000 import Network
 

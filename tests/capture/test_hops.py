@@ -12,8 +12,15 @@ import msgspec
 import pytest
 
 from polysight.host.capture.dca1000 import Status
-from polysight.host.capture.hops import Hop, neighbour_answers, route_interface, silent_card, silent_hop, silent_radar
-from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.network import (
+    Hop,
+    neighbour_answers,
+    route_interface,
+    silent_card,
+    silent_hop,
+    silent_radar,
+)
+from polysight.host.capture.receiver import RowCapture
 from polysight.shared.config import Board
 
 CARD = "192.168.33.180"

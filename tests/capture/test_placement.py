@@ -11,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from polysight.host.capture.dca1000 import encode_packet
-from polysight.host.capture.placed import Counters, Losses, Placed
-from polysight.host.capture.placement import Placement
+from polysight.host.capture.placement import Counters, Losses, Placed, Placement
 
 FULL = 1456
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault

@@ -17,15 +17,9 @@ import pytest
 
 from polysight.host.capture.dca1000 import Status, encode_packet
 from polysight.host.capture.end_of_record import Ending, record_ending
-from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.capture.receiver_words import Progress
+from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
+from polysight.host.capture.receiver import Progress, ReceiverProcess
 from polysight.host.capture.segment import read_index
-from polysight.host.capture.udp import (
-    BatchReceiver,
-    bind_udp,
-    enlarge_receive_buffer,
-    kernel_drops,
-)
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError
 

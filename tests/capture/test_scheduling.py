@@ -6,9 +6,9 @@ import os
 
 import pytest
 
+from polysight.host.capture.network import check_receive_buffer, usable_packets
 from polysight.host.capture.receiver import ReceiverProcess
 from polysight.host.capture.scheduling import receiver_cores, take_core, take_priority
-from polysight.host.capture.udp import check_receive_buffer, usable_packets
 from polysight.shared.errors import DeviceError
 
 FULL = 1456

@@ -13,7 +13,7 @@ import pytest
 
 from docs.check.pages import ROOT, read_page
 from polysight.host.capture import dca1000
-from polysight.host.capture.eeprom import EepromSettings
+from polysight.host.capture.card import EepromSettings
 from polysight.host.radar import commands, events
 from polysight.host.radar.commands import Command, DeviceConfiguration
 from polysight.host.radar.messages import Direction, Kind, SubBlock, decode

@@ -9,7 +9,7 @@ import tomli_w
 from doctor_case import QUICK, RIG, bench_of, rig_with
 
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
-from polysight.host.capture.hops import route_interface
+from polysight.host.capture.network import route_interface
 from polysight.host.cli import main
 from polysight.host.doctor import kernel
 from polysight.host.doctor.bench import Bench, System, Wanted

@@ -19,7 +19,7 @@ def judged(board="RH", rig=RIG, **disturbances):
 
 def captured(words, **changes):
     valid = np.ones(len(words), bool)
-    from polysight.host.capture.receiver_words import RowCapture
+    from polysight.host.capture.receiver import RowCapture
 
     zeros = dict.fromkeys((f for f in RowCapture.__struct_fields__), 0)
     row = {**zeros, "missing": [], "located": True, "reason": "", "holes": [], "slipped": False}

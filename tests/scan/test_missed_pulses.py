@@ -154,7 +154,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
 
 
 def _capture(expected, holes):
-    from polysight.host.capture.receiver_words import RowCapture
+    from polysight.host.capture.receiver import RowCapture
 
     zeros = dict.fromkeys(RowCapture.__struct_fields__, 0)
     return RowCapture(

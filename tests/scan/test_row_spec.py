@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.capture import receiver_words
+from polysight.host.capture import receiver as receiver_words
 from polysight.host.capture.dca1000 import Code
 from polysight.host.radar.interface import RadarControl, RadarState
 from polysight.host.scan.states import TRANSITIONS, RowState, RowTransaction

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polysight.host.capture.receiver_words import RowCapture
+from polysight.host.capture.receiver import RowCapture
 from polysight.host.capture.segment import Segment, write_index
 from polysight.host.pipeline import Pipeline
 from polysight.host.scan import run as host_run

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.radar.validator import direct_if_hz
+from polysight.host.radar.constraints import direct_if_hz
 from polysight.host.sync import BoardSetup
 from polysight.host.sync.align import AlignedRow, align_row, whole_blocks
 from polysight.host.sync.direct_path import reference

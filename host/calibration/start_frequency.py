@@ -12,7 +12,7 @@ import numpy as np
 from polysight.host.calibration.direct_signal import band_hz, find_direct, unwrapped
 from polysight.host.calibration.files import BoardStart
 from polysight.host.calibration.rows import board_rows
-from polysight.host.radar.validator import direct_if_hz
+from polysight.host.radar.constraints import direct_if_hz
 from polysight.host.store.source import ScanSource
 from polysight.host.sync import BoardSetup
 from polysight.shared.config import Board, Instrument

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.finding import Finding, ok
-from polysight.host.radar.validator import require
+from polysight.host.radar.constraints import require
 from polysight.shared.config import load_instrument
 from polysight.shared.raster import check_burst_fits
 

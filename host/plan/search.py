@@ -12,8 +12,8 @@ from polysight.host.plan.changes import Changes
 from polysight.host.plan.forecast import Forecast, Noise, burst_facts, cautions, forecast, noise_facts
 from polysight.host.plan.timing import ROW_OVERHEAD_S, payload_bytes, scan_time
 from polysight.host.plan.warn import MAX_STEPS_PER_S, Caution
+from polysight.host.radar.constraints import INTER_FRAME_US
 from polysight.host.radar.program import TRIGGER_MARGIN_US, chirp_us
-from polysight.host.radar.validator import INTER_FRAME_US
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 
@@ -21,11 +21,11 @@ _MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
 _MARGIN = 0.95  # of the time between two points that a burst may fill
 _MOST_TRAVEL_WAVELENGTHS = 0.5
 MAX_FRAMES = 65535
-"""Of a row, that a radar counts (host/radar/validator.py)."""
+"""Of a row, that a radar counts (host/radar/constraints.py)."""
 
 
 def shortest_period_us(rig: Instrument) -> float:
-    """Shortest pulse period that the radars take (host/radar/validator.py), up to the next 10 us."""
+    """Shortest pulse period that the radars take (host/radar/constraints.py), up to the next 10 us."""
     return 10 * float(np.ceil((chirp_us(rig) + INTER_FRAME_US + TRIGGER_MARGIN_US) / 10))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from polysight.host.options import Options
 from polysight.host.plan.field import FieldLimits
 from polysight.host.plan.timing import payload_bytes, tail_s
-from polysight.host.radar.validator import constraints
+from polysight.host.radar.constraints import constraints
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.raster import check_burst_fits

@@ -12,11 +12,11 @@ import sys
 from pathlib import Path
 
 from polysight.host.radar.board import RadarBoard
+from polysight.host.radar.constraints import constraints, require
 from polysight.host.radar.messages import command, encode
 from polysight.host.radar.native import open_board
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import SystemClock
-from polysight.host.radar.validator import constraints, require
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, PolysightError
 

@@ -12,9 +12,8 @@ from enum import Enum
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
-from polysight.host.radar.firmware import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
 from polysight.host.radar.messages import Message
-from polysight.host.radar.program import Program
+from polysight.host.radar.program import ERASE_TIMEOUT_S, TO_FLASH, Program, file_chunks
 from polysight.host.radar.spi import RESPONSE_S, Clock, Link, WordLink
 from polysight.shared.errors import DeviceError
 

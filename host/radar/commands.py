@@ -152,7 +152,7 @@ class ApllBandwidth(Command):
 class LdoBypass(Command):
     """RF LDO bypass: with 1.3 V on the RF supplies, as boards usually have it, bypassing may damage the device.
 
-    ICD 202. :mod:`polysight.host.radar.validator` refuses `bypass` without an acknowledgement for that very board.
+    ICD 202. :mod:`polysight.host.radar.constraints` refuses `bypass` without an acknowledgement for that very board.
     """
 
     ID = 0x02CC

@@ -10,12 +10,11 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 
 from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.constraints import constraints, direct_if_hz, require
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import Clock, SystemClock, WordLink
-from polysight.host.radar.usb import open_usb
-from polysight.host.radar.usb_tcp import SCHEME, open_tcp
-from polysight.host.radar.validator import constraints, direct_if_hz, require
+from polysight.host.radar.usb import SCHEME, open_tcp, open_usb
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 
@@ -79,7 +78,7 @@ class NativeRadars(RadarControl):
     Raises
     ------
     ConfigError
-        when a constraint is broken (:mod:`polysight.host.radar.validator`), or the USB library is missing.
+        when a constraint is broken (:mod:`polysight.host.radar.constraints`), or the USB library is missing.
     DeviceError
         when a board cannot be opened or configured.
     """

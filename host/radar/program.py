@@ -5,9 +5,12 @@ Order: ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. N
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 
 from polysight.host.radar import commands as c
+from polysight.host.radar.commands import FileChunk
+from polysight.host.radar.messages import BODY_LIMIT
 from polysight.shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instrument
 
 TRIGGER_MARGIN_US = 200.0
@@ -94,3 +97,23 @@ def program(rig: Instrument, board: Board) -> Program:
     for command in (*made.basic, *made.waveform):
         command.block()  # refuses here what fits no field
     return made
+
+
+TO_RAM = 0  # lost at power-off
+TO_FLASH = 4  # the first of four places in the board's serial flash
+ERASE_TIMEOUT_S = 10.0  # the first part is acknowledged when the flash is erased
+
+
+def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:
+    """Commands that download an image, each with the number of those that follow it.
+
+    Raises
+    ------
+    ValueError
+        when the image is empty.
+    """
+    if not image:
+        raise ValueError("the firmware image is empty")
+    whole = struct.pack("<II", file_type, len(image)) + image
+    parts = [whole[at : at + BODY_LIMIT] for at in range(0, len(whole), BODY_LIMIT)]
+    return [(FileChunk(part), len(parts) - 1 - n) for n, part in enumerate(parts)]

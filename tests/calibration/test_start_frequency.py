@@ -8,7 +8,7 @@ from polysight.host.calibration.direct_signal import unwrapped
 from polysight.host.calibration.files import StartFile, read
 from polysight.host.calibration.start_frequency import by_geometry, start_of
 from polysight.host.cli import main
-from polysight.host.radar.validator import direct_if_hz
+from polysight.host.radar.constraints import direct_if_hz
 from polysight.shared.tables import to_builtins
 
 TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {"columns": 20, "rows": 20}}

@@ -51,7 +51,7 @@ def test_a_direct_path_beyond_the_band_is_called_an_alias_and_gets_an_offset(off
 
 
 def rig_offset_for_the_middle(name):
-    from polysight.host.radar.validator import direct_if_hz
+    from polysight.host.radar.constraints import direct_if_hz
 
     return 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(rig_with(0.0), rig_with(0.0).by_name(name))
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.mpsse import UsbWords, read_words, set_up_spi, write_words
 from polysight.host.radar.program import program
+from polysight.host.radar.usb import UsbWords, read_words, set_up_spi, write_words
 from polysight.shared.errors import DeviceError
 from polysight.simulators import radar_board as simulated
 from polysight.simulators.radar_usb import UsbChip

@@ -137,7 +137,7 @@ def test_a_board_that_fails_at_the_start_closes_the_others(rig, clock, boards):
 
 
 def test_three_boards_behind_usb(rig, clock, boards):
-    from polysight.host.radar.mpsse import UsbWords
+    from polysight.host.radar.usb import UsbWords
 
     chips = {s: UsbChip(b) for s, b in boards.by_serial.items()}
     with NativeRadars(

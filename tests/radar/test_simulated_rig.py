@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.constraints import constraints
 from polysight.host.radar.native import open_board
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import SystemClock
-from polysight.host.radar.validator import constraints
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radar import SimulatedRig

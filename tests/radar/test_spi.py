@@ -6,8 +6,8 @@ import pytest
 
 from polysight.host.radar.commands import GET_TEMPERATURES, RF_POWER_UP, DeviceConfiguration, LowPower
 from polysight.host.radar.events import CALIBRATION_REPORT, MAIN_POWER_UP, RF_POWER_UP_DONE
-from polysight.host.radar.firmware import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
 from polysight.host.radar.messages import READY_TO_READ, decode
+from polysight.host.radar.program import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
 from polysight.host.radar.spi import ATTEMPTS, Link
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radar_board import Fault

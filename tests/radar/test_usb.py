@@ -8,8 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from polysight.host.radar.mpsse import set_up_interrupt, set_up_spi
-from polysight.host.radar.usb import PRODUCT, VENDOR, open_usb
+from polysight.host.radar.usb import PRODUCT, VENDOR, open_usb, set_up_interrupt, set_up_spi
 from polysight.shared.errors import ConfigError, DeviceError
 
 

@@ -7,7 +7,7 @@ import math
 import msgspec
 import pytest
 
-from polysight.host.radar.validator import constraints, direct_if_hz, require
+from polysight.host.radar.constraints import constraints, direct_if_hz, require
 from polysight.shared.config import Instrument, NativeRadar
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import direct_path_m

@@ -12,9 +12,8 @@ import time
 import msgspec
 import pytest
 
-from polysight.host.radar.backends import Endless, radar_control
+from polysight.host.radar.backends import LINE, Endless, LineServers, radar_control
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
-from polysight.host.radar.line_server import LINE, LineServers
 from polysight.host.scan.run import run_scan
 from polysight.host.store.scanfolder import ScanFolder
 from polysight.shared.config import Instrument, Radar
@@ -120,7 +119,7 @@ def test_unknown_host_is_named():
 
 HALF_OPEN = """
 import socket, subprocess
-from polysight.host.radar.line_server import LineServers
+from polysight.host.radar.backends import LineServers
 from polysight.shared.errors import DeviceError
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 listener = socket.create_server(("127.0.0.1", 5000))

@@ -29,7 +29,7 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
     """
     from benchmarks.data import RepeatedRows, published  # after the thread limits
     from polysight.host.pipeline import Pipeline
-    from polysight.host.store.scanfolder import ScanFolder
+    from polysight.host.store.scan_folder import ScanFolder
 
     if "scan" in source:
         scan = ScanFolder.load(Path(source["scan"]))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polysight.host.imaging.grid import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import scene_gate_m
-from polysight.host.store.source import RowData
+from polysight.host.store.sources.source import RowData
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.raster import RasterPlan, Row, plan_raster

@@ -21,7 +21,7 @@ from polysight.host.imaging.imager import choose_imager
 from polysight.host.imaging.samples import BoardSamples
 from polysight.host.imaging.sparse import reconstruct
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, load_instrument
 from polysight.simulators.scene import load_scene
 from polysight.simulators.simulate import simulate

@@ -10,7 +10,7 @@ from pathlib import Path
 from polysight.host.capture.inspect import Known, inspect_bin
 from polysight.host.capture.inspect_pcap import inspect_pcap, is_pcap
 from polysight.host.capture.inspect_text import main_text
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validate import to_json, validate
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError, PolysightError

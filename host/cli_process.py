@@ -85,8 +85,8 @@ def process_scans(
 
 def _positions(data: Path) -> int:
     """Positions of a scan, or of the published grid where its files do not say it at a glance."""
-    from polysight.host.store.authors_settings import COLLECTION
-    from polysight.host.store.scanfolder import ScanFolder
+    from polysight.host.store.scan_folder import ScanFolder
+    from polysight.host.store.sources.published_settings import COLLECTION
 
     try:
         if (data / COLLECTION).exists():

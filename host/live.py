@@ -22,9 +22,8 @@ from polysight.host.scan.result import OnProgress
 from polysight.host.scan.run import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
 from polysight.host.scan.stop import StopRequest, hangups_pass
 from polysight.host.store import manifest
-from polysight.host.store.connection import check_same_scan
 from polysight.host.store.raw import require_raw
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder, check_same_scan
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, PolysightError, ScanError, advice
 

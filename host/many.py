@@ -22,8 +22,8 @@ from threading import Event
 from typing import Any, Literal
 
 from polysight.host.report import write_json
-from polysight.host.store.authors_settings import COLLECTION
-from polysight.host.store.scanfolder import MANIFEST, versions
+from polysight.host.store.scan_folder import MANIFEST, versions
+from polysight.host.store.sources.published_settings import COLLECTION
 from polysight.shared.errors import ConfigError
 
 MARK = ".finished.json"

@@ -27,10 +27,10 @@ from polysight.host.report import write_json
 from polysight.host.report.focus import focus_figure
 from polysight.host.report.read import IMAGE
 from polysight.host.report.scan_facts import write_scan_facts
-from polysight.host.store.authors import AuthorsCube, open_scan
 from polysight.host.store.raw import require_raw
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder, versions
-from polysight.host.store.source import ScanSource
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder, versions
+from polysight.host.store.sources.published import AuthorsCube, open_scan
+from polysight.host.store.sources.source import ScanSource
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DataError, ScanError, advice
 

@@ -24,10 +24,10 @@ from polysight.host.polarimetry import Incidence, PlaneReference, incidence_choi
 from polysight.host.products import Products, write_images, write_materials, write_quality
 from polysight.host.quality import Quality
 from polysight.host.report.scan_facts import write_scan_facts
-from polysight.host.store.authors import AuthorsCube
-from polysight.host.store.authors_settings import mirrored
-from polysight.host.store.scanfolder import ScanFolder
-from polysight.host.store.source import RowData, ScanSource
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.sources.published import AuthorsCube
+from polysight.host.store.sources.published_settings import mirrored
+from polysight.host.store.sources.source import RowData, ScanSource
 from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
 from polysight.host.sync.cubes import CubeReader
 from polysight.shared.config import Instrument

@@ -16,8 +16,8 @@ from polysight.host.report import write_image, write_json, write_report
 from polysight.host.report.assemble import classifier_sentence, context_of
 from polysight.host.report.products import write_atomically
 from polysight.host.report.scan_facts import with_scan
-from polysight.host.store.scanfolder import versions
-from polysight.host.store.source import Scan
+from polysight.host.store.scan_folder import versions
+from polysight.host.store.sources.source import Scan
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 

@@ -20,7 +20,7 @@ from polysight.host.materials.patches import PATCHES
 from polysight.host.products import LABELS
 from polysight.host.report.read import IMAGE, MATERIALS, QUALITY, SavedProducts
 from polysight.host.report.scan_facts import SCAN
-from polysight.host.store.appending import sync_folder
+from polysight.host.store.append_only import sync_folder
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, "report.html", "figures")

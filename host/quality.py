@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.store.source import RowData
+from polysight.host.store.sources.source import RowData
 from polysight.host.sync.backlash import echo_of_row, estimate_backlash, object_filter
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument

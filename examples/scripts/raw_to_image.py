@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from polysight.host.capture.decode import row_words
 from polysight.host.imaging import ImageBuilder
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.sync import BoardSetup, synchronise_row
 
 # %%

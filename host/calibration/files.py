@@ -11,7 +11,7 @@ import msgspec
 import tomli_w
 
 from polysight.host.imaging.imaged_with import ImagedWith
-from polysight.host.store.scanfolder import versions
+from polysight.host.store.scan_folder import versions
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.tables import decode, read_toml, to_builtins

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from polysight.host.calibration.direct_signal import find_direct
 from polysight.host.calibration.files import BoardFilter, places_crc32
 from polysight.host.calibration.rows import board_rows
-from polysight.host.store.source import ScanSource
+from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup
 from polysight.host.sync.hpf import HighPass, fit_high_pass
 from polysight.shared.config import Board

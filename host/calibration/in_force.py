@@ -18,7 +18,7 @@ from polysight.host.calibration.files import FilterFile, MetalFile, PlacesFile, 
 from polysight.host.imaging.grid import image_grid
 from polysight.host.imaging.imaged_with import ImagedWith
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import Board, Instrument, MountStep
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import to_builtins

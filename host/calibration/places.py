@@ -29,7 +29,7 @@ from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan,
 from polysight.host.calibration.rows import board_rows
 from polysight.host.imaging.grid import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.host.store.source import ScanSource
+from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.host.sync.hpf import HighPass
 from polysight.shared.config import Instrument

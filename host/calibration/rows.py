@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from polysight.host.calibration.files import SourceScan
 from polysight.host.capture.decode import row_words
-from polysight.host.store.authors import AuthorsCube, open_scan
 from polysight.host.store.raw import require_raw
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
-from polysight.host.store.source import ScanSource
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.host.store.sources.published import AuthorsCube, open_scan
+from polysight.host.store.sources.source import ScanSource
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 

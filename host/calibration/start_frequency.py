@@ -13,7 +13,7 @@ from polysight.host.calibration.direct_signal import band_hz, find_direct, unwra
 from polysight.host.calibration.files import BoardStart
 from polysight.host.calibration.rows import board_rows
 from polysight.host.radar.constraints import direct_if_hz
-from polysight.host.store.source import ScanSource
+from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup
 from polysight.shared.config import Board, Instrument
 from polysight.shared.errors import DataError

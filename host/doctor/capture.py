@@ -17,7 +17,7 @@ from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import BoardState
 from polysight.host.scan.capture_rig import CaptureRig
 from polysight.host.scan.pi_client import PiClient
-from polysight.host.store.scanfolder import PART
+from polysight.host.store.scan_folder import PART
 from polysight.shared.config import Instrument
 from polysight.shared.messages import Pulsed
 

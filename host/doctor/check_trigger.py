@@ -12,7 +12,7 @@ from polysight.host.doctor.check_pi import check_free
 from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
 from polysight.host.scan.ready import make_ready
 from polysight.host.scan.stop import StopRequest
-from polysight.host.store.scanfolder import new_scan_id
+from polysight.host.store.scan_folder import new_scan_id
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import explain
 from polysight.shared.messages import BeginRun, RowFinished

@@ -13,7 +13,7 @@ from polysight.host.plan.measured import noise_of, row_overhead_of
 from polysight.host.plan.search import propose
 from polysight.host.plan.text import describe, numbers, table
 from polysight.host.plan.timing import ROW_OVERHEAD_S
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, load_instrument
 
 _SIMULATED = "the simulated rig's (no hardware has been measured; --like SCAN or --snr-db give another)"

@@ -12,8 +12,8 @@ from polysight.host.plan.forecast import Noise
 from polysight.host.plan.timing import row_motion_s, tail_s, turn_s
 from polysight.host.report.sync_report import SyncReport
 from polysight.host.store.events import read_events
-from polysight.host.store.scanfolder import EVENTS, ScanFolder
-from polysight.host.store.source import ScanSource
+from polysight.host.store.scan_folder import EVENTS, ScanFolder
+from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.errors import DataError
 from polysight.shared.messages import Capture

@@ -17,7 +17,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.preview.pictures import Picture, draw
 from polysight.host.preview.words import Notice, of_error
 from polysight.host.store.manifest import Manifest
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import PolysightError

@@ -21,7 +21,7 @@ from polysight.host.preview.story import Story
 from polysight.host.preview.verdict import Signs
 from polysight.host.scan.control import Wish, ask, last_sign_of_life
 from polysight.host.store.manifest import Manifest
-from polysight.host.store.scanfolder import EVENTS, MANIFEST
+from polysight.host.store.scan_folder import EVENTS, MANIFEST
 from polysight.shared.errors import PolysightError
 
 _TURN_S = 0.2

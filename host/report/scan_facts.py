@@ -13,8 +13,8 @@ import tomli_w
 from polysight.host.imaging import ChannelImages
 from polysight.host.report.context import ReportContext
 from polysight.host.report.products import write_json
-from polysight.host.store.scanfolder import versions
-from polysight.host.store.source import Scan
+from polysight.host.store.scan_folder import versions
+from polysight.host.store.sources.source import Scan
 from polysight.shared.config import Instrument
 from polysight.shared.raster import RasterPlan
 from polysight.shared.tables import to_builtins

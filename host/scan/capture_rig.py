@@ -14,7 +14,7 @@ from polysight.host.capture.end_of_record import TAIL_S
 from polysight.host.capture.network import check_receive_buffer
 from polysight.host.capture.receiver import Progress, ReceiverProcess, RowCapture
 from polysight.host.capture.scheduling import receiver_cores
-from polysight.host.store.scanfolder import PART
+from polysight.host.store.scan_folder import PART
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 

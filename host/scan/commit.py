@@ -7,9 +7,9 @@ from polysight.host.capture.network import silent_radar
 from polysight.host.scan.slipped_row import write_in_place
 from polysight.host.scan.take import Take
 from polysight.host.scan.take_faults import TakeFault, reasons
-from polysight.host.store.appending import sync_folder
+from polysight.host.store.append_only import sync_folder
 from polysight.host.store.manifest import Fact, ManifestWriter
-from polysight.host.store.scanfolder import PART, ScanFolder, utc_now
+from polysight.host.store.scan_folder import PART, ScanFolder, utc_now
 from polysight.shared.errors import DeviceError, ScanError, advice
 from polysight.shared.faults import explain
 

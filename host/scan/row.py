@@ -18,7 +18,7 @@ from polysight.host.scan.states import RowState, RowTransaction
 from polysight.host.scan.stop import StopRequest
 from polysight.host.scan.take import Take
 from polysight.host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
-from polysight.host.store.scanfolder import PART
+from polysight.host.store.scan_folder import PART
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import explain

@@ -21,9 +21,8 @@ from polysight.host.scan.processing import OnRow
 from polysight.host.scan.result import OnProgress, ScanProgress, ScanResult
 from polysight.host.scan.running import RunningScan
 from polysight.host.scan.stop import StopRequest, interrupts_wait
-from polysight.host.store.connection import check_same_scan, connection_of
 from polysight.host.store.manifest import ManifestWriter
-from polysight.host.store.scanfolder import ScanFolder, new_scan_id, utc_now
+from polysight.host.store.scan_folder import ScanFolder, check_same_scan, connection_of, new_scan_id, utc_now
 from polysight.host.store.validate import damaged_rows
 from polysight.shared.backends import is_simulated
 from polysight.shared.config import Instrument
@@ -106,7 +105,7 @@ def resume_scan(
     """Go on with a scan at its first row that is not committed; committed rows are compared with their digests.
 
     A row that is not what was committed is taken again. `rig_now` says how the Pi and the boards are reached from now
-    on, and the limits; in all else it has to be the rig that the scan was begun with (:mod:`polysight.host.store.connection`).
+    on, and the limits; in all else it has to be the rig that the scan was begun with (:mod:`polysight.host.store.scan_folder`).
 
     Parameters and errors as :func:`run_scan`. `on_row` is called for the rows committed earlier too.
     """

@@ -21,7 +21,7 @@ from polysight.host.scan.take_faults import ON_REQUEST, reasons
 from polysight.host.scan.time_left import time_left, usual_row_s
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, ManifestWriter
-from polysight.host.store.scanfolder import EVENTS, ScanFolder, utc_now
+from polysight.host.store.scan_folder import EVENTS, ScanFolder, utc_now
 from polysight.shared.errors import PolysightError, advice
 from polysight.shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
 from polysight.shared.raster import Row

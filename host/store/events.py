@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgpack
 
-from polysight.host.store.appending import AppendFile
+from polysight.host.store.append_only import AppendFile
 from polysight.shared.errors import DataError, DeviceError, ProtocolError
 from polysight.shared.messages import AnyEvent, pack_kept, unpack_kept
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from polysight.host.store.appending import AppendFile
+from polysight.host.store.append_only import AppendFile
 from polysight.shared.errors import DataError, DeviceError, PolysightError
 
 Fact = dict[str, Any]

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from polysight.host.store.appending import sync_folder
+from polysight.host.store.append_only import sync_folder
 from polysight.host.store.manifest import Fact
-from polysight.host.store.scanfolder import CommittedRow, ScanFolder, utc_now
+from polysight.host.store.scan_folder import CommittedRow, ScanFolder, utc_now
 from polysight.shared.errors import DataError, DeviceError, ScanError
 
 Digests = dict[str, dict[int, str]]

@@ -13,7 +13,7 @@ from polysight.host.capture.segment import read_index
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
 from polysight.host.store.raw import dropped_files
-from polysight.host.store.scanfolder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
+from polysight.host.store.scan_folder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
 from polysight.shared.errors import DeviceError, PolysightError
 from polysight.shared.raster import plan_raster
 

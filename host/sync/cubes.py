@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from polysight.host.store.source import SyncedSource
+from polysight.host.store.sources.source import SyncedSource
 from polysight.host.sync.align import AlignedRow, whole_blocks
 from polysight.host.sync.chain import SyncedRow
 from polysight.host.sync.direct_path import DirectPath, excess_path_m, prepare, reference

@@ -27,7 +27,7 @@ from polysight.host.materials.authors_labels import (
     told_angle,
 )
 from polysight.host.polarimetry import correct_leakage
-from polysight.host.store.authors_settings import COLLECTION, read_settings, rig_of
+from polysight.host.store.sources.published_settings import COLLECTION, read_settings, rig_of
 from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError

@@ -17,8 +17,8 @@ from polysight.host.demo import run_simulator
 from polysight.host.materials import MaterialsResult, TruthPlate, patches_from_plates, read_truth
 from polysight.host.offline import EDGE_MM, TRUTH
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.scanfolder import ScanFolder
-from polysight.host.store.source import ScanSource
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.sources.source import ScanSource
 from polysight.shared.errors import ScanError
 
 PLATE_MM = 45.0

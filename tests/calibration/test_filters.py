@@ -8,7 +8,7 @@ from polysight.host.calibration.filters import BIN_HZ, LEAST, binned
 from polysight.host.calibration.in_force import load_calibration
 from polysight.host.cli import main
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.sync.hpf import HighPass, high_pass
 
 OFFSETS_HZ = (60e3, 250e3, 500e3, 850e3, 1250e3)

@@ -21,7 +21,7 @@ from polysight.host.calibration.metal import write_metal
 from polysight.host.imaging.grid import image_grid
 from polysight.host.imaging.imaged_with import ImagedWith
 from polysight.host.polarimetry import plane_reference
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DataError

@@ -10,7 +10,7 @@ from polysight.host.cli import main
 from polysight.host.metal_scans import load_reference
 from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 
 TABLES = {
     "grid": {"columns": 14, "rows": 10, "step_x_mm": 12.0, "step_y_mm": 12.0},

@@ -17,7 +17,7 @@ from polysight.host.metal_scans import load_reference
 from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import plane_reference
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import DataError
 
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]

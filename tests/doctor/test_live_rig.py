@@ -14,7 +14,7 @@ from polysight.host.cli import main
 from polysight.host.doctor.bench import System
 from polysight.host.pipeline import Pipeline
 from polysight.host.scan.run import run_scan
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import PolysightError

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.tables import decode, to_builtins

@@ -11,7 +11,7 @@ import resource
 import pytest
 
 from polysight.host.store.events import read_events
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.messages import RowStarted
 
 pytestmark = pytest.mark.xdist_group("rig")

@@ -24,7 +24,7 @@ import pytest
 from polysight.host.pipeline import Pipeline
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.messages import RowStarted
 from tests.small_scene import small_scene

@@ -9,7 +9,7 @@ import pytest
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials import TruthPlate, read_truth
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, load_instrument
 from polysight.simulators.scene import Scene, load_scene
 from polysight.simulators.simulate import simulate

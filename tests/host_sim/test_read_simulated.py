@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.store.authors import open_scan
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.sources.published import open_scan
 from polysight.host.store.validate import validate
 from polysight.shared.config import load_instrument
 from polysight.simulators.radar import SimulatedRig

@@ -8,7 +8,7 @@ import tomli_w
 
 from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.authors import open_scan
+from polysight.host.store.sources.published import open_scan
 from polysight.shared.tables import to_builtins
 
 from .conftest import COPPER, PET, content, rig_of, scene_of, told_by

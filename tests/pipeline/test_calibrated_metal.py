@@ -11,7 +11,7 @@ from polysight.host.calibration.files import SourceScan
 from polysight.host.calibration.metal import write_metal
 from polysight.host.metal_scans import load_reference
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import MANIFEST
+from polysight.host.store.scan_folder import MANIFEST
 
 from .conftest import EVERYWHERE, content, scene_of, told_by
 

@@ -8,8 +8,8 @@ import pytest
 from polysight.host.pipeline import Pipeline
 from polysight.host.report.context import ReportContext
 from polysight.host.report.coverage import masked_positions
-from polysight.host.store.scanfolder import ScanFolder
-from polysight.host.store.source import RowData
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.sources.source import RowData
 
 from .conftest import EVERYWHERE, scene_of
 

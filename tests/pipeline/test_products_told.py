@@ -7,7 +7,7 @@ import shutil
 
 from polysight.host.many import MARK
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import MANIFEST
+from polysight.host.store.scan_folder import MANIFEST
 
 from .conftest import content, told_by
 

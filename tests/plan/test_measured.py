@@ -14,7 +14,7 @@ from polysight.host.plan import Changes, Noise
 from polysight.host.plan.measured import noise_of, row_overhead_of
 from polysight.host.plan.timing import row_motion_s, scan_time, turn_s, whole_packets
 from polysight.host.store.events import read_events
-from polysight.host.store.scanfolder import EVENTS, ScanFolder
+from polysight.host.store.scan_folder import EVENTS, ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.messages import Capture

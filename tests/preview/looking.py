@@ -14,7 +14,7 @@ from polysight.host.preview.server import make_app
 from polysight.host.preview.watch import Watch
 from polysight.host.scan.control import ALIVE, CONTROL
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import EVENTS, MANIFEST, utc_now
+from polysight.host.store.scan_folder import EVENTS, MANIFEST, utc_now
 
 LIMIT_S = 60.0
 

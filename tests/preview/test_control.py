@@ -13,7 +13,7 @@ from polysight.host.scan import run as host_run
 from polysight.host.scan.control import ALIVE, CONTROL, ControlDesk, Wish, ask, last_sign_of_life
 from polysight.host.scan.stop import StopRequest
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.errors import ScanError
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from polysight.host.preview.follow import EventTail, ManifestTail
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
-from polysight.host.store.scanfolder import EVENTS, MANIFEST
+from polysight.host.store.scan_folder import EVENTS, MANIFEST
 
 CUTS = st.lists(st.floats(0, 1), max_size=12)
 

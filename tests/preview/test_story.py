@@ -8,7 +8,7 @@ from polysight.host.preview.snapshot import remaining
 from polysight.host.preview.story import Story, seconds
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
-from polysight.host.store.scanfolder import EVENTS, MANIFEST, ScanFolder
+from polysight.host.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 from polysight.shared.messages import Capture, Fault
 
 UTC = "2026-05-01T02:{:02d}:{:02d}.000+00:00"

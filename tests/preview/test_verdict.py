@@ -14,7 +14,7 @@ from polysight.host.preview.verdict import Signs, judge, no_scan
 from polysight.host.preview.words import of_fault
 from polysight.host.scan.control import Wish
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import MANIFEST
+from polysight.host.store.scan_folder import MANIFEST
 from polysight.shared.faults import EXPLANATIONS, PiFault
 from polysight.shared.messages import Fault
 

@@ -11,7 +11,7 @@ from looking import LIMIT_S, GrowingScan, wait_for
 from polysight.host.pipeline import Pipeline
 from polysight.host.preview.pictures import draw
 from polysight.host.preview.watch import Watch
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 
 
 def told(watch: Watch) -> dict:

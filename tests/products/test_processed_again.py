@@ -14,7 +14,7 @@ from polysight.host.cli import main
 from polysight.host.materials import Library
 from polysight.host.options import LIBRARY
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
 from polysight.simulators.scene import load_scene

@@ -9,8 +9,8 @@ import pytest
 
 from polysight.host.pipeline import Pipeline
 from polysight.host.scan.missed_pulses import place_frames
-from polysight.host.store.scanfolder import ScanFolder
-from polysight.host.store.source import RowData
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.sources.source import RowData
 from polysight.shared.config import load_instrument
 from polysight.simulators.scene import load_scene
 from polysight.simulators.simulate import simulate

@@ -8,7 +8,7 @@ import pytest
 from polysight.host.scan.pi_stage import UNTOLD
 from polysight.host.scan.run import resume_scan, run_scan
 from polysight.host.scan.stop import StopRequest
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import ScanError
 
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from polysight.host.scan.run import run_scan
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import DeviceError
 
 DDR_FULL, LVDS_BUFFER_FULL = 1 << 7, 1 << 9

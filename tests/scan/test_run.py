@@ -21,7 +21,7 @@ import tomli_w
 from polysight.host.scan.run import resume_scan, run_scan
 from polysight.host.scan.running import takes_so_far
 from polysight.host.scan.stop import StopRequest
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.errors import DeviceError, ScanError
 from polysight.shared.tables import to_builtins

@@ -23,7 +23,7 @@ from polysight.host.scan.pi_client import PiClient
 from polysight.host.scan.ready import make_ready
 from polysight.host.scan.run import resume_scan, run_scan
 from polysight.host.scan.stop import StopRequest, hangups_pass
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared import messages as m
 from polysight.shared.errors import DeviceError, PolysightError, ScanError, os_error

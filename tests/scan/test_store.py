@@ -15,8 +15,8 @@ from polysight.host.capture.segment import write_index
 from polysight.host.store import manifest
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
-from polysight.host.store.scanfolder import ScanFolder, new_scan_id
-from polysight.host.store.source import ScanSource
+from polysight.host.store.scan_folder import ScanFolder, new_scan_id
+from polysight.host.store.sources.source import ScanSource
 from polysight.host.store.validate import to_json, validate
 from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 from polysight.shared.messages import Fault, RunStarted

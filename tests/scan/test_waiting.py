@@ -19,7 +19,7 @@ from polysight.host.scan import ready, row, running
 from polysight.host.scan.processing import NICE
 from polysight.host.scan.run import resume_scan, run_scan
 from polysight.host.scan.stop import StopRequest
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared import messages as m
 from polysight.shared.errors import DeviceError, ScanError

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
 

@@ -22,7 +22,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.scan import run as host_run
 from polysight.host.scan.run import ScanProgress, ScanResult, resume_scan, run_scan
 from polysight.host.store import manifest
-from polysight.host.store.scanfolder import MANIFEST, PART, ScanFolder
+from polysight.host.store.scan_folder import MANIFEST, PART, ScanFolder
 from polysight.pi_controller.journal import JournalFolder, JournalFullError
 from polysight.pi_controller.ledger import Ledger
 from polysight.shared import messages as m

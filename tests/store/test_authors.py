@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.store.authors import AuthorsCube, AuthorsScan, open_scan
+from polysight.host.store.sources.published import AuthorsCube, AuthorsScan, open_scan
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import rx_positions_m, tx_position_m

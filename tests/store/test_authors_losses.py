@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.store.authors import RowLosses, open_scan
-from polysight.host.store.authors_settings import mirrored
+from polysight.host.store.sources.published import RowLosses, open_scan
+from polysight.host.store.sources.published_settings import mirrored
 from polysight.shared.config import Burst, Grid, load_instrument
 from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
 from polysight.shared.raster import plan_raster

@@ -13,8 +13,7 @@ import tomli_w
 from polysight.host.cli import main
 from polysight.host.preview.story import Story
 from polysight.host.scan.run import resume_scan
-from polysight.host.store.connection import ADDRESSES, check_same_scan, connection_of, reconnected
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, reconnected
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, to_builtins

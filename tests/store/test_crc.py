@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.store.crc import crc32
+from polysight.host.store.append_only import crc32
 
 
 @given(st.binary(max_size=3000))

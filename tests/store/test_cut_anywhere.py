@@ -13,7 +13,7 @@ import pytest
 from small_scan import SmallScan
 
 from polysight.host.store.events import read_events
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.pi_controller.journal import records
 from polysight.shared.errors import DataError

@@ -9,7 +9,7 @@ import pytest
 from faulty_disk import GROWS, FaultyDisk
 from small_scan import Samples, SmallScan
 
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.errors import PolysightError
 

@@ -12,7 +12,7 @@ import pytest
 from faulty_disk import FaultyDisk, Killed
 from small_scan import Samples, SmallScan
 
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import Finding, validate
 
 POWER_CUTS = 4  # draws of what is left, for each place

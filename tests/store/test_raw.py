@@ -14,9 +14,9 @@ import pytest
 from polysight.host.dropping import drop_raw, processed_digests
 from polysight.host.live import resume
 from polysight.host.options import Options
-from polysight.host.store.appending import AppendFile
+from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validate import damaged_rows, validate
 from polysight.shared.errors import ConfigError, DataError, DeviceError, ScanError
 from tests.small_scene import small_scene

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.store import appending, validate
+from polysight.host.store import append_only as appending
+from polysight.host.store import validate
 from polysight.host.store.manifest import ManifestWriter
-from polysight.host.store.scanfolder import ScanFolder
+from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import DeviceError
 
 

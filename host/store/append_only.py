@@ -111,3 +111,11 @@ def sync_folder(path: Path) -> None:
             "the disk is full or fails",
             f"free space below {path}, then go on",
         ) from None
+
+
+try:
+    from zlib_ng.zlib_ng import crc32
+except ImportError:
+    from zlib import crc32
+
+__all__ = ["crc32"]

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.store.authors_packets import (
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.host.store.sources.published_packets import (
     Bursts,
     RowShape,
     Stream,
@@ -27,9 +28,8 @@ from polysight.host.store.authors_packets import (
     read_log,
     read_stream,
 )
-from polysight.host.store.authors_settings import COLLECTION, mirrored, read_settings, rig_of
-from polysight.host.store.scanfolder import MANIFEST, ScanFolder
-from polysight.host.store.source import RowData
+from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
+from polysight.host.store.sources.source import RowData
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan, plan_raster

@@ -29,7 +29,7 @@ from polysight.host.store.sources.published import AuthorsCube
 from polysight.host.store.sources.published_settings import mirrored
 from polysight.host.store.sources.source import RowData, ScanSource
 from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
-from polysight.host.sync.cubes import CubeReader
+from polysight.host.sync.synchronised import CubeReader
 from polysight.shared.config import Instrument
 
 

@@ -14,7 +14,7 @@ from polysight.host.calibration.files import BoardFilter, places_crc32
 from polysight.host.calibration.rows import board_rows
 from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup
-from polysight.host.sync.hpf import HighPass, fit_high_pass
+from polysight.host.sync.high_pass import HighPass, fit_high_pass
 from polysight.shared.config import Board
 from polysight.shared.errors import DataError
 

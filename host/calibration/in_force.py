@@ -25,7 +25,7 @@ from polysight.shared.tables import to_builtins
 
 if TYPE_CHECKING:
     from polysight.host.polarimetry import PlaneReference
-    from polysight.host.sync.hpf import HighPass
+    from polysight.host.sync.high_pass import HighPass
 
 FOLDER = "calibration"
 FACT = "calibration"
@@ -84,7 +84,7 @@ class Calibration:
 
     def high_pass(self, board: str) -> HighPass | None:
         """A board's filter as measured; None: as programmed."""
-        from polysight.host.sync.hpf import HighPass
+        from polysight.host.sync.high_pass import HighPass
 
         found = None if self.filters is None else self.filters.boards.get(board)
         return None if found is None else HighPass(tuple(1e3 * corner for corner in found.corners_khz))

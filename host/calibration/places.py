@@ -31,7 +31,7 @@ from polysight.host.imaging.grid import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.hpf import HighPass
+from polysight.host.sync.high_pass import HighPass
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import specular_midpoint_m

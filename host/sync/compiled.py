@@ -1,4 +1,4 @@
-"""The passes of `polysight.host.sync.plain`, compiled: a chirp is taken from the card's words into the cache and used there.
+"""The passes of `polysight.host.sync.numpy_passes`, compiled: a chirp is taken from the card's words into the cache and used there.
 
 Each pass reads the words anew, which costs less than any copy of them in memory would, and all of a chirp even where
 only its linear samples are needed: memory is fetched ahead only where it is read in line. For four RX. Compiled at the
@@ -12,9 +12,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from polysight.host.sync import kernels
-from polysight.host.sync.kernels import LANES, RX, compiled
-from polysight.host.sync.plain import BAND_BINS, FOLD
+from polysight.host.sync import compiled_loops as kernels
+from polysight.host.sync.compiled_loops import LANES, RX, compiled
+from polysight.host.sync.numpy_passes import BAND_BINS, FOLD
 from polysight.host.sync.tone import block_edges, block_times, search_size
 
 CHUNK = 512

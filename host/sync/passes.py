@@ -7,20 +7,20 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.sync import plain
+from polysight.host.sync import numpy_passes as plain
 
 try:
     from polysight.host.sync import compiled as fastest
 except ImportError:
     fastest = plain
 
-from polysight.host.sync.plain import FOLD as FOLD
+from polysight.host.sync.numpy_passes import FOLD as FOLD
 
 _Real, _Complex, _Chosen = NDArray[np.float64], NDArray[np.complex128], NDArray[np.bool_]
 
 
 class Passes(Protocol):
-    """What `polysight.host.sync.plain` and `polysight.host.sync.compiled` both are; documented there."""
+    """What `polysight.host.sync.numpy_passes` and `polysight.host.sync.compiled` both are; documented there."""
 
     CHUNK: int
 

@@ -16,7 +16,7 @@ from polysight.host.imaging import ImageBuilder
 from polysight.host.report.figures import INK, PALETTE
 from polysight.host.report.sync_report import QUANTITIES, SyncReport
 from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.hpf import fit_high_pass, high_pass
+from polysight.host.sync.high_pass import fit_high_pass, high_pass
 from polysight.host.sync.residuals import STAGES
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
 from polysight.papers.sensys2026.scenes import plate, scanned

@@ -11,7 +11,7 @@ import tomli_w
 from polysight.host.cli import main
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.sources.published import AuthorsCube, open_scan
-from polysight.host.sync.cubes import recognise
+from polysight.host.sync.synchronised import recognise
 from polysight.shared.config import Image, load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from polysight.host.sync import plain
+from polysight.host.sync import numpy_passes as plain
 from polysight.host.sync.align import align_row
-from polysight.host.sync.hpf import Equaliser, high_pass
+from polysight.host.sync.high_pass import Equaliser, high_pass
 from polysight.host.sync.passes import passes_for
 
 compiled = pytest.importorskip("polysight.host.sync.compiled", reason="numba is not installed")

@@ -15,7 +15,7 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from polysight.host.sync.plain import FOLD
+from polysight.host.sync.numpy_passes import FOLD
 
 RX = 4
 LANES = FOLD * RX  # samples that are averaged, of every RX; also chirps that are transformed at once

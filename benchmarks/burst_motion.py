@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.data import ROOT
 from polysight.host.imaging import ImageBuilder
-from polysight.host.imaging.grid import row_offsets_m
+from polysight.host.imaging.geometry import row_offsets_m
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.raster import mean_burst_travel_mm, plan_raster

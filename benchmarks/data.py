@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.imaging.grid import Antennas, image_grid, row_offsets_m
+from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import scene_gate_m
 from polysight.host.store.sources.source import RowData
 from polysight.host.sync.chain import SyncedRow

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from benchmarks.data import as_synced, point_row
 from polysight.host.imaging import ImageBuilder, backproject
-from polysight.host.imaging.grid import Antennas, row_offsets_m
+from polysight.host.imaging.geometry import Antennas, row_offsets_m
 from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import plan_raster

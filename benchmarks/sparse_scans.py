@@ -17,8 +17,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from polysight.host.imaging.imager import choose_imager
-from polysight.host.imaging.samples import BoardSamples
+from polysight.host.imaging.samples import BoardSamples, choose_imager
 from polysight.host.imaging.sparse import reconstruct
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder

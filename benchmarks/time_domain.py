@@ -14,7 +14,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from polysight.host.imaging.grid import Antennas, ImageGrid
+from polysight.host.imaging.geometry import Antennas, ImageGrid
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 OVERSAMPLING = 32

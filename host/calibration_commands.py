@@ -115,7 +115,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
     """Gains at every pixel from a scan of a metal plate over the plane, in sub-bands too. Raises PolysightError."""
     from polysight.host.calibration.files import MetalFile, read
     from polysight.host.calibration.metal import write_metal
-    from polysight.host.imaging.subbands import sub_bands
+    from polysight.host.imaging.images import sub_bands
     from polysight.host.metal_scans import load_reference
 
     source = open_raw(scan, None if config is None else load_instrument(config))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from polysight.host.imaging.subbands import sub_bands
+from polysight.host.imaging.images import sub_bands
 from polysight.host.materials import Library
 from polysight.host.materials.authors import read_materials
 from polysight.host.materials.concentration import fit_concentration

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from polysight.host.calibration.in_force import of_scan
 from polysight.host.capture.decode import row_words
 from polysight.host.imaging import ChannelImages, ImageBuilder
-from polysight.host.imaging.facts import imaging_facts
-from polysight.host.imaging.imaged_with import ImagedWith
-from polysight.host.imaging.subbands import SubBandImages
+from polysight.host.imaging.gain_conditions import ImagedWith
+from polysight.host.imaging.images import SubBandImages
+from polysight.host.imaging.resolution import imaging_facts
 from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, analyse, pixel_accuracy
 from polysight.host.materials.incidence import permittivity_change
 from polysight.host.materials.segment import Box, Segmentation

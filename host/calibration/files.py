@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import tomli_w
 
-from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.store.scan_folder import versions
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DeviceError

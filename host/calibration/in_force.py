@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from polysight.host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
-from polysight.host.imaging.grid import image_grid
-from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.imaging.gain_conditions import ImagedWith
+from polysight.host.imaging.geometry import image_grid
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import Board, Instrument, MountStep

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, head, places_crc32
 from polysight.host.calibration.rows import board_rows
-from polysight.host.imaging.grid import Antennas, image_grid, row_offsets_m
+from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup, synchronise_row

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
-from polysight.host.imaging.grid import Antennas, ImageGrid
+from polysight.host.imaging.geometry import Antennas, ImageGrid
+from polysight.shared.errors import ConfigError
 
 _SAME_M = 1e-6  # closer places are one: 2e-3 rad at one position, far below the noise of any
 _FINER = 4  # the lattice in y may be this much finer than the pixels
@@ -81,3 +85,34 @@ def pitch_y_m(aperture: Aperture) -> float | None:
         if np.abs(cells - np.round(cells)).max() * pitch < _SAME_M:
             return pitch
     return None
+
+
+def namespace(array: Any) -> Any:
+    """The array API namespace of an array; numpy for anything that is no array.
+
+    Raises
+    ------
+    ConfigError
+        when the array is of another library and `array-api-compat` is not installed.
+    """
+    if isinstance(array, np.ndarray | np.generic | list | tuple | float | int | complex):
+        return np
+    try:
+        import array_api_compat
+    except ImportError:
+        raise ConfigError(
+            f"arrays of type {type(array).__module__}.{type(array).__name__} need the package array-api-compat",
+            "it is an optional dependency, for GPUs",
+            "pip install polysight[gpu], or give numpy arrays",
+        ) from None
+    return array_api_compat.array_namespace(array)
+
+
+def fft_of(xp: Any) -> ModuleType | Any:
+    """Fourier transforms of a namespace. scipy's for numpy: several transforms at once, in single precision."""
+    return scipy.fft if xp is np else xp.fft
+
+
+def device_of(array: Any) -> Any:
+    """Where an array lies, to make others beside it."""
+    return getattr(array, "device", None)

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from polysight.host.imaging.aperture import Aperture
-from polysight.host.imaging.arrays import device_of, namespace
-from polysight.host.imaging.model import excess_path_m, turn
+from polysight.host.imaging.aperture import Aperture, device_of, namespace
+from polysight.host.imaging.geometry import excess_path_m, turn
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _CHUNK = 1 << 20  # products of position and voxel held at once

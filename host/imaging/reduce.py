@@ -23,8 +23,8 @@ import scipy.linalg
 import scipy.signal
 from numpy.typing import NDArray
 
-from polysight.host.imaging.grid import Antennas, ImageGrid
-from polysight.shared.config import Chirp
+from polysight.host.imaging.geometry import Antennas, ImageGrid
+from polysight.shared.config import Chirp, Instrument
 from polysight.shared.raster import RasterPlan
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
@@ -113,3 +113,57 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     few = np.exp(2j * np.pi * np.outer(d, frequencies))
     from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
     return Reduction(frequencies, matrix, whole, (matrix[:, a:b] @ from_few).astype(np.complex128), gate_m)
+
+
+REACH = 4  # positions to either side
+_BAND = 0.45  # cycles a position the filter is made for
+
+
+def burst_filters(rig: Instrument) -> NDArray[np.float32]:
+    """Filters `1 / D` that reach 0, 1, .. `REACH` positions to either side, float32 [reach, REACH + 1].
+
+    The first tap is the middle one, the others stand on both sides. By least squares up to 0.45 cycles a position.
+    """
+    burst = rig.burst
+    step = rig.stage.speed_mm_s * burst.period_us * 1e-6 / rig.grid.step_x_mm  # of a pulse, in positions
+    turns = np.linspace(0, _BAND, 91)
+    loss = np.cos(2 * np.pi * np.outer(turns, (np.arange(burst.pulses) - (burst.pulses - 1) / 2) * step)).mean(axis=1)
+    out = np.zeros((REACH + 1, REACH + 1))
+    out[0, 0] = 1
+    for reach in range(1, REACH + 1):
+        # What does not turn keeps its amplitude exactly: the taps' sum is one.
+        basis = 2 * np.cos(2 * np.pi * np.outer(turns, np.arange(1, reach + 1))) - 2
+        side = np.linalg.lstsq(basis, 1 / loss - 1, rcond=None)[0]
+        out[reach, 0], out[reach, 1 : reach + 1] = 1 - 2 * side.sum(), side
+    return out.astype(np.float32)
+
+
+def undo_burst_motion(
+    samples: NDArray[np.complex64], valid: NDArray[np.bool_], turn: NDArray[np.float64], filters: NDArray[np.float32]
+) -> NDArray[np.complex64]:
+    """Samples of a row as if the stage had stood still during each burst.
+
+    Parameters
+    ----------
+    samples
+        complex64 [..., position].
+    valid
+        bool [position]: a position is filtered as far as all positions to either side are valid; not at all at the
+        row's ends.
+    turn
+        float64 [position]: where the filter is centred, radians from one position to the next.
+    filters
+        From :func:`burst_filters`.
+    """
+    count, reach = valid.size, np.zeros(valid.size, int)
+    for i in range(1, min(REACH, (count - 1) // 2) + 1):
+        near = np.zeros(count, bool)
+        near[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
+        reach += near & (reach == i - 1)
+    taps = filters[reach]
+    out = samples * taps[:, 0]
+    for i in range(1, int(reach.max(initial=0)) + 1):
+        side = (taps[:, i] * np.exp(1j * i * turn)).astype(np.complex64)
+        out[..., :-i] += side[:-i].conj() * samples[..., i:]
+        out[..., i:] += side[i:] * samples[..., :-i]
+    return out

@@ -4,23 +4,70 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.imaging.aperture import Aperture, irregular, row_starts_m
-from polysight.host.imaging.footprint import mirror_reduced
-from polysight.host.imaging.grid import Antennas, ImageGrid, scan_offsets_m
-from polysight.host.imaging.imager import Imager, choose_imager
-from polysight.host.imaging.incremental import SLACK_M, IncrementalImager
-from polysight.host.imaging.motion import burst_filters, undo_burst_motion
-from polysight.host.imaging.reduce import Reduction
-from polysight.host.imaging.spectral import SpectralImager
+from polysight.host.imaging.direct import DirectImager
+from polysight.host.imaging.geometry import Antennas, ImageGrid, scan_offsets_m
+from polysight.host.imaging.reduce import Reduction, burst_filters, undo_burst_motion
+from polysight.host.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
 from polysight.host.sync.chain import SyncedRow
-from polysight.shared.config import Board, Instrument
+from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.raster import plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+
+
+class Imager(Protocol):
+    """Matched filter of an aperture's samples at its pixels, and its adjoint; sums, not means.
+
+    With A the forward model of unit reflectivities, `samples(x)` is A x and `image(y)` is A^H y.
+    """
+
+    @property
+    def aperture(self) -> Aperture:
+        """Positions, antennas, frequencies, pixels."""
+        ...
+
+    def image(self, samples: Any) -> Any:
+        """Of complex64 [rx, frequency, row, column], weighted, 0 where masked: complex [ny, nx]."""
+        ...
+
+    def constant(self, echo: Any, weights: Any) -> Any:
+        """Image of an echo complex [rx, frequency], the same at every position, times weights [row, column]."""
+        ...
+
+    def samples(self, image: Any) -> Any:
+        """What pixels complex [ny, nx] answer: complex [rx, frequency, row, column]."""
+        ...
+
+
+def choose_imager(aperture: Aperture) -> tuple[Imager, str | None]:
+    """The fastest imager that is exact for an aperture, and a notice when it is the slow one."""
+    reason = irregular(aperture)
+    if reason is None:
+        return SpectralImager(aperture), None
+    rx, _, rows, columns = aperture.shape
+    sums = rx * rows * columns * aperture.grid.x_m.size * aperture.grid.y_m.size
+    notice = f"imaging by direct sum, {sums:.1e} terms, some {sums / 1e7:.0f} s a board: {reason}"
+    return DirectImager(aperture), notice
+
+
+def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
+    """A mirror's samples after referencing, [rx, sample]; amplitude relative to a direct path of one metre."""
+    path = antennas.mirror_m(z_m)
+    sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    phase = 2j * np.pi * np.outer(path - antennas.direct_m, sweep) / SPEED_OF_LIGHT_M_S
+    return (np.exp(phase) / path[:, None]).astype(np.complex128)
+
+
+def mirror_reduced(antennas: Antennas, z_m: float, chirp: Chirp, reduction: Reduction) -> NDArray[np.complex128]:
+    """The same after the range gate, [rx, frequency]."""
+    return mirror_samples(antennas, z_m, chirp) @ reduction.matrix.T
+
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)

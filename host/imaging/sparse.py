@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.imaging.imager import choose_imager
-from polysight.host.imaging.samples import BoardSamples
+from polysight.host.imaging.samples import BoardSamples, choose_imager
 
 STRENGTH = 0.002
 """By measurement on simulated plates (docs/decisions/0002-imaging.md): more takes what hardly reflects in V out of the

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.imaging.subbands import SubBand
+from polysight.host.imaging.images import SubBand
 from polysight.host.materials.analyse import MaterialsResult, reference_error, smooth_inside, to_metal
 from polysight.host.materials.layers import Bands, Spectrum
 from polysight.host.materials.permittivity import inverse_spread, median_ratio

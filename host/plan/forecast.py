@@ -9,7 +9,7 @@ import scipy.signal
 from numpy.typing import NDArray
 
 from polysight.host.imaging.aperture import Aperture
-from polysight.host.imaging.grid import Antennas, image_grid, scan_offsets_m
+from polysight.host.imaging.geometry import Antennas, image_grid, scan_offsets_m
 from polysight.host.imaging.images import TAPERS
 from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, point_response

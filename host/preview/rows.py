@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.imaging.grid import Antennas, image_grid
+from polysight.host.imaging.geometry import Antennas, image_grid
 from polysight.host.imaging.reduce import scene_gate_m
 from polysight.host.pipeline import Pipeline
 from polysight.host.preview.pictures import Picture, draw

@@ -10,7 +10,7 @@ from benchmarks import peers
 from benchmarks.data import published
 from polysight.host.imaging import backproject, image_grid
 from polysight.host.imaging.aperture import Aperture
-from polysight.host.imaging.grid import Antennas
+from polysight.host.imaging.geometry import Antennas
 
 ROWS, COLUMNS, EVERY = 6, 7, 2
 

@@ -10,7 +10,7 @@ from benchmarks.data import RIG
 from benchmarks.published.image import SETTINGS, form_image
 from benchmarks.published.synchronise import Synchroniser
 from polysight.host.imaging import ImageGrid, backproject, image_grid
-from polysight.host.imaging.grid import Antennas
+from polysight.host.imaging.geometry import Antennas
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.raster import mean_burst_travel_mm, plan_raster
 from polysight.simulators.radar import SimulatedRig, reference_cube

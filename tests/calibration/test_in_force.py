@@ -18,8 +18,8 @@ from polysight.host.calibration.files import (
 )
 from polysight.host.calibration.in_force import keep_in_scan, load_calibration, of_rig, of_scan
 from polysight.host.calibration.metal import write_metal
-from polysight.host.imaging.grid import image_grid
-from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.imaging.gain_conditions import ImagedWith
+from polysight.host.imaging.geometry import image_grid
 from polysight.host.polarimetry import plane_reference
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate

@@ -13,7 +13,7 @@ from polysight.host.calibration.places import Prior, TargetPoint, fit_places, lo
 from polysight.host.calibration.rows import open_raw
 from polysight.host.calibration_commands import with_places_of
 from polysight.host.cli import main
-from polysight.host.imaging.grid import Antennas
+from polysight.host.imaging.geometry import Antennas
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.geometry import specular_midpoint_m
 

@@ -11,8 +11,8 @@ from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan
 from polysight.host.calibration.in_force import checked, load_calibration
 from polysight.host.calibration.metal import write_metal
 from polysight.host.cli import main
-from polysight.host.imaging.grid import image_grid
-from polysight.host.imaging.imaged_with import ImagedWith
+from polysight.host.imaging.gain_conditions import ImagedWith
+from polysight.host.imaging.geometry import image_grid
 from polysight.host.metal_scans import load_reference
 from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline

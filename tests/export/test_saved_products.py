@@ -12,7 +12,7 @@ import pytest
 import tomli_w
 
 from polysight.host.cli import main
-from polysight.host.imaging.subbands import sub_bands
+from polysight.host.imaging.images import sub_bands
 from polysight.host.material_commands import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.report import write_json

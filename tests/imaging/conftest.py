@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.imaging.grid import Antennas, row_offsets_m
+from polysight.host.imaging.geometry import Antennas, row_offsets_m
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.raster import plan_raster

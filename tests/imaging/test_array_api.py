@@ -8,9 +8,8 @@ import pytest
 from polysight.host.imaging import backproject, project
 from polysight.host.imaging.aperture import Aperture
 from polysight.host.imaging.direct import DirectImager
-from polysight.host.imaging.grid import Antennas, image_grid, scan_offsets_m
-from polysight.host.imaging.incremental import IncrementalImager
-from polysight.host.imaging.spectral import SpectralImager
+from polysight.host.imaging.geometry import Antennas, image_grid, scan_offsets_m
+from polysight.host.imaging.spectral import IncrementalImager, SpectralImager
 from polysight.shared.errors import ConfigError
 
 

@@ -8,12 +8,11 @@ import pytest
 from polysight.host.imaging import image_grid
 from polysight.host.imaging.aperture import Aperture, irregular
 from polysight.host.imaging.direct import DirectImager
-from polysight.host.imaging.grid import Antennas, scan_offsets_m
-from polysight.host.imaging.imager import choose_imager
-from polysight.host.imaging.incremental import IncrementalImager
-from polysight.host.imaging.kernels import forget
+from polysight.host.imaging.geometry import Antennas, scan_offsets_m
+from polysight.host.imaging.lattice import forget
 from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.host.imaging.spectral import SpectralImager
+from polysight.host.imaging.samples import choose_imager
+from polysight.host.imaging.spectral import IncrementalImager, SpectralImager
 from polysight.shared.raster import plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 

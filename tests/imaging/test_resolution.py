@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 
 from polysight.host.imaging import ImageBuilder
-from polysight.host.imaging.facts import board_facts
-from polysight.host.imaging.resolution import point_response
+from polysight.host.imaging.resolution import board_facts, point_response
 from polysight.shared.geometry import specular_midpoint_m
 
 

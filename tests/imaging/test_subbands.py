@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.imaging.subbands import LEAST_SAMPLES, sub_bands
+from polysight.host.imaging.images import LEAST_SAMPLES, sub_bands
 from polysight.host.materials.layers import Spectrum
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.imaging.subbands import SubBand
+from polysight.host.imaging.images import SubBand
 from polysight.host.materials.layers import Bands, Layer, fit_layer
 from polysight.host.materials.subbands import band_rows, bands_of_row
 from polysight.host.polarimetry import fresnel, ratio_from_permittivity

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from polysight.host.imaging import ImageBuilder, backproject
-from polysight.host.imaging.facts import board_facts
-from polysight.host.imaging.grid import Antennas
+from polysight.host.imaging.geometry import Antennas
+from polysight.host.imaging.resolution import board_facts
 from polysight.host.plan import Changes, Noise, field_limits, forecast, propose
 from polysight.host.plan.field import PhaseSlope
 from polysight.host.plan.forecast import aperture_of, burst_facts, cautions, noise_facts

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.materials import Classifier, Library, Verdict
-from polysight.host.materials.authors import read_materials
-from polysight.host.materials.patches import PATCHES, MatchedPatch, match_patches
+from polysight.host.materials.patch_files import PATCHES, MatchedPatch, match_patches
+from polysight.host.materials.published import read_materials
 from polysight.host.options import LIBRARY
 from polysight.host.report.assemble import classifier_sentence
 from polysight.host.report.read import SavedProducts, find_products
@@ -61,9 +61,9 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
 
 
 def _judge(data: Path, as_json: bool) -> int:
-    from polysight.host.materials.judge import score
-    from polysight.host.materials.models import MODELS
+    from polysight.host.materials.classify import MODELS
     from polysight.host.materials.samples import Samples
+    from polysight.host.materials.train import score
 
     library = read_materials(data) if data.is_dir() else Library.load(data)
     if len(library.angles_deg) > 1:

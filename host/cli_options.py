@@ -27,7 +27,7 @@ def options_of(args: argparse.Namespace) -> Options:
     DataError
         when the label file is none.
     """
-    from polysight.host.materials.labels import read_labels
+    from polysight.host.materials.patch_files import read_labels
     from polysight.host.options import Options
 
     given = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}

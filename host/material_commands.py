@@ -14,10 +14,10 @@ import numpy as np
 
 from polysight.host.imaging.images import sub_bands
 from polysight.host.materials import Library
-from polysight.host.materials.authors import read_materials
 from polysight.host.materials.concentration import fit_concentration
 from polysight.host.materials.layers import Layer, LayerFit, fit_layer
-from polysight.host.materials.subbands import AMPLITUDE_ERROR, bands_of_row
+from polysight.host.materials.published import read_materials
+from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row
 from polysight.host.report.read import MATERIALS, SavedProducts, read_products
 from polysight.host.report.scan_facts import SCAN
 from polysight.shared.config import Chirp, load_instrument

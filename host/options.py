@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy.typing as npt
 
 from polysight.host.materials import Classifier, Library
-from polysight.host.materials.authors_labels import is_metal
-from polysight.host.materials.labels import patches_from_labels
 from polysight.host.materials.library import SAME_ANGLE_DEG
+from polysight.host.materials.patch_files import patches_from_labels
+from polysight.host.materials.published import is_metal
 from polysight.host.materials.segment import Box, Segmentation
 from polysight.host.polarimetry import Incidence, PlaneReference
 from polysight.shared.config import Instrument

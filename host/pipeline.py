@@ -16,9 +16,9 @@ from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.images import SubBandImages
 from polysight.host.imaging.resolution import imaging_facts
 from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, analyse, pixel_accuracy
-from polysight.host.materials.incidence import permittivity_change
+from polysight.host.materials.analyse import permittivity_change
 from polysight.host.materials.segment import Box, Segmentation
-from polysight.host.materials.subbands import band_rows
+from polysight.host.materials.sub_bands import band_rows
 from polysight.host.options import Options
 from polysight.host.polarimetry import Incidence, PlaneReference, incidence_choice
 from polysight.host.products import Products, write_images, write_materials, write_quality

@@ -9,8 +9,7 @@ from typing import Any
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
-from polysight.host.materials.labels import labels_of, write_labels
-from polysight.host.materials.patches import PATCHES, pack_patches
+from polysight.host.materials.patch_files import PATCHES, labels_of, pack_patches, write_labels
 from polysight.host.polarimetry import ratio
 from polysight.host.report import write_image, write_json, write_report
 from polysight.host.report.assemble import classifier_sentence, context_of

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from polysight.host.many import MARK
-from polysight.host.materials.patches import PATCHES
+from polysight.host.materials.patch_files import PATCHES
 from polysight.host.products import LABELS
 from polysight.host.report.read import IMAGE, MATERIALS, QUALITY, SavedProducts
 from polysight.host.report.scan_facts import SCAN

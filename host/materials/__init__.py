@@ -2,14 +2,13 @@
 
 from polysight.host.materials.analyse import MaterialsResult, PatchResult, analyse, image_centre_mm, pixel_accuracy
 from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, Verdict
-from polysight.host.materials.fit import fit_library
 from polysight.host.materials.knn import Fit, Weights, fit_weights
-from polysight.host.materials.labels import patches_from_labels, patches_from_plates, read_labels, write_labels
 from polysight.host.materials.library import Entry, Library
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
+from polysight.host.materials.patch_files import patches_from_labels, patches_from_plates, read_labels, write_labels
 from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
 from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, segment
-from polysight.host.materials.train import TrainingScan, entries_of, make_library
+from polysight.host.materials.train import TrainingScan, entries_of, fit_library, make_library
 from polysight.host.materials.truth import TruthPlate, read_truth, truth_labels, truth_plates
 
 __all__ = [

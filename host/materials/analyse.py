@@ -15,7 +15,16 @@ from polysight.host.materials.metal import MetalReference, find_metal, metal_by_
 from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, inverse_spread
 from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
 from polysight.host.materials.truth import TruthPlate, match
-from polysight.host.polarimetry import Calibrated, PlaneReference, calibrate, correct_leakage, ratio, smooth
+from polysight.host.polarimetry import (
+    Calibrated,
+    IncidenceChoice,
+    PlaneReference,
+    calibrate,
+    correct_leakage,
+    permittivity_from_ratio,
+    ratio,
+    smooth,
+)
 
 Image = npt.NDArray[np.complexfloating]
 FILLED = 0.1
@@ -53,7 +62,7 @@ class MaterialsResult:
     theta_rad
         Incidence angle, a number or [ny, nx].
     bands
-        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.subbands`); empty when not asked for.
+        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.sub_bands`); empty when not asked for.
     boxes
         Patch number to the name of the box drawn by hand; empty when the patches were found.
     """
@@ -276,3 +285,21 @@ def _row(r: PatchResult, metal: MetalReference, incidence_deg: float) -> dict[st
         "metal_like": not e.determinable and bool(np.isfinite(e.ratio)),  # a box without a valid pixel is nothing
         "truth": truth,
     }
+
+
+def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:
+    """Largest relative change of a patch's permittivity (Eq. 3) if the other angle were used; for quality.json.
+
+    `largest_permittivity_change` is |eps_other / eps - 1|, `of_patch` its number; empty without any permittivity.
+    """
+    changes = []
+    for r in found.patches:
+        at = r.patch.interior
+        if r.permittivity.value is not None and at.any():
+            used, other = (float(np.mean(a[at])) for a in (angles.used_rad, angles.other_rad))
+            eps = permittivity_from_ratio(r.permittivity.ratio, np.array([used, other]))
+            changes.append((float(abs(eps[1] / eps[0] - 1)), r.patch.label))
+    if not changes:
+        return {}
+    largest, label = max(changes)
+    return {"largest_permittivity_change": round(largest, 5), "of_patch": label}

@@ -23,8 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import f as f_distribution
 
-from polysight.host.materials.decision import Model, NamedScan
-from polysight.host.materials.samples import Real, Samples, by_angle
+from polysight.host.materials.samples import Model, NamedScan, Real, Samples, by_angle
 
 REJECTED = 0.01
 """Share of the known materials' pixels, and of their patches, that may be called unknown."""

@@ -22,8 +22,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.decision import Model
-from polysight.host.materials.samples import Real, Samples, by_angle
+from polysight.host.materials.samples import Model, Real, Samples, by_angle
 from polysight.shared.errors import DataError
 
 Measure = Literal["paper", "inverse", "log"]

@@ -65,7 +65,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Library:
-    """Entries, and what was fitted on them (`polysight.host.materials.fit`; empty when nothing was)."""
+    """Entries, and what was fitted on them (`polysight.host.materials.train`; empty when nothing was)."""
 
     entries: tuple[Entry, ...]
     fit: dict[str, Any] = field(default_factory=dict)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.patches import PATCHES, SeenPatches, read_patches
+from polysight.host.materials.patch_files import PATCHES, SeenPatches, read_patches
 from polysight.host.report.products import read_image
 from polysight.host.report.scan_facts import SCAN
 from polysight.shared.config import Chirp

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from polysight.host.materials.judge import Score, best_model, score, strangers
-from polysight.host.materials.models import DISCRIMINANT, PAPER
+from polysight.host.materials.classify import DISCRIMINANT, PAPER
 from polysight.host.materials.samples import CHANNELS, Samples
+from polysight.host.materials.train import Score, best_model, score, strangers
 from polysight.host.polarimetry import fresnel
 from polysight.host.report.figures import INK, PALETTE
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, percent

@@ -16,13 +16,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from polysight.host.materials import Entry, Library, fit_library
-from polysight.host.materials.authors import read_material
-from polysight.host.materials.authors_labels import (
+from polysight.host.materials.published import (
     METALS,
     LabelledScan,
     entries_of_boxes,
     label_folders,
     read_labelled_scan,
+    read_material,
     reading_of,
     told_angle,
 )

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from polysight.host.materials import Library
+from polysight.host.materials.classify import DISCRIMINANT, PAPER
 from polysight.host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
-from polysight.host.materials.judge import Score, score
-from polysight.host.materials.models import DISCRIMINANT, PAPER
 from polysight.host.materials.samples import CHANNELS, Samples
+from polysight.host.materials.train import Score, score
 from polysight.host.report.figures import INK, PALETTE
 from polysight.papers.sensys2026.classification import confusion_figure
 from polysight.papers.sensys2026.concentration import WATER

@@ -13,7 +13,7 @@ from polysight.host.cli import main
 from polysight.host.material_commands import parse_layer
 from polysight.host.materials import read_truth
 from polysight.host.materials.layers import fit_layer
-from polysight.host.materials.subbands import bands_of_row
+from polysight.host.materials.sub_bands import bands_of_row
 from polysight.host.metal_scans import load_reference
 from polysight.host.offline import imaged
 from polysight.host.polarimetry import Leakage, PlaneReference

@@ -9,7 +9,7 @@ from polysight.host.imaging import ImageBuilder, backproject, image_grid
 from polysight.host.imaging.geometry import Antennas, row_offsets_m
 from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.host.imaging.samples import mirror_samples
-from polysight.host.materials.spectrum import Spectrum
+from polysight.host.materials.layers import Spectrum
 from polysight.host.polarimetry import multilayer
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.errors import DataError

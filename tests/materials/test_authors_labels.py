@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.materials.authors_labels import (
+from polysight.host.materials.published import (
     PIXELS,
     TURNS,
     entries_of_boxes,

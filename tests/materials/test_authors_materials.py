@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import Entry
-from polysight.host.materials.authors import read_material, read_materials, read_pickle, write_materials
+from polysight.host.materials.published import read_material, read_materials, read_pickle, write_materials
 from polysight.shared.errors import DataError
 
 RNG = np.random.default_rng(1)

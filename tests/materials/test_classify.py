@@ -10,8 +10,8 @@ import pytest
 
 from polysight.host.cli import main
 from polysight.host.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
-from polysight.host.materials.models import DISCRIMINANT, MODELS, PAPER
-from polysight.host.materials.patches import PATCHES, match_patches, pack_patches, read_patches
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
+from polysight.host.materials.patch_files import PATCHES, match_patches, pack_patches, read_patches
 from polysight.host.report.assemble import classifier_sentence
 from polysight.papers.sensys2026.patches import Errors, draw, groups
 from polysight.shared.errors import DataError
@@ -183,6 +183,6 @@ def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):
 
 
 def test_every_short_name_is_a_model():
-    from polysight.host.materials.models import SHORT
+    from polysight.host.materials.classify import SHORT
 
     assert set(SHORT.values()) <= set(MODELS)

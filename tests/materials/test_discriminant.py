@@ -5,12 +5,11 @@ import pytest
 
 from polysight.host.cli import main
 from polysight.host.materials import Classifier, Entry, Library
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.discriminant import REJECTED, ErrorDiscriminant
-from polysight.host.materials.fit import fit_samples
-from polysight.host.materials.judge import score, strangers
 from polysight.host.materials.knn import fit_weights
-from polysight.host.materials.models import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.samples import Samples, feature_matrix
+from polysight.host.materials.train import fit_samples, score, strangers
 from polysight.host.report.assemble import classifier_sentence
 from polysight.shared.errors import DataError
 
@@ -211,6 +210,6 @@ def test_the_report_and_the_table_of_models_name_what_was_not_judged(tmp_path, m
     told = classifier_sentence(Classifier(library))
     assert "Of its 6 materials 1 could not be judged, because one scan alone holds them: lonely." in told
     library.save(tmp_path / "library.npz")
-    monkeypatch.setattr("polysight.host.materials.models.MODELS", {DISCRIMINANT: MODELS[DISCRIMINANT]})
+    monkeypatch.setattr("polysight.host.materials.classify.MODELS", {DISCRIMINANT: MODELS[DISCRIMINANT]})
     assert main(["classify", str(tmp_path / "library.npz")]) == 0
     assert "not judged with scans left out, because one scan alone holds them: lonely" in capsys.readouterr().out

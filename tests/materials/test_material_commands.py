@@ -9,8 +9,8 @@ import pytest
 from polysight.host.cli import main
 from polysight.host.material_commands import parse_layer
 from polysight.host.materials import Entry, Library
-from polysight.host.materials.authors import write_materials
 from polysight.host.materials.layers import Layer, Spectrum, predict
+from polysight.host.materials.published import write_materials
 from polysight.shared.config import load_instrument
 
 RIG = Path(__file__).parents[2] / "instrument.toml"

@@ -21,9 +21,9 @@ from polysight.host.materials import (
     pixel_accuracy,
     read_truth,
 )
-from polysight.host.materials.decision import majority
 from polysight.host.materials.knn import ratio_distance
 from polysight.host.materials.library import FORMAT
+from polysight.host.materials.samples import majority
 from polysight.host.polarimetry import fresnel
 from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.errors import DataError

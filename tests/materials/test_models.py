@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials.decision import Model
-from polysight.host.materials.judge import best_model, score, splits
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, OWN_SPREAD, PAPER, SLOW
 from polysight.host.materials.knn import PaperKnn, Weights, fit_weights
-from polysight.host.materials.models import DISCRIMINANT, MODELS, OWN_SPREAD, PAPER, SLOW
-from polysight.host.materials.samples import CHANNELS, Samples, feature_matrix
+from polysight.host.materials.samples import CHANNELS, Model, Samples, feature_matrix
+from polysight.host.materials.train import best_model, score, splits
 from polysight.shared.errors import DataError
 
 QUICK = [m for m in MODELS if m != SLOW]

@@ -9,7 +9,7 @@ import pytest
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.images import SubBand
 from polysight.host.materials.layers import Bands, Layer, fit_layer
-from polysight.host.materials.subbands import band_rows, bands_of_row
+from polysight.host.materials.sub_bands import band_rows, bands_of_row
 from polysight.host.polarimetry import fresnel, ratio_from_permittivity
 from polysight.shared.config import load_instrument
 

@@ -5,8 +5,8 @@ import inspect
 import numpy as np
 import pytest
 
-from polysight.host.materials.judge import score
-from polysight.host.materials.models import DISCRIMINANT, PAPER
+from polysight.host.materials.classify import DISCRIMINANT, PAPER
+from polysight.host.materials.train import score
 from polysight.host.polarimetry import fresnel, permittivity_from_ratio
 from polysight.papers.sensys2026 import patches
 from polysight.papers.sensys2026.classification import pixel_bound

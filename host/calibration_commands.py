@@ -49,7 +49,7 @@ def _key(kind: str, path: Path) -> list[str]:
 
 def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
     """Places of boards and plane from a scan of known points. Raises PolysightError."""
-    from polysight.host.calibration.in_force import of_scan
+    from polysight.host.calibration.active import of_scan
     from polysight.host.calibration.places import Prior, fit_places, look, places_file, read_target
 
     points = read_target(target)
@@ -139,7 +139,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
 
 def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
     """Start offsets that put the direct paths in the middle of the band. Raises PolysightError."""
-    from polysight.host.calibration.start_frequency import fit_start
+    from polysight.host.calibration.direct_signal import fit_start
 
     source = open_raw(scan, None if config is None else load_instrument(config))
     boards = {b.name: fit_start(source, b.name) for b in source.instrument.receivers}

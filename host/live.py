@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from polysight.host.calibration.in_force import Calibration, of_rig, of_scan
+from polysight.host.calibration.active import Calibration, of_rig, of_scan
 from polysight.host.imaging.geometry import image_grid
 from polysight.host.materials import read_truth
 from polysight.host.offline import TRUTH, check_options, make_products, truth_of

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from polysight.host.calibration.in_force import of_scan
+from polysight.host.calibration.active import of_scan
 from polysight.host.demo import check_scenes, run_simulator
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.focus import focus_sweep

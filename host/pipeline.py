@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.calibration.in_force import of_scan
+from polysight.host.calibration.active import of_scan
 from polysight.host.capture.decode import row_words
 from polysight.host.imaging import ChannelImages, ImageBuilder
 from polysight.host.imaging.gain_conditions import ImagedWith

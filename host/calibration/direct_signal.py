@@ -16,7 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.calibration.files import BoardStart
+from polysight.host.calibration.rows import board_rows
 from polysight.host.radar.constraints import direct_if_hz
+from polysight.host.store.sources.source import ScanSource
 from polysight.host.sync import BoardSetup
 from polysight.host.sync.align import AlignedRow, align_row, whole_blocks
 from polysight.host.sync.direct_path import reference
@@ -24,6 +27,7 @@ from polysight.host.sync.passes import FOLD
 from polysight.host.sync.residuals import noise_power
 from polysight.host.sync.tone import cis
 from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import DataError
 
 FULL_SCALE = 32767
 PASSBAND = 0.9  # of the sample rate
@@ -154,3 +158,48 @@ def _power(
     still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
     folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
+
+
+ROWS = 4
+FOUND = 0.25  # part of the chirps in which a direct path must be found to be believed
+
+
+def fit_start(source: ScanSource, board_name: str) -> BoardStart:
+    """The start offset of a board, from where its direct path was.
+
+    Raises
+    ------
+    DataError
+        when it was hardly ever found; the error names the offset by geometry alone.
+    """
+    rig = source.instrument
+    board = rig.by_name(board_name)
+    setup = BoardSetup.of(rig, board)
+    heard = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
+    if_hz, chirps = np.concatenate([s.if_hz for s in heard]), sum(s.chirps for s in heard)
+    expected = direct_if_hz(rig, board)
+    if if_hz.size < max(2, FOUND * chirps):
+        raise DataError(
+            f"{source.scan_id}: a direct path of {board_name} in {if_hz.size} of {chirps} chirps only",
+            "it lies outside the band and is filtered away, or something stands in it",
+            f"by geometry alone start_offset_hz = {by_geometry(rig, board):.0f} for {board_name}; scan again with it",
+        )
+    if_hz = unwrapped(if_hz, rig)
+    return start_of(rig, board, expected, float(if_hz.mean()), float(if_hz.std() / np.sqrt(if_hz.size)), if_hz.size)
+
+
+def start_of(
+    rig: Instrument, board: Board, expected_hz: float, seen_hz: float, error_hz: float, chirps: int
+) -> BoardStart:
+    """The offset that moves a direct path seen at `seen_hz`, whatever sample rates away it really is, to the middle."""
+    rate, middle = rig.chirp.sample_rate_hz, sum(band_hz(rig)) / 2
+    alias = round((expected_hz - seen_hz) / rate)
+    offset = board.start_offset_hz + middle - (seen_hz + alias * rate)
+    return BoardStart(
+        float(round(offset)), board.start_offset_hz, seen_hz, error_hz, expected_hz, middle, alias, chirps
+    )
+
+
+def by_geometry(rig: Instrument, board: Board) -> float:
+    """The offset by the rig file alone, hertz."""
+    return board.start_offset_hz + sum(band_hz(rig)) / 2 - direct_if_hz(rig, board)

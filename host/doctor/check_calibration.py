@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from polysight.host.calibration.in_force import checked
+from polysight.host.calibration.active import checked
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.finding import Finding, ok
 from polysight.shared.backends import is_simulated

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import zmq
 
-from polysight.host.calibration.in_force import keep_in_scan
+from polysight.host.calibration.active import keep_in_scan
 from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import RadarControl
 from polysight.host.scan.capture_rig import CaptureRig

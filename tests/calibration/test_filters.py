@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from polysight.host.calibration.active import load_calibration
 from polysight.host.calibration.files import FilterFile, read
 from polysight.host.calibration.filters import BIN_HZ, LEAST, binned
-from polysight.host.calibration.in_force import load_calibration
 from polysight.host.cli import main
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from polysight.host.calibration.active import keep_in_scan, load_calibration, of_rig, of_scan
 from polysight.host.calibration.files import (
     BoardFilter,
     FilterFile,
@@ -16,7 +17,6 @@ from polysight.host.calibration.files import (
     read,
     write,
 )
-from polysight.host.calibration.in_force import keep_in_scan, load_calibration, of_rig, of_scan
 from polysight.host.calibration.metal import write_metal
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import image_grid

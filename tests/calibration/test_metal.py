@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.calibration.in_force import load_calibration
+from polysight.host.calibration.active import load_calibration
 from polysight.host.cli import main
 from polysight.host.metal_scans import load_reference
 from polysight.host.options import Options

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import tomli_w
 
+from polysight.host.calibration.active import Calibration, load_calibration
 from polysight.host.calibration.files import PlacesFile, read
-from polysight.host.calibration.in_force import Calibration, load_calibration
 from polysight.host.calibration.places import Prior, TargetPoint, fit_places, look, places_file, read_target
 from polysight.host.calibration.rows import open_raw
 from polysight.host.calibration_commands import with_places_of

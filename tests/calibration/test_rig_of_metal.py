@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from polysight.host.calibration.active import checked, load_calibration
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
-from polysight.host.calibration.in_force import checked, load_calibration
 from polysight.host.calibration.metal import write_metal
 from polysight.host.cli import main
 from polysight.host.imaging.gain_conditions import ImagedWith

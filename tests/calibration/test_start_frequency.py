@@ -4,9 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.calibration.direct_signal import unwrapped
+from polysight.host.calibration.direct_signal import by_geometry, start_of, unwrapped
 from polysight.host.calibration.files import StartFile, read
-from polysight.host.calibration.start_frequency import by_geometry, start_of
 from polysight.host.cli import main
 from polysight.host.radar.constraints import direct_if_hz
 from polysight.shared.tables import to_builtins

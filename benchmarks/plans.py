@@ -37,9 +37,9 @@ from polysight.host.materials import (
     pixel_accuracy,
     truth_plates,
 )
-from polysight.host.options import LIBRARY
 from polysight.host.plan import Changes, scan_time
 from polysight.host.polarimetry import incidence_map
+from polysight.host.process.request import LIBRARY
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.raster import plan_raster

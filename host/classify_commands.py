@@ -15,7 +15,7 @@ import numpy.typing as npt
 from polysight.host.materials import Classifier, Library, Verdict
 from polysight.host.materials.patch_files import PATCHES, MatchedPatch, match_patches
 from polysight.host.materials.published import read_materials
-from polysight.host.options import LIBRARY
+from polysight.host.process.request import LIBRARY
 from polysight.host.report.assemble import classifier_sentence
 from polysight.host.report.read import SavedProducts, find_products
 from polysight.shared.errors import ConfigError, DataError

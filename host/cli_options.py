@@ -12,7 +12,7 @@ from polysight.host.cli_materials import add_model_option
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
-    from polysight.host.options import Options
+    from polysight.host.process.request import Options
 
 RIG = Path("instrument.toml")
 
@@ -28,7 +28,7 @@ def options_of(args: argparse.Namespace) -> Options:
         when the label file is none.
     """
     from polysight.host.materials.patch_files import read_labels
-    from polysight.host.options import Options
+    from polysight.host.process.request import Options
 
     given = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
     asked = [name for name, value in given.items() if value is not None]

@@ -12,7 +12,7 @@ from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
     from polysight.host.cli_materials import Add
-    from polysight.host.options import Options
+    from polysight.host.process.request import Options
 
 
 def add_polarimetry_options(sub: argparse.ArgumentParser) -> None:

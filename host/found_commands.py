@@ -52,7 +52,7 @@ def report(folder: Path) -> int:
     found = find_products(folder, REPORT)
     if found is None:
         from polysight.host.offline import process
-        from polysight.host.options import Options
+        from polysight.host.process.request import Options
 
         return process(folder, folder / "products", None, Options())
     sys.stdout.write(f"report:   {found.folder / REPORT}\n")

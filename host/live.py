@@ -13,8 +13,8 @@ from polysight.host.calibration.active import Calibration, of_rig, of_scan
 from polysight.host.imaging.geometry import image_grid
 from polysight.host.materials import read_truth
 from polysight.host.offline import TRUTH, check_options, make_products, truth_of
-from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
+from polysight.host.process.request import Options
 from polysight.host.products_folder import check_products_folder
 from polysight.host.progress import ScanBar
 from polysight.host.scan.control import ControlDesk

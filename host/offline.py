@@ -19,9 +19,9 @@ from polysight.host.demo import check_scenes, run_simulator
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.focus import focus_sweep
 from polysight.host.materials import TrainingScan, TruthPlate, make_library, patches_from_plates, read_truth
-from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
-from polysight.host.products import Products, write_images, write_quality
+from polysight.host.process.request import Options
+from polysight.host.process.save import Products, write_images, write_quality
 from polysight.host.products_folder import check_products_folder, making_products
 from polysight.host.report import write_json
 from polysight.host.report.focus import focus_figure

@@ -19,10 +19,10 @@ from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, an
 from polysight.host.materials.analyse import permittivity_change
 from polysight.host.materials.segment import Box, Segmentation
 from polysight.host.materials.sub_bands import band_rows
-from polysight.host.options import Options
 from polysight.host.polarimetry import Incidence, PlaneReference, incidence_choice
-from polysight.host.products import Products, write_images, write_materials, write_quality
-from polysight.host.quality import Quality
+from polysight.host.process.quality import Quality
+from polysight.host.process.request import Options
+from polysight.host.process.save import Products, write_images, write_materials, write_quality
 from polysight.host.report.scan_facts import write_scan_facts
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.published import AuthorsCube

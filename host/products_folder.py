@@ -17,7 +17,7 @@ from typing import Any
 
 from polysight.host.many import MARK
 from polysight.host.materials.patch_files import PATCHES
-from polysight.host.products import LABELS
+from polysight.host.process.save import LABELS
 from polysight.host.report.read import IMAGE, MATERIALS, QUALITY, SavedProducts
 from polysight.host.report.scan_facts import SCAN
 from polysight.host.store.append_only import sync_folder

@@ -8,8 +8,8 @@
 from pathlib import Path
 
 from polysight.host.materials import read_truth
-from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
+from polysight.host.process.request import Options
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.simulators.scene import load_scene

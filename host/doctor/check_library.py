@@ -5,7 +5,7 @@ from __future__ import annotations
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.finding import Finding, ok, warning
 from polysight.host.materials import Library
-from polysight.host.options import LIBRARY, Options
+from polysight.host.process.request import LIBRARY, Options
 from polysight.shared.geometry import incidence_deg
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
-from polysight.host.options import Options
 from polysight.host.plan.field import FieldLimits
 from polysight.host.plan.timing import payload_bytes, tail_s
+from polysight.host.process.request import Options
 from polysight.host.radar.constraints import constraints
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError

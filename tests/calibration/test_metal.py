@@ -8,8 +8,8 @@ import pytest
 from polysight.host.calibration.active import load_calibration
 from polysight.host.cli import main
 from polysight.host.metal_scans import load_reference
-from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
+from polysight.host.process.request import Options
 from polysight.host.store.scan_folder import ScanFolder
 
 TABLES = {

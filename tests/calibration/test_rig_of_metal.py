@@ -14,9 +14,9 @@ from polysight.host.cli import main
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import image_grid
 from polysight.host.metal_scans import load_reference
-from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import plane_reference
+from polysight.host.process.request import Options
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import DataError
 

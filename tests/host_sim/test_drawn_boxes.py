@@ -7,7 +7,7 @@ import pytest
 
 from polysight.host.materials import Classifier, Library
 from polysight.host.materials.patch_files import labels_of, read_labels, write_labels
-from polysight.host.options import LIBRARY, Options
+from polysight.host.process.request import LIBRARY, Options
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 

@@ -3,7 +3,7 @@
 import pytest
 
 from polysight.host.materials import Classifier, Library
-from polysight.host.options import LIBRARY
+from polysight.host.process.request import LIBRARY
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 

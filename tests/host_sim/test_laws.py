@@ -8,8 +8,8 @@ import pytest
 
 from polysight.host.materials import Classifier, Library, pixel_accuracy
 from polysight.host.materials.segment import axis_mm, box_mask
-from polysight.host.options import LIBRARY
 from polysight.host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
+from polysight.host.process.request import LIBRARY
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.host.options import Options
 from polysight.host.pipeline import Pipeline
+from polysight.host.process.request import Options
 from polysight.host.store.sources.published import open_scan
 from polysight.shared.tables import to_builtins
 

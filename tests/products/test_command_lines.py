@@ -11,7 +11,7 @@ import pytest
 
 from polysight.host.cli import build_parser, main
 from polysight.host.cli_options import joined
-from polysight.host.options import LIBRARY
+from polysight.host.process.request import LIBRARY
 from polysight.host.report import write_json
 
 REPO = Path(__file__).resolve().parents[2]

@@ -12,7 +12,7 @@ import tomli_w
 
 from polysight.host.cli import main
 from polysight.host.materials import Library
-from polysight.host.options import LIBRARY
+from polysight.host.process.request import LIBRARY
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument

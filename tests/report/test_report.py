@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from polysight.host.quality import masked_runs
+from polysight.host.process.quality import masked_runs
 from polysight.host.report import (
     ReportContext,
     banner_png,

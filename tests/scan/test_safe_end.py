@@ -17,7 +17,7 @@ import pytest
 import tomli_w
 
 from polysight.host import live, progress
-from polysight.host.options import Options
+from polysight.host.process.request import Options
 from polysight.host.scan import running
 from polysight.host.scan.pi_client import PiClient
 from polysight.host.scan.ready import make_ready

@@ -13,7 +13,7 @@ import pytest
 
 from polysight.host.dropping import drop_raw, processed_digests
 from polysight.host.live import resume
-from polysight.host.options import Options
+from polysight.host.process.request import Options
 from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder

@@ -138,14 +138,14 @@ def main() -> int:
     import resource
 
     from polysight.host.cli import process_one
-    from polysight.host.many import MARK
     from polysight.host.report import write_json
+    from polysight.host.report.read import FINISHED
 
     job: Job = pickle.loads(sys.stdin.buffer.read())  # from the program that started this one
 
     began = time.monotonic()
     try:
-        (job.out / MARK).unlink(missing_ok=True)
+        (job.out / FINISHED).unlink(missing_ok=True)
         status = process_one(argparse.Namespace(data=job.data, out=job.out, **job.options))
     except PolysightError as e:
         sys.stderr.write(f"{e}\n")
@@ -156,7 +156,7 @@ def main() -> int:
     if status == 0:
         used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
         seconds = round(time.monotonic() - began, 1)
-        write_json(job.out / MARK, {"made_with": job.made_with, "seconds": seconds, "memory_gb": used / 1e9})
+        write_json(job.out / FINISHED, {"made_with": job.made_with, "seconds": seconds, "memory_gb": used / 1e9})
     return status
 
 

@@ -22,11 +22,11 @@ from threading import Event
 from typing import Any, Literal
 
 from polysight.host.report import write_json
+from polysight.host.report.read import FINISHED
 from polysight.host.store.scan_folder import MANIFEST, versions
 from polysight.host.store.sources.published_settings import COLLECTION
 from polysight.shared.errors import ConfigError
 
-MARK = ".finished.json"
 SUMMARY = "processed.json"
 Status = Literal["done", "skipped", "failed", "stopped"]
 _PRODUCTS = ("image.npz", "quality.json")
@@ -131,7 +131,7 @@ def _told(value: Any) -> Any:
 def finished(job: Job) -> bool:
     """Whether the products are there and were made with just this."""
     try:
-        mark = json.loads((job.out / MARK).read_text(encoding="utf-8"))
+        mark = json.loads((job.out / FINISHED).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     same = isinstance(mark, dict) and mark.get("made_with") == json.loads(json.dumps(job.made_with))
@@ -160,7 +160,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
         return Outcome(job.name, "stopped", seconds)
     if child.returncode:
         return Outcome(job.name, "failed", seconds, message=_why(log, child.returncode))
-    mark = json.loads((job.out / MARK).read_text(encoding="utf-8"))
+    mark = json.loads((job.out / FINISHED).read_text(encoding="utf-8"))
     return Outcome(job.name, "done", seconds, float(mark["memory_gb"]))
 
 

@@ -15,10 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from polysight.host.many import MARK
 from polysight.host.materials.patch_files import PATCHES
-from polysight.host.process.save import LABELS
-from polysight.host.report.read import IMAGE, MATERIALS, QUALITY, SavedProducts
+from polysight.host.report.read import FINISHED, IMAGE, LABELS, MATERIALS, QUALITY, SavedProducts
 from polysight.host.report.scan_facts import SCAN
 from polysight.host.store.append_only import sync_folder
 from polysight.shared.errors import ConfigError, DataError, DeviceError
@@ -176,7 +174,7 @@ def _exchange(a: Path, b: Path) -> bool:
 
 
 def _is_ours(name: str) -> bool:
-    return name in PRODUCTS or name == MARK
+    return name in PRODUCTS or name == FINISHED
 
 
 def _raw_dropped(out: Path) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
+
+import tomli_w
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
@@ -13,14 +15,17 @@ from polysight.host.materials.patch_files import PATCHES, labels_of, pack_patche
 from polysight.host.polarimetry import ratio
 from polysight.host.report import write_image, write_json, write_report
 from polysight.host.report.assemble import classifier_sentence, context_of
+from polysight.host.report.context import ReportContext
 from polysight.host.report.products import write_atomically
-from polysight.host.report.scan_facts import with_scan
+from polysight.host.report.read import LABELS
+from polysight.host.report.scan_facts import rx_gains
 from polysight.host.store.scan_folder import versions
 from polysight.host.store.sources.source import Scan
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
+from polysight.shared.raster import RasterPlan
+from polysight.shared.tables import to_builtins
 
-LABELS = "labels.json"
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
 
 
@@ -102,8 +107,13 @@ def write_materials(
         },
         notes=[NOT_ON_HARDWARE, *([unnamed] if unnamed else [])],
     )
-    write_report(out, with_scan(context, source.plan, rig or source.instrument, images))
+    write_report(out, _with_scan(context, source.plan, rig or source.instrument, images))
     return Products(out, _lines(source, found, rows) + ((unnamed,) if unnamed else ()))
+
+
+def _with_scan(ctx: ReportContext, plan: RasterPlan, rig: Instrument, images: ChannelImages) -> ReportContext:
+    """A report's context with what it says of the scan itself: where its positions were, gains, the whole rig file."""
+    return replace(ctx, plan=plan, rx_gains=rx_gains(images), rig_file=tomli_w.dumps(to_builtins(rig)))
 
 
 def _config_summary(rig: Instrument) -> dict[str, Any]:

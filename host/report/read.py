@@ -18,7 +18,8 @@ from polysight.shared.config import Chirp
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import decode
 
-IMAGE, QUALITY, MATERIALS = "image.npz", "quality.json", "materials.json"
+IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
+FINISHED = ".finished.json"  # says what the products were made with, when several scans are processed
 _PRODUCTS = "products"  # of a scan folder
 
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.report.context import ReportContext
 from polysight.host.report.products import write_json
 from polysight.host.store.scan_folder import versions
 from polysight.host.store.sources.source import Scan
 from polysight.shared.config import Instrument
-from polysight.shared.raster import RasterPlan
 from polysight.shared.tables import to_builtins
 
 SCAN = "scan.json"
@@ -31,11 +27,6 @@ def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
             {"gain_db": float(20 * np.log10(abs(g))), "phase_deg": float(np.degrees(np.angle(g)))} for g in relative
         ]
     return out
-
-
-def with_scan(ctx: ReportContext, plan: RasterPlan, rig: Instrument, images: ChannelImages) -> ReportContext:
-    """A report's context with what it says of the scan itself: where its positions were, gains, the whole rig file."""
-    return replace(ctx, plan=plan, rx_gains=rx_gains(images), rig_file=tomli_w.dumps(to_builtins(rig)))
 
 
 def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:

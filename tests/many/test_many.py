@@ -10,7 +10,8 @@ import pytest
 from polysight.host import many
 from polysight.host.cli import main
 from polysight.host.cli_process import table
-from polysight.host.many import MARK, Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
+from polysight.host.many import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
+from polysight.host.report.read import FINISHED
 from polysight.shared.errors import ConfigError
 
 WORKER = """
@@ -115,7 +116,7 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
     (tmp_path / "out" / "a" / "image.npz").unlink()
     assert not finished(job())
     process_many([job()], tmp_path / "out", 1, again=True)
-    (tmp_path / "out" / "a" / MARK).write_text("[1]")
+    (tmp_path / "out" / "a" / FINISHED).write_text("[1]")
     assert not finished(job())
 
 
@@ -227,7 +228,7 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     assert "not JSON" in told
     assert "plate   done" in told
     assert (tmp_path / "out" / "plate" / "report.html").exists()
-    mark = json.loads((tmp_path / "out" / "plate" / MARK).read_text())
+    mark = json.loads((tmp_path / "out" / "plate" / FINISHED).read_text())
     assert {"versions", "products", "options", "data"} == set(mark["made_with"])
     assert len(mark["made_with"]["options"]["config"]) == 64  # digest of the rig file
     (broken / "data_collection_cfg.json").unlink()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 
-from polysight.host.many import MARK
+from polysight.host.report.read import FINISHED
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
 
@@ -43,13 +43,13 @@ def test_plates_named_right_are_counted_and_the_mark_of_an_earlier_run_is_remove
     quality = content(out / "quality.json")
     assert (quality["rows_retaken"], quality["rows_incomplete"]) == (0, [])
 
-    (out / MARK).write_text("{}")
+    (out / FINISHED).write_text("{}")
     (pet,) = (s for s in segments if s["truth"] and s["truth"]["name"] == "no such material")
     rename_pet(scan, pet["name"])
     taken_again(scan)
     told = told_by("process", scan, "--out", out, "--metal", METAL).splitlines()
     assert told[1].startswith("2 of 2 plates named right, ")
     assert float(told[1].split()[-5]) > share
-    assert not (out / MARK).exists()
+    assert not (out / FINISHED).exists()
     quality = content(out / "quality.json")
     assert (quality["rows_retaken"], quality["rows_incomplete"]) == (2, [5])

@@ -16,8 +16,8 @@ from polysight.host.materials import Classifier, Library, Verdict
 from polysight.host.materials.patch_files import PATCHES, MatchedPatch, match_patches
 from polysight.host.materials.published import read_materials
 from polysight.host.process.request import LIBRARY
-from polysight.host.report.assemble import classifier_sentence
-from polysight.host.report.read import SavedProducts, find_products
+from polysight.host.products.files import SavedProducts, find_products
+from polysight.host.report.context import classifier_sentence
 from polysight.shared.errors import ConfigError, DataError
 
 

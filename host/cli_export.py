@@ -16,7 +16,7 @@ _FORMATS = {
 
 
 def _export(args: argparse.Namespace) -> int:
-    from polysight.host.export.command import export
+    from polysight.host.report.export import export
 
     return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
 

@@ -121,7 +121,7 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
 
 def _found(products: Path) -> tuple[str, str]:
     """Share of positions that are masked, and number of patches, as the products say."""
-    from polysight.host.report.read import SavedProducts
+    from polysight.host.products.files import SavedProducts
 
     saved = SavedProducts(products)
     try:
@@ -138,8 +138,8 @@ def main() -> int:
     import resource
 
     from polysight.host.cli import process_one
+    from polysight.host.products.files import FINISHED
     from polysight.host.report import write_json
-    from polysight.host.report.read import FINISHED
 
     job: Job = pickle.loads(sys.stdin.buffer.read())  # from the program that started this one
 

@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 from polysight.host.confirm import typed
-from polysight.host.products_folder import RAW_DROPPED
+from polysight.host.products.files import QUALITY, read_products
+from polysight.host.products.folder import RAW_DROPPED
 from polysight.host.report import write_json
-from polysight.host.report.read import QUALITY, read_products
 from polysight.host.store.raw import Digests, drop, droppable
 from polysight.host.store.scan_folder import ScanFolder, utc_now
 from polysight.shared.errors import ConfigError, DataError

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from polysight.host.report.read import MATERIALS, find_products, read_products
+from polysight.host.products.files import MATERIALS, find_products, read_products
 
 REPORT = "report.html"
 

@@ -15,7 +15,7 @@ from polysight.host.materials import read_truth
 from polysight.host.offline import TRUTH, check_options, make_products, truth_of
 from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options
-from polysight.host.products_folder import check_products_folder
+from polysight.host.products.folder import check_products_folder
 from polysight.host.progress import ScanBar
 from polysight.host.scan.control import ControlDesk
 from polysight.host.scan.result import OnProgress

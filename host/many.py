@@ -21,8 +21,8 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Literal
 
+from polysight.host.products.files import FINISHED
 from polysight.host.report import write_json
-from polysight.host.report.read import FINISHED
 from polysight.host.store.scan_folder import MANIFEST, versions
 from polysight.host.store.sources.published_settings import COLLECTION
 from polysight.shared.errors import ConfigError

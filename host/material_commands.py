@@ -18,8 +18,7 @@ from polysight.host.materials.concentration import fit_concentration
 from polysight.host.materials.layers import Layer, LayerFit, fit_layer
 from polysight.host.materials.published import read_materials
 from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row
-from polysight.host.report.read import MATERIALS, SavedProducts, read_products
-from polysight.host.report.scan_facts import SCAN
+from polysight.host.products.files import MATERIALS, SCAN, SavedProducts, read_products
 from polysight.shared.config import Chirp, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 

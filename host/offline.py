@@ -22,11 +22,10 @@ from polysight.host.materials import TrainingScan, TruthPlate, make_library, pat
 from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options
 from polysight.host.process.save import Products, write_images, write_quality
-from polysight.host.products_folder import check_products_folder, making_products
+from polysight.host.products.files import IMAGE, write_scan_facts
+from polysight.host.products.folder import check_products_folder, making_products
 from polysight.host.report import write_json
-from polysight.host.report.focus import focus_figure
-from polysight.host.report.read import IMAGE
-from polysight.host.report.scan_facts import write_scan_facts
+from polysight.host.report.figures import focus_figure
 from polysight.host.store.raw import require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder, versions
 from polysight.host.store.sources.published import AuthorsCube, open_scan

@@ -23,7 +23,7 @@ from polysight.host.polarimetry import Incidence, PlaneReference, incidence_choi
 from polysight.host.process.quality import Quality
 from polysight.host.process.request import Options
 from polysight.host.process.save import Products, write_images, write_materials, write_quality
-from polysight.host.report.scan_facts import write_scan_facts
+from polysight.host.products.files import write_scan_facts
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.published import AuthorsCube
 from polysight.host.store.sources.published_settings import mirrored

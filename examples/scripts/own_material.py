@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from polysight.host.export import material_columns, read_products
 from polysight.host.materials import Library
 from polysight.host.offline import train
 from polysight.host.polarimetry import fresnel
+from polysight.host.products.files import read_products
+from polysight.host.report.export import material_columns
 from polysight.shared.config import load_instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.simulators.scene import load_scene

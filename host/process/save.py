@@ -13,12 +13,9 @@ from polysight.host.imaging import ChannelImages
 from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
 from polysight.host.materials.patch_files import PATCHES, labels_of, pack_patches, write_labels
 from polysight.host.polarimetry import ratio
+from polysight.host.products.files import LABELS, rx_gains, write_atomically
 from polysight.host.report import write_image, write_json, write_report
-from polysight.host.report.assemble import classifier_sentence, context_of
-from polysight.host.report.context import ReportContext
-from polysight.host.report.products import write_atomically
-from polysight.host.report.read import LABELS
-from polysight.host.report.scan_facts import rx_gains
+from polysight.host.report.context import ReportContext, classifier_sentence, context_of
 from polysight.host.store.scan_folder import versions
 from polysight.host.store.sources.source import Scan
 from polysight.shared.config import Instrument

@@ -16,8 +16,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from polysight.host.products.files import write_atomically, write_json
 from polysight.host.report.figures import INK, MUTED, STAMP
-from polysight.host.report.products import write_atomically, write_json
 from polysight.host.sync.chain import SyncedRow
 from polysight.host.sync.residuals import STAGES
 

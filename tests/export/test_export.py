@@ -12,11 +12,10 @@ import pytest
 import scipy.io
 
 from polysight.host.cli import main
-from polysight.host.export import hdf5, material_columns, read_products
-from polysight.host.export.hdf5 import write_hdf5
-from polysight.host.export.matlab import write_mat
-from polysight.host.export.table import write_csv
+from polysight.host.products.files import read_products
+from polysight.host.report import export as hdf5
 from polysight.host.report import write_image, write_json
+from polysight.host.report.export import material_columns, write_csv, write_hdf5, write_mat
 from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
 

@@ -15,8 +15,8 @@ from polysight.host.cli import main
 from polysight.host.imaging.images import sub_bands
 from polysight.host.material_commands import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
+from polysight.host.products.files import MATERIALS, SavedProducts, read_products
 from polysight.host.report import write_json
-from polysight.host.report.read import MATERIALS, SavedProducts, read_products
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins

@@ -12,7 +12,7 @@ from polysight.host.cli import main
 from polysight.host.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
 from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.patch_files import PATCHES, match_patches, pack_patches, read_patches
-from polysight.host.report.assemble import classifier_sentence
+from polysight.host.report.context import classifier_sentence
 from polysight.papers.sensys2026.patches import Errors, draw, groups
 from polysight.shared.errors import DataError
 

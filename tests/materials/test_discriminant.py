@@ -10,7 +10,7 @@ from polysight.host.materials.discriminant import REJECTED, ErrorDiscriminant
 from polysight.host.materials.knn import fit_weights
 from polysight.host.materials.samples import Samples, feature_matrix
 from polysight.host.materials.train import fit_samples, score, strangers
-from polysight.host.report.assemble import classifier_sentence
+from polysight.host.report.context import classifier_sentence
 from polysight.shared.errors import DataError
 
 MEANS = np.array([[-0.6, -2.0, 0.1], [-0.55, -1.9, 0.2], [-0.5, -2.2, 3.1], [-0.4, -1.5, -3.1], [-0.3, -1.2, 0.5]])

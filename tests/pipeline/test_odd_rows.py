@@ -7,7 +7,7 @@ import pytest
 
 from polysight.host.pipeline import Pipeline
 from polysight.host.report.context import ReportContext
-from polysight.host.report.coverage import masked_positions
+from polysight.host.report.tables import masked_positions
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.source import RowData
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 
-from polysight.host.report.read import FINISHED
+from polysight.host.products.files import FINISHED
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host import products_folder
-from polysight.host.products_folder import check_products_folder, making_products
+from polysight.host.products import folder as products_folder
+from polysight.host.products.folder import check_products_folder, making_products
 from polysight.host.report import write_json
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 

@@ -1,5 +1,4 @@
-from polysight.host.report.imaging import imaging_table
-from polysight.host.report.quality import quality_tables
+from polysight.host.report.tables import imaging_table, quality_tables
 
 BOARD = {
     "masked_positions": 12,

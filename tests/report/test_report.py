@@ -21,10 +21,9 @@ from polysight.host.report import (
     write_json,
     write_report,
 )
-from polysight.host.report.coverage import coverage_figure, masked_positions
 from polysight.host.report.figures import colours_of, png
-from polysight.host.report.quality import pretty, text
 from polysight.host.report.report import render
+from polysight.host.report.tables import coverage_figure, masked_positions, pretty, text
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan
 

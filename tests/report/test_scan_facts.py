@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.report.scan_facts import SCAN, write_scan_facts
+from polysight.host.products.files import SCAN, write_scan_facts
 from polysight.shared.config import load_instrument
 from polysight.shared.tables import decode, to_builtins
 

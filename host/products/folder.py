@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from polysight.host.materials.patch_files import PATCHES
-from polysight.host.report.read import FINISHED, IMAGE, LABELS, MATERIALS, QUALITY, SavedProducts
-from polysight.host.report.scan_facts import SCAN
+from polysight.host.products.files import FINISHED, IMAGE, LABELS, MATERIALS, QUALITY, SCAN, SavedProducts
 from polysight.host.store.append_only import sync_folder
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 

@@ -1,0 +1,1 @@
+"""A folder of products: written whole or not at all, and read back."""

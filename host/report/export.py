@@ -1,0 +1,281 @@
+"""HDF5: arrays with their axes as dimension scales, units on everything, the rest as attributes."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from polysight.host.products.files import SavedProducts, read_products
+from polysight.host.report import ReportContext, figures, write_atomically
+from polysight.shared.errors import ConfigError, DataError
+
+_COLUMNS = (
+    "patch", "name", "confidence", "metal_reference", "metal_like", "centre_x_mm", "centre_y_mm", "width_mm",
+    "height_mm", "pixels", "incidence_deg", "permittivity_real", "permittivity_real_standard_error",
+    "permittivity_loss", "permittivity_loss_standard_error", "p_real", "p_imag", "p_abs_db", "p_phase_deg",
+    "inverse_p_standard_error", "true_name", "true_permittivity_real", "true_permittivity_loss",
+)  # fmt: skip
+
+
+def material_columns(products: SavedProducts) -> dict[str, list[Any]]:
+    """Columns by name, an entry for each patch; None where a number is not known.
+
+    Permittivity is `permittivity_real` - j `permittivity_loss`; p_imag and p_phase are those of P = H / V relative to
+    metal; positions count from the image's centre.
+    """
+    rows = [_row(segment) for segment in products.segments]
+    return {name: [row[name] for row in rows] for name in _COLUMNS}
+
+
+def _row(s: dict[str, Any]) -> dict[str, Any]:
+    x0, y0, x1, y1 = s["box_mm"]
+    e, truth = s.get("permittivity") or {}, s.get("truth") or {}
+    true = truth.get("permittivity") or {}
+    p = s.get("ratio")
+    size = math.hypot(p["real"], p["imag"]) if p else 0.0
+    return {
+        "patch": s["label"],
+        "name": s.get("name"),
+        "confidence": s.get("confidence"),
+        "metal_reference": bool(s.get("metal_reference")),
+        "metal_like": bool(s.get("metal_like")),
+        "centre_x_mm": (x0 + x1) / 2,
+        "centre_y_mm": (y0 + y1) / 2,
+        "width_mm": x1 - x0,
+        "height_mm": y1 - y0,
+        "pixels": s.get("interior_pixels"),
+        "incidence_deg": s.get("incidence_deg"),
+        "permittivity_real": e.get("real"),
+        "permittivity_real_standard_error": e.get("real_std"),
+        "permittivity_loss": _minus(e.get("imag")),
+        "permittivity_loss_standard_error": e.get("imag_std"),
+        "p_real": p["real"] if p else None,
+        "p_imag": p["imag"] if p else None,
+        "p_abs_db": 20 * math.log10(size) if size else None,
+        "p_phase_deg": math.degrees(math.atan2(p["imag"], p["real"])) if p else None,
+        "inverse_p_standard_error": s.get("inverse_ratio_std"),
+        "true_name": truth.get("name"),
+        "true_permittivity_real": true.get("real"),
+        "true_permittivity_loss": _minus(true.get("imag")),
+    }
+
+
+def _minus(value: float | None) -> float | None:
+    return None if value is None else -value
+
+
+def write_csv(path: Path, products: SavedProducts) -> None:
+    """Write the table as CSV: comma, UTF-8, a header line; what is not known is empty. Numbers keep all digits."""
+    columns = material_columns(products)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    write_atomically(path, text.getvalue().encode("utf-8"))
+
+
+CONVENTION = (
+    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
+    " column 0 the smallest x; rig frame; permittivity is real - j loss"
+)
+_UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
+
+
+def _h5py() -> Any:
+    try:
+        return import_module("h5py")
+    except ImportError:
+        raise ConfigError(
+            "HDF5 needs the package h5py, which is not installed",
+            "only this export uses it, so it is an extra",
+            "pip install 'polysight[export]', or pip install h5py",
+        ) from None
+
+
+def write_hdf5(path: Path, products: SavedProducts) -> None:
+    """Write a file of these products.
+
+    /h, /v, /p complex64 [y, x], /valid bool [y, x]; /x, /y float64 in metres, the dimension scales of all four; group
+    /materials with a column for each of :func:`polysight.host.report.export.material_columns`; attributes scan_id, simulated,
+    convention, and as JSON instrument, versions, quality, materials.
+
+    Raises
+    ------
+    ConfigError
+        when h5py is not installed.
+    """
+    h5py = _h5py()
+    part = path.with_name(f".{path.name}.part")
+    with h5py.File(part, "w") as f:
+        axes = {"y": products.y_m, "x": products.x_m}
+        for name, values in axes.items():
+            f[name] = values
+            f[name].attrs["units"] = "m"
+            f[name].attrs["long_name"] = f"pixel centre, {name} of the rig frame"
+            f[name].make_scale(name)
+        about = {"h": "s-polarised channel", "v": "p-polarised channel", "p": "polarisation ratio H / V"}
+        for name, long_name in {**about, "valid": "whether the scan illuminates the pixel"}.items():
+            data = f.create_dataset(name, data=getattr(products, name), compression="gzip", shuffle=True)
+            data.attrs["units"], data.attrs["long_name"] = "1", long_name
+            for i, axis in enumerate(axes):
+                data.dims[i].attach_scale(f[axis])
+                data.dims[i].label = axis
+        _write_materials(h5py, f.create_group("materials"), material_columns(products))
+        f.attrs["scan_id"], f.attrs["convention"] = products.scan_id, CONVENTION
+        if products.simulated is not None:
+            f.attrs["simulated"] = products.simulated
+        for name, content in _documents(products).items():
+            # Attributes above 64 kB do not fit the file's header; a dataset of text takes any length.
+            f.create_dataset(f"documents/{name}", data=json.dumps(content), dtype=h5py.string_dtype())
+        f.attrs["versions"] = json.dumps(products.scan.get("versions", {}))
+        f.attrs["config"] = json.dumps(products.scan.get("instrument", {}))
+    part.replace(path)
+
+
+def _documents(products: SavedProducts) -> dict[str, dict[str, Any]]:
+    return {"quality": products.quality, "materials": products.materials, "scan": products.scan}
+
+
+def _write_materials(h5py: Any, group: Any, columns: dict[str, list[Any]]) -> None:
+    """One dataset a column: text, bool or float64, not a number where a value is not known."""
+    for name, values in columns.items():
+        if name in ("name", "true_name"):
+            group.create_dataset(name, data=[v or "" for v in values], dtype=h5py.string_dtype())
+        elif name in ("metal_reference", "metal_like"):
+            group[name] = np.array(values, np.bool_)
+        elif name == "patch":
+            group[name] = np.array(values, np.int32)
+        else:
+            group[name] = np.array([np.nan if v is None else v for v in values], np.float64)
+        unit = _UNITS.get(name.rpartition("_")[2])
+        if unit or name.startswith(("permittivity", "true_permittivity", "p_", "inverse", "confidence")):
+            group[name].attrs["units"] = unit or "1"
+
+
+_LONGEST_NAME = 63
+
+
+def write_mat(path: Path, products: SavedProducts) -> None:
+    """Write `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, struct `materials` of columns, structs `config`, `versions`.
+
+    `quality_json` and `materials_json` are those files as text: jsondecode reads them.
+    """
+    content = {
+        "h": products.h,
+        "v": products.v,
+        "p": products.p,
+        "valid": products.valid,
+        "x_m": products.x_m[None, :],
+        "y_m": products.y_m[:, None],
+        "materials": {name: _column(values) for name, values in material_columns(products).items()},
+        "config": _struct(products.scan.get("instrument", {})),
+        "versions": _struct(products.scan.get("versions", {})),
+        "scan_id": products.scan_id,
+        "simulated": np.nan if products.simulated is None else products.simulated,
+        "convention": CONVENTION,
+        "quality_json": json.dumps(products.quality),
+        "materials_json": json.dumps(products.materials),
+    }
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, content, long_field_names=True, do_compression=True, oned_as="column")
+    write_atomically(path, buffer.getvalue())
+
+
+def _column(values: list[Any]) -> Any:
+    """A column of numbers, not a number where one is not known; of words, a cell array."""
+    if any(isinstance(v, str) for v in values):
+        return np.array([v or "" for v in values], dtype=object)[:, None]
+    if values and all(isinstance(v, bool) for v in values):
+        return np.array(values)[:, None]
+    return np.array([np.nan if v is None else v for v in values], np.float64)[:, None]
+
+
+def _struct(node: Any) -> Any:
+    """Nested tables as structs; names made into MATLAB's; lists that are not plain numbers as cell arrays."""
+    if isinstance(node, dict):
+        return {_name(k): _struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
+    if isinstance(node, list | tuple):
+        if node and all(isinstance(v, int | float) and not isinstance(v, bool) for v in node):
+            return np.array(node, np.float64)[None, :]
+        cells = np.empty((1, len(node)), dtype=object)
+        for i, v in enumerate(node):
+            cells[0, i] = _struct(v)
+        return cells
+    return float(node) if isinstance(node, int) and not isinstance(node, bool) else node
+
+
+def _name(key: str) -> str:
+    name = re.sub(r"\W", "_", key)
+    return (name if name[:1].isalpha() else f"x{name}")[:_LONGEST_NAME]
+
+
+def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
+    """Amplitude (dB), phase (degrees) of H, V and P, and what is known of the materials, as PNG; returns the files."""
+    context = ReportContext(
+        title=products.scan_id,
+        simulated=products.simulated is not False,
+        x_m=products.x_m,
+        y_m=products.y_m,
+        h=products.h,
+        v=products.v,
+        p=products.p,
+        valid=products.valid,
+        metal_referenced=bool(products.materials),
+        materials=products.segments,
+    )
+    paths = []
+    for name, data in figures(context).items():
+        paths.append(folder / f"{name}.png")
+        write_atomically(paths[-1], data)
+    return paths
+
+
+FORMATS = ("hdf5", "mat", "png", "csv")
+_FOLDER = "export"
+
+
+def export(folder: Path, formats: list[str], out: Path | None) -> int:
+    """Write the formats asked for; prints each file.
+
+    Raises
+    ------
+    PolysightError
+        when no format was asked for, the products cannot be read, or a package is missing.
+    """
+    if not formats:
+        raise ConfigError(
+            "nothing to export", "no format was named", "add --hdf5, --mat, --png or --csv, or several of them"
+        )
+    products = read_products(folder)
+    if "csv" in formats and not products.materials:
+        raise DataError(
+            f"{products.folder}: no materials.json",
+            "only images were made of this scan",
+            "polysight process names them",
+        )
+    out = out or products.folder.parent / f"{products.folder.name}-{_FOLDER}"
+    out.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    for kind in formats:
+        if kind == "png":
+            written += write_pngs(out, products)
+            continue
+        writer, name = {
+            "hdf5": (write_hdf5, "image.h5"),
+            "mat": (write_mat, "image.mat"),
+            "csv": (write_csv, "materials.csv"),
+        }[kind]
+        writer(out / name, products)
+        written.append(out / name)
+    sys.stdout.write("".join(f"{path}\n" for path in written))
+    return 0

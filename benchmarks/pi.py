@@ -20,7 +20,7 @@ from benchmarks.data import temporary
 from benchmarks.measure import machine
 from benchmarks.table import add_arguments as add_common
 from benchmarks.table import write
-from polysight.host.scan.pi_client import PiClient
+from polysight.host.acquisition.pi_client import PiClient
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.messages import BeginRun, Capture, RowFinished
 from polysight.shared.raster import plan_raster

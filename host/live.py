@@ -9,6 +9,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from polysight.host.acquisition.control import ControlDesk, StopRequest, hangups_pass
+from polysight.host.acquisition.progress import OnProgress
+from polysight.host.acquisition.scan import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
 from polysight.host.calibration.active import Calibration, of_rig, of_scan
 from polysight.host.imaging.geometry import image_grid
 from polysight.host.materials import read_truth
@@ -17,10 +20,6 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options
 from polysight.host.products.folder import check_products_folder
 from polysight.host.progress import ScanBar
-from polysight.host.scan.control import ControlDesk
-from polysight.host.scan.result import OnProgress
-from polysight.host.scan.run import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
-from polysight.host.scan.stop import StopRequest, hangups_pass
 from polysight.host.store import manifest
 from polysight.host.store.raw import require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder, check_same_scan

@@ -8,7 +8,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from polysight.host.scan.run import ScanProgress
+from polysight.host.acquisition.scan import ScanProgress
 
 
 def _clock(seconds: float | None) -> str:

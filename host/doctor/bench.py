@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import zmq
 
+from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.capture.survey import CardSurvey, survey_cards
 from polysight.host.doctor.kernel import clock_is_synchronised, write_speed
-from polysight.host.scan.pi_client import PiClient
 from polysight.shared.config import Board, Instrument
 from polysight.shared.messages import HelloReply
 

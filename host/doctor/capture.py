@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.acquisition.capture_rig import CaptureRig
+from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.capture.decode import row_words
 from polysight.host.capture.receiver import RowCapture
 from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import BoardState
-from polysight.host.scan.capture_rig import CaptureRig
-from polysight.host.scan.pi_client import PiClient
 from polysight.host.store.scan_folder import PART
 from polysight.shared.config import Instrument
 from polysight.shared.messages import Pulsed

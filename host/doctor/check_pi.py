@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from polysight.host.acquisition.ready import differences
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.finding import Finding, error, ok, warning
-from polysight.host.scan.pi_stage import differences
 from polysight.shared import __version__
 from polysight.shared.backends import is_simulated
 from polysight.shared.sockets import HOST_KEYS, is_loopback

@@ -5,11 +5,11 @@ Nothing moves. Radars that are armed transmit for as long as the pulses last, so
 
 from __future__ import annotations
 
+from polysight.host.acquisition.pi_client import RefusedError
 from polysight.host.capture.network import silent_radar
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
 from polysight.host.radar.interface import RadarState
-from polysight.host.scan.pi_client import RefusedError
 from polysight.shared.config import Board
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import MOST_PULSES, MOST_PULSES_S

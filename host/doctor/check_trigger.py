@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import time
 
+from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.ready import make_ready
 from polysight.host.doctor.bench import Bench
 from polysight.host.doctor.check_pi import check_free
 from polysight.host.doctor.finding import Finding, error, not_checked, ok, warning
-from polysight.host.scan.ready import make_ready
-from polysight.host.scan.stop import StopRequest
 from polysight.host.store.scan_folder import new_scan_id
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import explain

@@ -20,9 +20,9 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from polysight.host.acquisition.control import Wish
 from polysight.host.preview.pictures import AMPLITUDE, PHASE, colour_bar
 from polysight.host.preview.watch import Watch
-from polysight.host.scan.control import Wish
 from polysight.shared.errors import PolysightError
 
 STATIC = Path(__file__).parent / "static"

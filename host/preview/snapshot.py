@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from polysight.host.acquisition.control import Wish
+from polysight.host.acquisition.progress import time_left
 from polysight.host.preview.listener import Heard
 from polysight.host.preview.rows import Shown
 from polysight.host.preview.story import Story
 from polysight.host.preview.verdict import Signs, judge, no_scan, sync_notices, unreadable
 from polysight.host.preview.words import Notice
-from polysight.host.scan.control import Wish
-from polysight.host.scan.time_left import time_left
 from polysight.shared.sync_in import WIDTH_US
 
 PAPER_PHASE_RAD = 0.022

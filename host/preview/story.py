@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
+from polysight.host.acquisition.progress import usual_row_s
 from polysight.host.plan.timing import scan_time
 from polysight.host.preview.words import Notice, of_fault, of_kept, of_rejection
-from polysight.host.scan.time_left import usual_row_s
 from polysight.host.store.manifest import Fact
 from polysight.host.store.scan_folder import reconnected
 from polysight.shared.config import Instrument

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from polysight.host.acquisition.control import Wish
 from polysight.host.preview.listener import Heard
 from polysight.host.preview.rows import Shown
 from polysight.host.preview.story import Story
 from polysight.host.preview.words import Notice, sentence
-from polysight.host.scan.control import Wish
 
 StatusLevel = Literal["good", "done", "wait", "warn", "bad"]
 SINCE = "{since}"  # where the page writes for how long

@@ -13,13 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from polysight.host.acquisition.control import Wish, ask, last_sign_of_life
 from polysight.host.preview.follow import EventTail, ManifestTail
 from polysight.host.preview.listener import Heard, PiListener
 from polysight.host.preview.rows import RowViewer, Shown
 from polysight.host.preview.snapshot import Content, make_motion, make_snapshot
 from polysight.host.preview.story import Story
 from polysight.host.preview.verdict import Signs
-from polysight.host.scan.control import Wish, ask, last_sign_of_life
 from polysight.host.store.manifest import Manifest
 from polysight.host.store.scan_folder import EVENTS, MANIFEST
 from polysight.shared.errors import PolysightError

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from polysight.host.scan.take_faults import FaultKind
+from polysight.host.acquisition.take import FaultKind
 from polysight.host.store.manifest import Fact
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain

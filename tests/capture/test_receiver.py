@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polysight.host.acquisition.capture_rig import Ending, record_ending
 from polysight.host.capture.dca1000 import Status, encode_packet
-from polysight.host.capture.end_of_record import Ending, record_ending
 from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
 from polysight.host.capture.receiver import Progress, ReceiverProcess
 from polysight.host.capture.segment import read_index

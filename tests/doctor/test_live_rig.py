@@ -9,11 +9,11 @@ import time
 
 import pytest
 
+from polysight.host.acquisition.scan import run_scan
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
 from polysight.host.cli import main
 from polysight.host.doctor.bench import System
 from polysight.host.pipeline import Pipeline
-from polysight.host.scan.run import run_scan
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.config import load_instrument

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from polysight.host.scan.run import run_scan
+from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.config import Instrument

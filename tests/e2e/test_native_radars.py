@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from polysight.host.scan.run import run_scan
+from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.validate import validate
 
 from .pattern_rig import COLUMNS, PULSES, ROWS, counts, small_table, start_rig

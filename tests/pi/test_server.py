@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from host_side import HostSide
 
-from polysight.host.scan.heartbeat import HostHeartbeat
+from polysight.host.acquisition.pi_client import HostHeartbeat
 from polysight.pi_controller.service import Options, Service
 from polysight.shared import messages as m
 from polysight.shared.errors import DeviceError

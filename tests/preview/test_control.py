@@ -9,9 +9,8 @@ import pytest
 from looking import wait_for
 from small_scan import SmallScan
 
-from polysight.host.scan import run as host_run
-from polysight.host.scan.control import ALIVE, CONTROL, ControlDesk, Wish, ask, last_sign_of_life
-from polysight.host.scan.stop import StopRequest
+from polysight.host.acquisition import scan as host_run
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish, ask, last_sign_of_life
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validate import validate

@@ -9,8 +9,7 @@ import pytest
 from chromium import DESK, PHONE, Browser
 from looking import LIMIT_S, GrowingScan, served, wait_for
 
-from polysight.host.scan.control import ALIVE, CONTROL, ControlDesk
-from polysight.host.scan.stop import StopRequest
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest
 from polysight.shared.config import load_instrument
 from polysight.simulators.loopback import on_free_subnet
 

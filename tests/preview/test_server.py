@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 from looking import LIMIT_S, served, wait_for
 
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
 from polysight.host.cli import build_parser
 from polysight.host.preview.serve import is_loopback
 from polysight.host.preview.server import STATIC, TOKEN_HEADER
-from polysight.host.scan.control import ALIVE, CONTROL, ControlDesk, Wish
-from polysight.host.scan.stop import StopRequest
 
 TOKEN = "the-right-token"
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
+from polysight.host.acquisition.capture_rig import CaptureRig
+from polysight.host.acquisition.scan import run_scan
 from polysight.host.capture.dca1000 import Code
-from polysight.host.scan.capture_rig import CaptureRig
-from polysight.host.scan.run import run_scan
 from polysight.host.store.validate import validate
 
 from .conftest import FULL, FakeRig

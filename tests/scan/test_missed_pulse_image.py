@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from polysight.host.acquisition.missed_pulses import place_frames
 from polysight.host.pipeline import Pipeline
-from polysight.host.scan.missed_pulses import place_frames
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.source import RowData
 from polysight.shared.config import load_instrument

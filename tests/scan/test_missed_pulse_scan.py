@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.scan.run import run_scan
+from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.validate import validate
 
 POINTS, PULSES = 8, 6

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
+from polysight.host.acquisition.slipped_row import describe, write_in_place
 from polysight.host.capture.receiver import ReceiverProcess
 from polysight.host.capture.segment import read_index, write_index
-from polysight.host.scan.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from polysight.host.scan.slipped_row import describe, write_in_place
 
 from .arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from polysight.host.scan.pi_stage import UNTOLD
-from polysight.host.scan.run import resume_scan, run_scan
-from polysight.host.scan.stop import StopRequest
+from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.ready import UNTOLD
+from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import ScanError
 

@@ -7,8 +7,8 @@ import re
 
 from rich.console import Console
 
+from polysight.host.acquisition.scan import ScanProgress
 from polysight.host.progress import ScanBar
-from polysight.host.scan.run import ScanProgress
 
 ROWS = 20
 

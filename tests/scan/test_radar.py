@@ -12,9 +12,9 @@ import time
 import msgspec
 import pytest
 
+from polysight.host.acquisition.scan import run_scan
 from polysight.host.radar.backends import LINE, Endless, LineServers, radar_control
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
-from polysight.host.scan.run import run_scan
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, Radar
 from polysight.shared.errors import ConfigError, DeviceError, ScanError

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
+from polysight.host.acquisition import ready
+from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.ready import check_disk, make_ready
 from polysight.host.doctor.check_disk import check_time
 from polysight.host.plan.forecast import forecast
-from polysight.host.scan import ready
-from polysight.host.scan.ready import check_disk, make_ready
-from polysight.host.scan.stop import StopRequest
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import PiFault
 from polysight.shared.stage_line import HOMING_LIMIT_S

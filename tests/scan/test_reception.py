@@ -7,7 +7,7 @@ import struct
 import msgspec
 import pytest
 
-from polysight.host.scan.run import run_scan
+from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import DeviceError
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from polysight.host.acquisition.row import TRANSITIONS, RowState, RowTransaction
 from polysight.host.capture import receiver as receiver_words
 from polysight.host.capture.dca1000 import Code
 from polysight.host.radar.interface import RadarControl, RadarState
-from polysight.host.scan.states import TRANSITIONS, RowState, RowTransaction
 from polysight.shared import messages
 from polysight.shared.config import Radar
 from polysight.shared.errors import ScanError

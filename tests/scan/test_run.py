@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.host.scan.run import resume_scan, run_scan
-from polysight.host.scan.running import takes_so_far
-from polysight.host.scan.stop import StopRequest
+from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.scan import resume_scan, run_scan
+from polysight.host.acquisition.scan_loop import takes_so_far
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.errors import DeviceError, ScanError
@@ -206,7 +206,7 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, payload, tmp_path):
     (tmp_path / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     code = (
         "import sys\nfrom pathlib import Path\nfrom polysight.shared.config import load_instrument\n"
-        "from polysight.host.scan.run import run_scan\nrun_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
+        "from polysight.host.acquisition.scan import run_scan\nrun_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
     )
     rig.pi.hang_at = {2}
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "rig.toml"), str(tmp_path / "s")]) as host:

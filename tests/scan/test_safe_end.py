@@ -17,12 +17,12 @@ import pytest
 import tomli_w
 
 from polysight.host import live, progress
+from polysight.host.acquisition import scan_loop as running
+from polysight.host.acquisition.control import StopRequest, hangups_pass
+from polysight.host.acquisition.pi_client import PiClient
+from polysight.host.acquisition.ready import make_ready
+from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.process.request import Options
-from polysight.host.scan import running
-from polysight.host.scan.pi_client import PiClient
-from polysight.host.scan.ready import make_ready
-from polysight.host.scan.run import resume_scan, run_scan
-from polysight.host.scan.stop import StopRequest, hangups_pass
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared import messages as m

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.scan import run_scan
+from polysight.host.acquisition.take import ON_REQUEST, FaultKind, TakeFault
 from polysight.host.capture.dca1000 import Status
 from polysight.host.preview.words import CAUSES, of_rejection
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
-from polysight.host.scan.run import run_scan
-from polysight.host.scan.stop import StopRequest
-from polysight.host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
 from polysight.shared.faults import PiFault, explain
 
 SPEC = Path(__file__).resolve().parents[2] / "docs/spec/scan-folder.md"

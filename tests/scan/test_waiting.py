@@ -15,10 +15,11 @@ import msgspec
 import pytest
 import zmq
 
-from polysight.host.scan import ready, row, running
-from polysight.host.scan.processing import NICE
-from polysight.host.scan.run import resume_scan, run_scan
-from polysight.host.scan.stop import StopRequest
+from polysight.host.acquisition import ready, row
+from polysight.host.acquisition import scan_loop as running
+from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.progress import NICE
+from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared import messages as m

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from polysight.host.acquisition import scan as host_run
+from polysight.host.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
 from polysight.host.capture.receiver import RowCapture
 from polysight.host.capture.segment import Segment, write_index
 from polysight.host.pipeline import Pipeline
-from polysight.host.scan import run as host_run
-from polysight.host.scan.run import ScanProgress, ScanResult, resume_scan, run_scan
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, PART, ScanFolder
 from polysight.pi_controller.journal import JournalFolder, JournalFullError

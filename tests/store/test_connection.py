@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import tomli_w
 
+from polysight.host.acquisition.scan import resume_scan
 from polysight.host.cli import main
 from polysight.host.preview.story import Story
-from polysight.host.scan.run import resume_scan
 from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, reconnected
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError

@@ -11,16 +11,15 @@ from pathlib import Path
 
 import zmq
 
+from polysight.host.acquisition.capture_rig import CaptureRig
+from polysight.host.acquisition.control import StopRequest, interrupts_wait
+from polysight.host.acquisition.pi_client import PiClient
+from polysight.host.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult
+from polysight.host.acquisition.ready import check_same_stage, differences, pi_fact
+from polysight.host.acquisition.scan_loop import RunningScan
 from polysight.host.calibration.active import keep_in_scan
 from polysight.host.radar.backends import radar_control
 from polysight.host.radar.interface import RadarControl
-from polysight.host.scan.capture_rig import CaptureRig
-from polysight.host.scan.pi_client import PiClient
-from polysight.host.scan.pi_stage import check_same_stage, differences, pi_fact
-from polysight.host.scan.processing import OnRow
-from polysight.host.scan.result import OnProgress, ScanProgress, ScanResult
-from polysight.host.scan.running import RunningScan
-from polysight.host.scan.stop import StopRequest, interrupts_wait
 from polysight.host.store.manifest import ManifestWriter
 from polysight.host.store.scan_folder import ScanFolder, check_same_scan, connection_of, new_scan_id, utc_now
 from polysight.host.store.validate import damaged_rows

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
@@ -11,13 +12,14 @@ from typing import Any, TypeVar
 
 import zmq
 
-from polysight.host.scan.heartbeat import HostHeartbeat
+from polysight.host.capture.scheduling import take_priority
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError, ProtocolError, ScanError
 from polysight.shared.messages import (
     JOURNALLED,
     Abort,
     Accepted,
+    Alive,
     AnyCommand,
     AnyEvent,
     AnyReply,
@@ -44,6 +46,50 @@ from polysight.shared.messages import (
     unpack_reply,
 )
 from polysight.shared.sockets import requester, subscriber
+
+REAL_TIME = 1  # below the receiving processes
+_REPLY_LIMIT_S = 1.0  # then the question was lost, and another one is asked
+
+
+class HostHeartbeat:
+    """Says `Alive` from a thread and a socket of its own, so that it lives as long as this process, and no longer.
+
+    Parameters
+    ----------
+    context, instrument
+        Where the Pi is.
+    scan_id
+        The run that is begun.
+    interval_s
+        How often.
+    """
+
+    def __init__(self, context: zmq.Context[Any], instrument: Instrument, scan_id: str, interval_s: float) -> None:
+        self._socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
+        self._alive, self._interval_s = pack(Alive(scan_id=scan_id)), interval_s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._thread.start()
+
+    def _beat(self) -> None:
+        take_priority(REAL_TIME)  # where that is not permitted, a busy machine may cost a row, which is taken again
+        try:
+            while not self._stop.wait(self._interval_s):
+                self._socket.send(self._alive)
+                waited_s = 0.0
+                while not self._stop.is_set() and waited_s < _REPLY_LIMIT_S:
+                    if self._socket.poll(round(self._interval_s * 1e3)):
+                        self._socket.recv()
+                        break
+                    waited_s += self._interval_s
+        finally:
+            self._socket.close()
+
+    def stop(self) -> None:
+        """No more."""
+        self._stop.set()
+        self._thread.join()
+
 
 ATTEMPTS = 3
 AT_WORK: tuple[State, ...] = ("homing", "running", "held", "done")  # which change by themselves

@@ -7,11 +7,16 @@ grants the receivers nothing the kernel prefers them by three to one.
 
 from __future__ import annotations
 
+import statistics
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from dataclasses import dataclass, field
 from os import PRIO_PROCESS, getpriority, setpriority
+
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.shared.messages import ExitStatus
 
 OnRow = Callable[[int], None]
 NICE = 5
@@ -77,3 +82,68 @@ def _yield_to_capture() -> None:
     thread = threading.get_native_id()
     with suppress(OSError):
         setpriority(PRIO_PROCESS, thread, getpriority(PRIO_PROCESS, thread) + NICE)
+
+
+@dataclass(frozen=True)
+class ScanProgress:
+    """Where a scan is.
+
+    `phase`: check, connect, home, row, state, held, wait, committed, retake, warning, stop or end. `message` is for
+    people, `state` the row's (docs/spec/row.md).
+    """
+
+    phase: str
+    message: str
+    rows: int
+    committed: int
+    row: int = -1
+    take: int = 0
+    points: int = 0
+    row_points: int = 0
+    remaining_s: float | None = None
+    state: str = ""
+
+
+@dataclass
+class ScanResult:
+    """How a scan ended; `processing_error` is the first error `on_row` raised, after all data is safe."""
+
+    folder: ScanFolder
+    exit_status: ExitStatus
+    reason: str
+    retakes: int = 0
+    incomplete_rows: list[int] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    processing_error: BaseException | None = None
+
+
+OnProgress = Callable[[ScanProgress], None]
+
+
+_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a rig that was sped up
+
+
+def usual_row_s(row_seconds: Sequence[float]) -> float:
+    """How long a row takes: the median of the last 25, so that a retake or a wait among them does not count.
+
+    Parameters
+    ----------
+    row_seconds
+        [n >= 1] from the end of one row to the end of the next, pauses left out.
+    """
+    return statistics.median(row_seconds[-_RECENT_ROWS:])
+
+
+def time_left(rows_left: int, row_s: float, elapsed_s: float = 0.0) -> float:
+    """Seconds to the end of a scan.
+
+    Parameters
+    ----------
+    rows_left
+        Rows that are not committed.
+    row_s
+        How long a row takes.
+    elapsed_s
+        Since the last row ended, pauses left out; a row that is overdue counts as one that ends now.
+    """
+    return max(0.0, rows_left * row_s - min(max(elapsed_s, 0.0), row_s))

@@ -6,19 +6,22 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+from polysight.host.acquisition.capture_rig import CaptureRig
+from polysight.host.acquisition.control import StopRequest, interrupts_request
+from polysight.host.acquisition.pi_client import PiClient
+from polysight.host.acquisition.progress import (
+    OnProgress,
+    OnRow,
+    ProcessingQueue,
+    ScanProgress,
+    ScanResult,
+    time_left,
+    usual_row_s,
+)
+from polysight.host.acquisition.ready import check_disk, check_may_move, make_ready
+from polysight.host.acquisition.row import RowState, RowTaker, RowTransaction
+from polysight.host.acquisition.take import ON_REQUEST, Take, commit_row, gave_up, reasons, reject_row
 from polysight.host.radar.interface import RadarControl
-from polysight.host.scan.capture_rig import CaptureRig
-from polysight.host.scan.commit import commit_row, gave_up, reject_row
-from polysight.host.scan.pi_client import PiClient
-from polysight.host.scan.processing import OnRow, ProcessingQueue
-from polysight.host.scan.ready import check_disk, check_may_move, make_ready
-from polysight.host.scan.result import OnProgress, ScanProgress, ScanResult
-from polysight.host.scan.row import RowTaker
-from polysight.host.scan.states import RowState, RowTransaction
-from polysight.host.scan.stop import StopRequest, interrupts_request
-from polysight.host.scan.take import Take
-from polysight.host.scan.take_faults import ON_REQUEST, reasons
-from polysight.host.scan.time_left import time_left, usual_row_s
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, ManifestWriter
 from polysight.host.store.scan_folder import EVENTS, ScanFolder, utc_now
@@ -60,7 +63,7 @@ class RunningScan:
         self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
 
     def run(self) -> ScanResult:
-        """Take every missing row, and write down how it ended. Raises what :func:`polysight.host.scan.run.run_scan` does."""
+        """Take every missing row, and write down how it ended. Raises what :func:`polysight.host.acquisition.scan.run_scan` does."""
         for warning in self.result.warnings:
             self._say("warning", warning)
         begun = False

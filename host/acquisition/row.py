@@ -5,19 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
+from enum import StrEnum
 from pathlib import Path
 
 import zmq
 
-from polysight.host.capture.end_of_record import record_ending
+from polysight.host.acquisition.capture_rig import CaptureRig, record_ending
+from polysight.host.acquisition.control import StopRequest
+from polysight.host.acquisition.pi_client import PiClient
+from polysight.host.acquisition.slipped_row import ToldCapture, find_frames, find_slip
+from polysight.host.acquisition.take import ON_REQUEST, FaultKind, Take, TakeFault
 from polysight.host.radar.interface import RadarControl
-from polysight.host.scan.capture_rig import CaptureRig
-from polysight.host.scan.pi_client import PiClient
-from polysight.host.scan.slipped_row import ToldCapture, find_frames, find_slip
-from polysight.host.scan.states import RowState, RowTransaction
-from polysight.host.scan.stop import StopRequest
-from polysight.host.scan.take import Take
-from polysight.host.scan.take_faults import ON_REQUEST, FaultKind, TakeFault
 from polysight.host.store.scan_folder import PART
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ScanError
@@ -25,6 +23,62 @@ from polysight.shared.faults import explain
 from polysight.shared.messages import Capture, RowFinished
 from polysight.shared.raster import Row
 from polysight.shared.units import NS_PER_S
+
+
+class RowState(StrEnum):
+    """Where one take of a row is."""
+
+    WAITING = "waiting"
+    ARMING = "arming"
+    RUNNING = "running"
+    ABORTING = "aborting"
+    COLLECTING = "collecting"
+    WRITING = "writing"
+    CHECKING = "checking"
+    COMMITTED = "committed"
+    KEPT = "kept"
+    REJECTED = "rejected"
+    STOPPED = "stopped"
+    FAILED = "failed"
+
+
+S = RowState
+TRANSITIONS: dict[RowState, frozenset[RowState]] = {
+    S.WAITING: frozenset({S.ARMING, S.STOPPED, S.FAILED}),
+    S.ARMING: frozenset({S.RUNNING, S.WRITING, S.FAILED}),
+    S.RUNNING: frozenset({S.COLLECTING, S.ABORTING, S.WRITING, S.FAILED}),
+    S.ABORTING: frozenset({S.COLLECTING, S.WRITING, S.FAILED}),
+    S.COLLECTING: frozenset({S.WRITING, S.FAILED}),
+    S.WRITING: frozenset({S.CHECKING, S.FAILED}),
+    S.CHECKING: frozenset({S.COMMITTED, S.KEPT, S.REJECTED, S.FAILED}),
+    S.COMMITTED: frozenset(),
+    S.KEPT: frozenset(),
+    S.REJECTED: frozenset(),
+    S.STOPPED: frozenset(),
+    S.FAILED: frozenset(),
+}
+
+
+class RowTransaction:
+    """One take on its way through the states; `tell` hears of each one, the first included."""
+
+    def __init__(self, tell: Callable[[RowState], None]) -> None:
+        self._tell = tell
+        self.state = RowState.WAITING
+        tell(self.state)
+
+    def to(self, state: RowState) -> None:
+        """Go on to a state. Raises ScanError when it does not follow from the one before: a fault of this program."""
+        if state not in TRANSITIONS[self.state]:
+            raise ScanError(f"a row went from {self.state} to {state}", "a fault of this program", "report it")
+        self.state = state
+        self._tell(state)
+
+    def fail(self) -> None:
+        """End as failed, unless it has ended already."""
+        if TRANSITIONS[self.state]:
+            self.to(RowState.FAILED)
+
 
 _TURN_MS = 50  # how often stop requests and limits are looked at
 _ABORT_LIMIT_S = 10.0

@@ -24,8 +24,8 @@ _NUMBERS = (
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from polysight.host.plan.changes import Changes
-    from polysight.host.plan.command import Wanted, plan
+    from polysight.host.plan.search import Changes
+    from polysight.host.plan.text import Wanted, plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     wanted = Wanted(args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json)

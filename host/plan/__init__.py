@@ -1,9 +1,8 @@
 """What a scan will take and give, before it is made: time, data, resolution, noise, aliases, and what is wrong."""
 
-from polysight.host.plan.changes import Changes
 from polysight.host.plan.field import FieldLimits, field_limits
 from polysight.host.plan.forecast import Forecast, Noise, forecast
-from polysight.host.plan.search import propose
+from polysight.host.plan.search import Changes, propose
 from polysight.host.plan.timing import ScanTime, row_motion_s, scan_time, straight_move_s
 
 __all__ = [

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 import textwrap
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
-from polysight.host.plan.forecast import Forecast
+import numpy as np
+
+from polysight.host.capture.decode import row_words
+from polysight.host.plan.forecast import Forecast, Noise, forecast
+from polysight.host.plan.search import Changes, propose, rig_lines
+from polysight.host.plan.timing import ROW_OVERHEAD_S, row_motion_s, tail_s, turn_s
+from polysight.host.report.sync_report import SyncReport
+from polysight.host.store.events import read_events
+from polysight.host.store.scan_folder import EVENTS, ScanFolder
+from polysight.host.store.sources.source import ScanSource
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import DataError
+from polysight.shared.messages import Capture
 
 _WIDTH = 118
 
@@ -127,3 +145,128 @@ def numbers(f: Forecast) -> dict[str, Any]:
         "noise_source": f.noise_source,
         "warnings": [w._asdict() for w in f.warnings],
     }
+
+
+_ROWS = 5  # that the noise is taken from
+
+
+def noise_of(source: ScanSource) -> Noise:
+    """Direct path over noise of a scan's weaker receiver, from a few of its rows.
+
+    Raises
+    ------
+    DataError
+        when no row tells: bursts of one chirp, or nothing recorded.
+    """
+    rig = source.instrument
+    rows = list(source.rows())
+    chosen = [rows[i] for i in sorted({*np.linspace(0, len(rows) - 1, _ROWS).astype(int)})] if rows else []
+    found = []
+    for board in rig.receivers:
+        setup = BoardSetup.of(rig, board)
+        report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, len(rig.antennas.rx_mm))
+        for row in chosen:
+            data = source.read_row(board.name, row)
+            words, valid = row_words(data.payload, data.missing, data.frames_expected, rig.chirp.samples)
+            report.add(synchronise_row(words, valid, setup))
+        found.append(report.snr)
+    if not np.isfinite(found).all():
+        raise DataError(
+            f"scan {source.scan_id}: its noise cannot be told",
+            "it has no rows, or bursts of a single chirp",
+            "give another scan to --like, or the ratio itself to --snr-db",
+        )
+    kind = "simulated scan" if source.simulated else "scan"
+    return Noise(float(10 * np.log10(min(found))), f"measured on {kind} {source.scan_id}")
+
+
+def row_overhead_of(folder: Path) -> float | None:
+    """Standstill between rows, seconds: median time from a row's last trigger to the next one's first, less motion.
+
+    On the clock of the triggers. None where the Pi's events do not tell: fewer than two rows in a sequence, or data
+    that was made without a Pi.
+    """
+    scan = ScanFolder.load(folder)
+    if not scan.facts("scan_started")[0].get("pi"):
+        return None
+    rig, ends = scan.instrument, {}
+    for event in read_events(folder / EVENTS).events:
+        if isinstance(event, Capture):
+            first, _ = ends.setdefault((event.row_index, event.take), (event.edge_ns, event.edge_ns))
+            ends[event.row_index, event.take] = (first, event.edge_ns)
+    measuring = (rig.grid.columns - 1) * rig.grid.step_x_mm / rig.stage.speed_mm_s
+    known = row_motion_s(rig.grid, rig.stage) - measuring + turn_s(rig.grid, rig.stage) + tail_s(rig)
+    gaps = [
+        (later[0] - earlier[1]) / 1e9
+        for (row, earlier), (next_row, later) in pairwise((row, t) for (row, _), t in ends.items())
+        if next_row == row + 1
+    ]
+    return max(0.0, float(np.median(gaps)) - known) if gaps else None
+
+
+_SIMULATED = "the simulated rig's (no hardware has been measured; --like SCAN or --snr-db give another)"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user wants to know besides the plan's own numbers."""
+
+    minutes: float | None = None
+    count: int = 5
+    like: Path | None = None
+    snr_db: float | None = None
+    row_overhead_s: float | None = None
+    scene_mm: tuple[float, float] | None = None
+    as_json: bool = False
+
+
+def plan(config: Path, changes: Changes, wanted: Wanted) -> int:
+    """Print the forecast, or the proposals; the exit status is 1 when the plan would be refused, or none fits.
+
+    Raises
+    ------
+    PolysightError
+        when the rig file, a number or the scan named by --like is wrong.
+    """
+    begun_with = load_instrument(config)
+    rig = changes.apply(begun_with)
+    noise, overhead = _assumed(wanted)
+    if wanted.minutes is not None:
+        plans = propose(rig, wanted.minutes, wanted.count, noise, overhead, wanted.scene_mm)
+        if wanted.as_json:
+            content = {"minutes": wanted.minutes, "plans": [numbers(p) for p in plans]}
+            sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        elif plans:
+            sys.stdout.write(
+                f"Best plans within {wanted.minutes:g} minutes for this aperture, least noise in the image first"
+                f" (dB: point over noise; motion: wavelengths within a burst)\n\n{table(plans)}\n"
+                f"The first one in full:\n\n{describe(plans[0])}\n"
+                f"{_lines(plans[0].rig, begun_with)}"
+            )
+        else:
+            sys.stderr.write(
+                f"polysight plan: no plan keeps {wanted.minutes:g} minutes with this aperture, stage and scene without"
+                " aliases: give more time, a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
+                " --accel-mm-s2\n"
+            )
+        return 0 if plans else 1
+    told = forecast(rig, noise, overhead, wanted.scene_mm)
+    sys.stdout.write(json.dumps(numbers(told), indent=1) + "\n" if wanted.as_json else describe(told))
+    return 0 if told.possible else 1
+
+
+def _lines(plan: Instrument, begun_with: Instrument) -> str:
+    lines = rig_lines(plan, begun_with)
+    return f"Its lines in the rig file, all that differ:\n\n{lines}" if lines else "The rig file says so already.\n"
+
+
+def _assumed(wanted: Wanted) -> tuple[Noise, float]:
+    """Noise and standstill: given, else of the scan named by --like, else the simulated rig's."""
+    noise, overhead = Noise(source=_SIMULATED), None
+    if wanted.like is not None:
+        noise, overhead = noise_of(ScanFolder.load(wanted.like)), row_overhead_of(wanted.like)
+    if wanted.snr_db is not None:
+        noise = Noise(wanted.snr_db, "given")
+    if wanted.row_overhead_s is not None:
+        overhead = wanted.row_overhead_s
+    return noise, ROW_OVERHEAD_S if overhead is None else overhead

@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 
 from polysight.host.plan import Changes, Noise
-from polysight.host.plan.measured import noise_of, row_overhead_of
+from polysight.host.plan.text import noise_of, row_overhead_of
 from polysight.host.plan.timing import row_motion_s, scan_time, turn_s, whole_packets
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import EVENTS, ScanFolder

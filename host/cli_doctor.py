@@ -12,7 +12,7 @@ from polysight.shared.errors import ConfigError
 
 def _doctor(args: argparse.Namespace) -> int:
     from polysight.host.doctor.bench import Wanted
-    from polysight.host.doctor.command import doctor
+    from polysight.host.doctor.walk import doctor
 
     if args.move and not args.pulse:
         raise ConfigError(

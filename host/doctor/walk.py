@@ -2,50 +2,46 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
-from polysight.host.doctor.bench import Bench
-from polysight.host.doctor.check_cards import check_buffer, check_card
-from polysight.host.doctor.check_clock import check_host_clock, check_pi_clock
-from polysight.host.doctor.check_config import check_config
-from polysight.host.doctor.check_disk import check_disk, check_time
-from polysight.host.doctor.check_network import check_network
-from polysight.host.doctor.check_pi import check_free, check_keys, check_pi
-from polysight.host.doctor.check_stage import check_stage
-from polysight.host.doctor.check_stream import check_pulses, check_radar
-from polysight.host.doctor.check_trigger import check_trigger
-from polysight.host.doctor.finding import Finding, not_checked, of_error
+from polysight.host.doctor.bench import Bench, Finding, System, Wanted, not_checked, of_error
+from polysight.host.doctor.check_capture import check_buffer, check_card, check_network, check_pulses, check_radar
+from polysight.host.doctor.check_host import check_config, check_disk, check_host_clock, check_pi_clock, check_time
+from polysight.host.doctor.check_pi import SIMULATED, check_free, check_keys, check_pi, check_stage, check_trigger
+from polysight.shared.backends import is_simulated
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError, PolysightError
 
 
 def _calibration(bench: Bench) -> Finding:
-    from polysight.host.doctor.check_calibration import check_calibration
+    from polysight.host.doctor.check_host import check_calibration
 
     return check_calibration(bench)
 
 
 def _library(bench: Bench) -> Finding:
-    from polysight.host.doctor.check_library import check_library
+    from polysight.host.doctor.check_host import check_library
 
     return check_library(bench)
 
 
 def _level(bench: Bench, board: Board) -> Finding:
-    from polysight.host.doctor.check_level import check_level
+    from polysight.host.doctor.check_capture import check_level
 
     return check_level(bench, board)
 
 
 def _direct_path(bench: Bench, board: Board) -> Finding:
-    from polysight.host.doctor.check_direct_path import check_direct_path
+    from polysight.host.doctor.check_capture import check_direct_path
 
     return check_direct_path(bench, board)
 
 
 def _skew(bench: Bench) -> Finding:
-    from polysight.host.doctor.check_skew import check_skew
+    from polysight.host.doctor.check_capture import check_skew
 
     return check_skew(bench)
 
@@ -134,3 +130,38 @@ def _try(check: Check, bench: Bench, board: Board | None) -> Finding:
         return of_error(
             DeviceError(f"{where}{e.strerror or e}", "a path, a permission or a device", "see what it says")
         )
+
+
+_WIDTH = 16
+
+
+def doctor(wanted: Wanted, as_json: bool, system: System = System()) -> int:  # noqa: B008 - immutable
+    """Walk the rig; 0 when no check found an error, 1 otherwise."""
+    findings: list[Finding] = []
+    with Bench(wanted, system) as bench:
+        for finding in walk(bench):
+            findings.append(finding)
+            if not as_json:
+                sys.stdout.write(line(finding))
+                sys.stdout.flush()
+        simulated = bench.hello is not None and is_simulated(bench.hello.backend)
+    wrong = [f.check for f in findings if f.verdict == "error"]
+    if as_json:
+        found = {"ok": not wrong, "simulated": simulated, "findings": [asdict(f) for f in findings]}
+        sys.stdout.write(json.dumps(found, indent=1) + "\n")
+    else:
+        sys.stdout.write(_sum(findings, wrong) + (f" ({SIMULATED})" if simulated else "") + "\n")
+    return 1 if wrong else 0
+
+
+def line(finding: Finding) -> str:
+    """A finding as lines of text."""
+    head = f"{finding.verdict:12}{finding.check:{_WIDTH}} {finding.found}".rstrip() + "\n"
+    more = (("why", finding.why), ("do", finding.remedy))
+    return head + "".join(f"{'':{12 + _WIDTH}} {word}: {text}\n" for word, text in more if text)
+
+
+def _sum(findings: list[Finding], wrong: list[str]) -> str:
+    count = {v: sum(f.verdict == v for f in findings) for v in ("ok", "warning", "not checked")}
+    told = f"{count['ok']} ok, {count['warning']} warnings, {len(wrong)} errors, {count['not checked']} not checked"
+    return f"{told}: begin with {wrong[0]}" if wrong else told

@@ -18,8 +18,7 @@ import tomli_w
 import zmq
 
 from polysight.host.acquisition.pi_client import PiClient
-from polysight.host.doctor.bench import Bench, System, Wanted
-from polysight.host.doctor.finding import Finding
+from polysight.host.doctor.bench import Bench, Finding, System, Wanted
 from polysight.host.doctor.walk import walk
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument, load_instrument

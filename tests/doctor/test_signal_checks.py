@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from doctor_case import FRAMES, RIG, bench_of, frames_of, rig_with, signal_of
 
-from polysight.host.doctor import check_direct_path, check_skew
-from polysight.host.doctor.capture import Captured
-from polysight.host.doctor.check_direct_path import check_direct_path as direct_path_of
-from polysight.host.doctor.check_level import check_level
-from polysight.host.doctor.check_stream import check_radar
+from polysight.host.doctor import check_capture as check_direct_path
+from polysight.host.doctor import check_capture as check_skew
+from polysight.host.doctor.bench import Captured
+from polysight.host.doctor.check_capture import check_direct_path as direct_path_of
+from polysight.host.doctor.check_capture import check_level, check_radar
 
 
 def judged(board="RH", rig=RIG, **disturbances):

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from polysight.host.doctor.bench import Bench, Wanted
-from polysight.host.doctor.check_library import check_library
+from polysight.host.doctor.check_host import check_library
 from polysight.host.plan import forecast
 from polysight.shared.geometry import incidence_deg
 

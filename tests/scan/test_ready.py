@@ -11,7 +11,7 @@ import pytest
 from polysight.host.acquisition import ready
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.ready import check_disk, make_ready
-from polysight.host.doctor.check_disk import check_time
+from polysight.host.doctor.check_host import check_time
 from polysight.host.plan.forecast import forecast
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import PiFault

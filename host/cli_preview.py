@@ -19,7 +19,7 @@ def _preview(args: argparse.Namespace) -> int:
         )
     if args.folder.exists() and not args.folder.is_dir():
         raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
-    from polysight.host.preview.serve import preview
+    from polysight.host.page.server import preview
 
     return preview(args.folder, args.host, args.port, args.control)
 

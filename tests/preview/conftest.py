@@ -15,7 +15,7 @@ from chromium import Browser, find_chromium
 from looking import GrowingScan
 from small_scan import Samples, SmallScan
 
-from polysight.host.preview.watch import Watch
+from polysight.host.page.watch import Watch
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from polysight.host.acquisition.control import ALIVE, CONTROL
-from polysight.host.preview.serve import server
-from polysight.host.preview.server import make_app
-from polysight.host.preview.watch import Watch
+from polysight.host.page.server import make_app, server
+from polysight.host.page.watch import Watch
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import EVENTS, MANIFEST, utc_now
 

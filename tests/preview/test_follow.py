@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.host.preview.follow import EventTail, ManifestTail
+from polysight.host.page.watch import EventTail, ManifestTail
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import EVENTS, MANIFEST

@@ -16,7 +16,7 @@ import zmq
 from looking import wait_for
 from zmq.utils.monitor import recv_monitor_message
 
-from polysight.host.preview.listener import PiListener
+from polysight.host.page.listener import PiListener
 from polysight.shared import messages as m
 from polysight.shared.config import load_instrument
 from polysight.shared.raster import plan_raster

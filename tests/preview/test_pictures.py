@@ -11,8 +11,7 @@ import pytest
 from matplotlib.image import imread
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.preview.pictures import PHASE, colour_bar, draw
-from polysight.host.preview.rows import range_profile_db
+from polysight.host.page.images import PHASE, colour_bar, draw, range_profile_db
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import load_instrument
 from polysight.shared.units import SPEED_OF_LIGHT_M_S

@@ -14,8 +14,7 @@ from looking import LIMIT_S, served, wait_for
 
 from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
 from polysight.host.cli import build_parser
-from polysight.host.preview.serve import is_loopback
-from polysight.host.preview.server import STATIC, TOKEN_HEADER
+from polysight.host.page.server import STATIC, TOKEN_HEADER, is_loopback
 
 TOKEN = "the-right-token"
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from polysight.host.preview.snapshot import remaining
-from polysight.host.preview.story import Story, seconds
+from polysight.host.page.snapshot import remaining
+from polysight.host.page.story import Story, seconds
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import EVENTS, MANIFEST, ScanFolder

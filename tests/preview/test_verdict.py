@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 
 from polysight.host.acquisition.control import Wish
-from polysight.host.preview.listener import Heard
-from polysight.host.preview.rows import Shown
-from polysight.host.preview.story import Story
-from polysight.host.preview.verdict import Signs, judge, no_scan
-from polysight.host.preview.words import of_fault
+from polysight.host.page.images import Shown
+from polysight.host.page.listener import Heard
+from polysight.host.page.story import Story, of_fault
+from polysight.host.page.verdict import Signs, judge, no_scan
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
 from polysight.shared.faults import EXPLANATIONS, PiFault

@@ -8,9 +8,9 @@ import shutil
 import pytest
 from looking import LIMIT_S, GrowingScan, wait_for
 
+from polysight.host.page.images import draw
+from polysight.host.page.watch import Watch
 from polysight.host.pipeline import Pipeline
-from polysight.host.preview.pictures import draw
-from polysight.host.preview.watch import Watch
 from polysight.host.store.scan_folder import ScanFolder
 
 

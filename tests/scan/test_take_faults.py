@@ -12,7 +12,7 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.acquisition.take import ON_REQUEST, FaultKind, TakeFault
 from polysight.host.capture.dca1000 import Status
-from polysight.host.preview.words import CAUSES, of_rejection
+from polysight.host.page.story import CAUSES, of_rejection
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.shared.faults import PiFault, explain
 

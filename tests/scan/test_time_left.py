@@ -10,8 +10,8 @@ from polysight.host.acquisition import scan_loop as running
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.progress import time_left, usual_row_s
 from polysight.host.acquisition.scan import run_scan
-from polysight.host.preview.snapshot import remaining
-from polysight.host.preview.story import Story, seconds
+from polysight.host.page.snapshot import remaining
+from polysight.host.page.story import Story, seconds
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
 

@@ -12,7 +12,7 @@ import tomli_w
 
 from polysight.host.acquisition.scan import resume_scan
 from polysight.host.cli import main
-from polysight.host.preview.story import Story
+from polysight.host.page.story import Story
 from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, reconnected
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 from polysight.host.acquisition.control import Wish
-from polysight.host.preview.listener import Heard
-from polysight.host.preview.rows import Shown
-from polysight.host.preview.story import Story
-from polysight.host.preview.words import Notice, sentence
+from polysight.host.page.images import Shown
+from polysight.host.page.listener import Heard
+from polysight.host.page.story import Notice, Story, sentence
 
 StatusLevel = Literal["good", "done", "wait", "warn", "bad"]
 SINCE = "{since}"  # where the page writes for how long

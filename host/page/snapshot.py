@@ -9,11 +9,10 @@ from typing import Any
 
 from polysight.host.acquisition.control import Wish
 from polysight.host.acquisition.progress import time_left
-from polysight.host.preview.listener import Heard
-from polysight.host.preview.rows import Shown
-from polysight.host.preview.story import Story
-from polysight.host.preview.verdict import Signs, judge, no_scan, sync_notices, unreadable
-from polysight.host.preview.words import Notice
+from polysight.host.page.images import Shown
+from polysight.host.page.listener import Heard
+from polysight.host.page.story import Notice, Story
+from polysight.host.page.verdict import Signs, judge, no_scan, sync_notices, unreadable
 from polysight.shared.sync_in import WIDTH_US
 
 PAPER_PHASE_RAD = 0.022

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import zmq
 
-from polysight.host.preview.words import Notice, of_error, of_fault
+from polysight.host.page.story import Notice, of_error, of_fault
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError, ProtocolError
 from polysight.shared.messages import (

@@ -28,13 +28,13 @@ Run = Callable[[argparse.Namespace], int]
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from polysight.host.demo import run_demo
+    from polysight.host.jobs.demo import run_demo
 
     return run_demo(args.scene, args.config, args.out, args.time_scale)
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from polysight.host.demo import run_simulator
+    from polysight.host.jobs.demo import run_simulator
 
     command = ["simulate", str(args.scene), "--config", str(args.config), "--out", str(args.out)]
     command += ["--layout", args.layout]
@@ -49,26 +49,26 @@ def _process(args: argparse.Namespace) -> int:
 
 def process_one(args: argparse.Namespace) -> int:
     """`polysight process` of one scan."""
-    from polysight.host.offline import process
+    from polysight.host.jobs.process import process
 
     config = rig_file(args)
     return process(args.data, args.out, config, with_polarimetry(options_of(args), args, config))
 
 
 def _image(args: argparse.Namespace) -> int:
-    from polysight.host.offline import image
+    from polysight.host.jobs.process import image
 
     return image(args.data, args.out, rig_file(args))
 
 
 def _focus(args: argparse.Namespace) -> int:
-    from polysight.host.offline import focus
+    from polysight.host.jobs.process import focus
 
     return focus(args.data, args.out, rig_file(args), args.depth)
 
 
 def _sync_report(args: argparse.Namespace) -> int:
-    from polysight.host.offline import sync_report
+    from polysight.host.jobs.process import sync_report
 
     return sync_report(args.data, args.out, rig_file(args))
 
@@ -84,13 +84,13 @@ def _train(args: argparse.Namespace) -> int:
         from polysight.papers.sensys2026.dataset import train_authors
 
         return train_authors(args.authors, args.config, args.out)
-    from polysight.host.offline import train
+    from polysight.host.jobs.process import train
 
     return train(args.simulate, args.data, args.config, args.out)
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from polysight.host.checks import inspect_file
+    from polysight.host.jobs.scan_files import inspect_file
 
     return inspect_file(args.file, args.config, args.plot, args.card, args.json)
 

@@ -13,25 +13,25 @@ _FORM = argparse.RawDescriptionHelpFormatter
 
 
 def _direct_path(args: argparse.Namespace) -> int:
-    from polysight.host.calibration_commands import direct_path
+    from polysight.host.jobs.calibrate import direct_path
 
     return direct_path(args.scan, args.target, args.config, args.prior, args.out, args.json)
 
 
 def _hpf(args: argparse.Namespace) -> int:
-    from polysight.host.calibration_commands import hpf
+    from polysight.host.jobs.calibrate import hpf
 
     return hpf(args.scans, args.config, args.out, args.json)
 
 
 def _metal(args: argparse.Namespace) -> int:
-    from polysight.host.calibration_commands import metal
+    from polysight.host.jobs.calibrate import metal
 
     return metal(args.scan, args.config, args.bands, args.out, args.json)
 
 
 def _start_frequency(args: argparse.Namespace) -> int:
-    from polysight.host.calibration_commands import start_frequency
+    from polysight.host.jobs.calibrate import start_frequency
 
     return start_frequency(args.scan, args.config, args.out, args.json)
 

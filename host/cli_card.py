@@ -12,19 +12,19 @@ _FORM = argparse.RawDescriptionHelpFormatter
 
 def card_status(args: argparse.Namespace) -> int:
     """`polysight card` without an action."""
-    from polysight.host.cards import show_cards
+    from polysight.host.jobs.cards import show_cards
 
     return show_cards(args.config, args.listen, args.json)
 
 
 def _program(args: argparse.Namespace) -> int:
-    from polysight.host.cards import program_card
+    from polysight.host.jobs.cards import program_card
 
     return program_card(args.config, args.board, args.mac, args.at, args.yes, args.wait)
 
 
 def _reset(args: argparse.Namespace) -> int:
-    from polysight.host.cards import reset_card
+    from polysight.host.jobs.cards import reset_card
 
     return reset_card(args.config, args.board, args.radar)
 

@@ -25,19 +25,19 @@ class Add(Protocol):
 
 
 def _materials(args: argparse.Namespace) -> int:
-    from polysight.host.found_commands import materials
+    from polysight.host.jobs.materials import materials
 
     return materials(args.data, args.json)
 
 
 def _report(args: argparse.Namespace) -> int:
-    from polysight.host.found_commands import report
+    from polysight.host.jobs.materials import report
 
     return report(args.scan)
 
 
 def _permittivity(args: argparse.Namespace) -> int:
-    from polysight.host.material_commands import permittivity
+    from polysight.host.jobs.materials import permittivity
 
     given = {"--bands": args.bands, "--amplitude": args.amplitude, "--config": args.config}
     useless = [name for name, value in given.items() if value is not None]
@@ -54,19 +54,19 @@ def _permittivity(args: argparse.Namespace) -> int:
 
 
 def _concentration(args: argparse.Namespace) -> int:
-    from polysight.host.material_commands import concentration
+    from polysight.host.jobs.materials import concentration
 
     return concentration(args.data, dict(args.value), args.confidence, args.json)
 
 
 def _classify(args: argparse.Namespace) -> int:
-    from polysight.host.classify_commands import classify
+    from polysight.host.jobs.materials import classify
 
     return classify(args.data, args.library, args.model, args.json)
 
 
 def _layer(text: str) -> Layer:
-    from polysight.host.material_commands import parse_layer
+    from polysight.host.jobs.materials import parse_layer
 
     try:
         return parse_layer(text)

@@ -55,14 +55,14 @@ def with_polarimetry(options: Options, args: argparse.Namespace, config: Path | 
         )
     if args.reference is None:
         return options
-    from polysight.host.metal_scans import load_reference
+    from polysight.host.jobs.calibrate import load_reference
 
     by_position = args.reference_by != "mean"
     return replace(options, reference=load_reference(args.reference, config, by_position, args.bands))
 
 
 def _leakage(args: argparse.Namespace) -> int:
-    from polysight.host.metal_scans import leakage
+    from polysight.host.jobs.calibrate import leakage
 
     return leakage(args.plate, args.strips, args.config, args.json)
 

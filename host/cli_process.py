@@ -14,7 +14,7 @@ from polysight.host.cli_numbers import count
 from polysight.shared.errors import ConfigError, PolysightError
 
 if TYPE_CHECKING:
-    from polysight.host.many import Job, Outcome
+    from polysight.host.jobs.batch import Job, Outcome
 
 
 def add_data_arguments(sub: argparse.ArgumentParser, several: bool) -> None:
@@ -62,7 +62,7 @@ def process_scans(
     PolysightError
         as processing one scan does; with several only when none can be begun.
     """
-    from polysight.host.many import at_once, cores, free_memory_bytes, jobs_of, process_many, scans_of
+    from polysight.host.jobs.batch import at_once, cores, free_memory_bytes, jobs_of, process_many, scans_of
 
     scans = scans_of(args.data)
     one = argparse.Namespace(**{k: v for k, v in vars(args).items() if k not in ("jobs", "again", "dask")})
@@ -99,7 +99,7 @@ def _positions(data: Path) -> int:
 
 def table(outcomes: Sequence[Outcome], out: Path) -> str:
     """What became of every scan, and the counts."""
-    from polysight.host.many import SUMMARY
+    from polysight.host.jobs.batch import SUMMARY
 
     rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
     for o in outcomes:

@@ -10,25 +10,25 @@ from polysight.host.cli_options import add_config_option, add_material_options, 
 
 
 def _scan(args: argparse.Namespace) -> int:
-    from polysight.host.live import scan
+    from polysight.host.jobs.live_scan import scan
 
     return scan(args.config, args.out, args.truth, options_of(args), args.keep_incomplete, not args.no_process)
 
 
 def _resume(args: argparse.Namespace) -> int:
-    from polysight.host.live import resume
+    from polysight.host.jobs.live_scan import resume
 
     return resume(args.folder, options_of(args), args.keep_incomplete, not args.no_process, args.config)
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from polysight.host.checks import validate_folder
+    from polysight.host.jobs.scan_files import validate_folder
 
     return validate_folder(args.folder, args.json)
 
 
 def _drop_raw(args: argparse.Namespace) -> int:
-    from polysight.host.dropping import drop_raw
+    from polysight.host.jobs.scan_files import drop_raw
 
     return drop_raw(args.folder, args.products, args.yes)
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
+from polysight.host.jobs.process import train
 from polysight.host.materials import Library
-from polysight.host.offline import train
 from polysight.host.polarimetry import fresnel
 from polysight.host.products.files import read_products
 from polysight.host.report.export import material_columns

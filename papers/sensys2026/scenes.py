@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import tomli_w
 
-from polysight.host.demo import run_simulator
+from polysight.host.jobs.demo import run_simulator
+from polysight.host.jobs.process import EDGE_MM, TRUTH
 from polysight.host.materials import MaterialsResult, TruthPlate, patches_from_plates, read_truth
-from polysight.host.offline import EDGE_MM, TRUTH
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.source import ScanSource

@@ -7,7 +7,7 @@ import pytest
 
 from polysight.host.calibration.active import load_calibration
 from polysight.host.cli import main
-from polysight.host.metal_scans import load_reference
+from polysight.host.jobs.calibrate import load_reference
 from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options
 from polysight.host.store.scan_folder import ScanFolder

@@ -13,7 +13,7 @@ from polysight.host.calibration.metal import write_metal
 from polysight.host.cli import main
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import image_grid
-from polysight.host.metal_scans import load_reference
+from polysight.host.jobs.calibrate import load_reference
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import plane_reference
 from polysight.host.process.request import Options

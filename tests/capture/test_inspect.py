@@ -12,8 +12,7 @@ from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.inspect import Known, Report, Shape, inspect_bin
 from polysight.host.capture.inspect_pcap import inspect_pcap, read_pcap
-from polysight.host.capture.inspect_text import main_text
-from polysight.host.capture.plot import plot_profile
+from polysight.host.jobs.scan_files import main_text, plot_profile
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 

@@ -13,7 +13,7 @@ import tomli_w
 
 from polysight.host.cli import main
 from polysight.host.imaging.images import sub_bands
-from polysight.host.material_commands import parse_layer
+from polysight.host.jobs.materials import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.products.files import MATERIALS, SavedProducts, read_products
 from polysight.host.report import write_json

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from polysight.host.cli import main
-from polysight.host.material_commands import parse_layer
+from polysight.host.jobs.calibrate import load_reference
+from polysight.host.jobs.materials import parse_layer
+from polysight.host.jobs.process import imaged
 from polysight.host.materials import read_truth
 from polysight.host.materials.layers import fit_layer
 from polysight.host.materials.sub_bands import bands_of_row
-from polysight.host.metal_scans import load_reference
-from polysight.host.offline import imaged
 from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument
 from polysight.simulators.scene import decode_scene

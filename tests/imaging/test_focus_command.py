@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host import offline
 from polysight.host.cli import main
 from polysight.host.imaging.focus import Focus
+from polysight.host.jobs import process as offline
 from polysight.shared.config import load_instrument
 from polysight.simulators.scene import decode_scene
 from polysight.simulators.simulate import simulate

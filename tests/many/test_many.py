@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host import many
 from polysight.host.cli import main
 from polysight.host.cli_process import table
-from polysight.host.many import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
+from polysight.host.jobs import batch as many
+from polysight.host.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
 from polysight.host.products.files import FINISHED
 from polysight.shared.errors import ConfigError
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polysight.host.cli import main
-from polysight.host.material_commands import parse_layer
+from polysight.host.jobs.materials import parse_layer
 from polysight.host.materials import Entry, Library
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.materials.published import write_materials

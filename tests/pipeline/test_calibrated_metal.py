@@ -9,7 +9,7 @@ import pytest
 
 from polysight.host.calibration.files import SourceScan
 from polysight.host.calibration.metal import write_metal
-from polysight.host.metal_scans import load_reference
+from polysight.host.jobs.calibrate import load_reference
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
 

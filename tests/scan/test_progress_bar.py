@@ -8,7 +8,7 @@ import re
 from rich.console import Console
 
 from polysight.host.acquisition.scan import ScanProgress
-from polysight.host.progress import ScanBar
+from polysight.host.jobs.live_scan import ScanBar
 
 ROWS = 20
 

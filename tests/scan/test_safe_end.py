@@ -16,12 +16,13 @@ import msgspec
 import pytest
 import tomli_w
 
-from polysight.host import live, progress
 from polysight.host.acquisition import scan_loop as running
 from polysight.host.acquisition.control import StopRequest, hangups_pass
 from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.ready import make_ready
 from polysight.host.acquisition.scan import resume_scan, run_scan
+from polysight.host.jobs import live_scan as live
+from polysight.host.jobs import live_scan as progress
 from polysight.host.process.request import Options
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate

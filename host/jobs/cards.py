@@ -11,7 +11,7 @@ import msgspec
 
 from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.host.capture.survey import CardSurvey, HopFinding, survey_cards
-from polysight.host.confirm import typed
+from polysight.host.jobs.scan_files import typed
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DeviceError
 

@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.progress import track
 
 from polysight.host.calibration.active import of_scan
-from polysight.host.demo import check_scenes, run_simulator
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.focus import focus_sweep
+from polysight.host.jobs.demo import check_scenes, run_simulator
 from polysight.host.materials import TrainingScan, TruthPlate, make_library, patches_from_plates, read_truth
 from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options

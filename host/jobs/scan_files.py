@@ -1,0 +1,242 @@
+"""`polysight drop-raw`: give the space of raw rows back once they are processed."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from polysight.host.capture.dca1000 import Code
+from polysight.host.capture.inspect import CardReport, Known, Report, inspect_bin
+from polysight.host.capture.inspect_pcap import inspect_pcap, is_pcap
+from polysight.host.products.files import QUALITY, read_products
+from polysight.host.products.folder import RAW_DROPPED
+from polysight.host.report import write_json
+from polysight.host.store.raw import Digests, drop, droppable
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder, utc_now
+from polysight.host.store.validate import to_json, validate
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError, DataError, PolysightError
+
+
+def typed(what: str, word: str, yes: bool) -> str:
+    """Say what would be done, and return what is typed in answer; `word` unasked when `yes` was given."""
+    sys.stdout.write(f"{what}\n")
+    if yes:
+        return word
+    sys.stdout.write(f"type {word} to do it: ")
+    sys.stdout.flush()
+    return sys.stdin.readline().strip()
+
+
+WORD = "drop"
+
+
+def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
+    """Remove every raw row that saved products were made from, once confirmed; returns the exit status.
+
+    Raises
+    ------
+    DataError
+        when there are no products, or they were made from nothing of this scan.
+    ConfigError
+        when it is not confirmed; nothing was removed.
+    """
+    scan = ScanFolder.load(folder)
+    products = read_products(products or folder).folder
+    processed = processed_digests(products)
+    what = droppable(scan, processed)
+    for line in what.kept:
+        sys.stdout.write(f"kept: {line}\n")
+    if not what.files:
+        if what.kept:
+            raise DataError(
+                f"{folder}: nothing can be dropped",
+                f"{products} is made from none of its rows",
+                f"`polysight process {folder} --out DIR`, then --products DIR",
+            )
+        sys.stdout.write(f"{folder}: every processed row is dropped already\n")
+        return 0
+    text = (
+        f"{folder}: the raw data of {len(what.files)} rows, {what.bytes / 1e6:.1f} MB, is removed. {products} stays;"
+        " it cannot be processed again."
+    )
+    said = typed(text, WORD, yes)
+    if said != WORD:
+        raise ConfigError(f"nothing dropped: answered {said!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
+    _keep(products, scan)
+    drop(scan, processed, products)
+    sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
+    return 0
+
+
+def _keep(products: Path, scan: ScanFolder) -> None:
+    """Have the products say that they are all that is left of the scan, so that no other's ever replace them."""
+    told = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
+    write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: told})
+
+
+def processed_digests(folder: Path) -> Digests:
+    """What saved products were made from, as quality.json beside a readable image.npz says. Raises DataError."""
+    products = read_products(folder)
+    _ = products.image  # raises when it cannot be read
+    try:
+        boards = products.quality["boards"]
+        return {name: {int(r): str(crc) for r, crc in b["raw_crc32"].items()} for name, b in boards.items()}
+    except (ValueError, KeyError, AttributeError, TypeError) as e:
+        raise DataError(
+            f"{products.folder / QUALITY}: does not say what it was made from: {e}",
+            "made by an earlier release, damaged, or from another program's recordings",
+            "`polysight process SCAN --out DIR` makes it again",
+        ) from None
+
+
+def main_text(report: Report) -> str:
+    """The report for people."""
+    r = report
+    lines = [f"{r.path}: {r.bytes} bytes{' of a simulated scan' if r.simulated else ''}"]
+    if r.card is not None:
+        lines += _card_lines(r.card)
+    if r.chirps:
+        order = ("Q first" if r.q_first else "I first") if r.is_complex else "real"
+        lines += [
+            f"shape      {r.chirps} chirps x {r.rx} RX x {r.samples} samples, {r.lanes}-lane, {order}"
+            + (f" (guessed: {', '.join(r.guessed)})" if r.guessed else ""),
+            f"peak       {r.peak_db:.1f} dB over the median at bin {r.peak_bin} of {r.samples}",
+            f"level      rms {', '.join(f'{v:.0f}' for v in r.rx_rms)} counts on RX 0.., DC {max(r.rx_dc):.1f}",
+            f"clipping   {r.clipped} values at full scale",
+            f"profile    {_sparkline(r.profile_db)}",
+        ]
+    return "\n".join(lines + [f"note       {remark}" for remark in r.remarks]) + "\n"
+
+
+def _card_lines(card: CardReport) -> list[str]:
+    lines = [f"card       {card.address}, {len(card.replies)} replies: {', '.join(n for n, _ in card.replies)}"]
+    refused = [n for n, s in card.replies if s and n not in (Code.STATUS.name, Code.VERSION.name)]
+    if refused:
+        lines.append(f"refused    {', '.join(refused)}")
+    if card.version:
+        lines.append(f"FPGA       {card.version}")
+    if card.status:
+        lines.append(f"status     {' '.join(s.name or '?' for s in card.status)}")
+    if card.record is not None:
+        c = card.record.counts
+        lines.append(
+            f"record     {card.record.received} of {card.record.expected} bytes in {c.placed} packets, {c.duplicates}"
+            f" duplicates, {c.late} late, {c.disagreeing} disagreeing"
+        )
+    if card.tail_bytes:
+        lines.append(f"tail       {card.tail_bytes} bytes, {card.tail_after_s:.3f} s after the packet before")
+    return lines
+
+
+def _sparkline(profile_db: NDArray[np.float64], width: int = 64) -> str:
+    bars = " ▁▂▃▄▅▆▇█"
+    groups = np.array_split(profile_db, min(width, profile_db.size))
+    tops = np.array([g.max() for g in groups])
+    span = max(float(tops.max()), 1e-9)
+    return "".join(bars[int(np.clip(round(t / span * 8), 0, 8))] for t in tops)
+
+
+def validate_folder(folder: Path, as_json: bool) -> int:
+    """Print every fault of a scan folder; 0 when there is none."""
+    findings = validate(folder)
+    if as_json:
+        sys.stdout.write(to_json(findings) + "\n")
+    else:
+        sys.stdout.write("".join(f"{f}\n" for f in findings) or f"{folder}: whole\n")
+    return 1 if any(f.severity == "error" for f in findings) else 0
+
+
+def _refuse_text(file: Path) -> None:
+    """Text would be taken for samples: payload has no mark by which it is known. Raises DataError."""
+    with file.open("rb") as f:
+        head = f.read(4096)
+    if head.strip() and all(byte >= 0x20 or byte in b"\t\n\r\f" for byte in head) and head.isascii():
+        raise DataError(
+            f"{file}: a text file", "a card records bytes, not text", "give a row (.bin) or a capture (.pcap)"
+        )
+
+
+def _is_pcap(file: Path) -> bool:
+    """By its name, or by its first bytes where the name does not say."""
+    if file.suffix in (".pcap", ".bin"):
+        return file.suffix == ".pcap"
+    with file.open("rb") as f:
+        return is_pcap(f.read(4))
+
+
+def _scan_of(file: Path) -> ScanFolder | None:
+    """The scan a row's file belongs to, where its manifest can be read."""
+    folders = file.resolve().parents
+    if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
+        return None
+    try:
+        return ScanFolder.load(folders[2])
+    except PolysightError:
+        return None  # `polysight validate` says what is wrong with it
+
+
+def inspect_file(file: Path, config: Path | None, plot: Path | None, card_address: str, as_json: bool) -> int:
+    """Say what is in a capture, and draw its range profile; returns the exit status.
+
+    `config` is the rig file it was recorded with; a row of a scan folder brings its own. Raises PolysightError.
+    """
+    if file.is_file():
+        _refuse_text(file)
+    scan = _scan_of(file)
+    rig = load_instrument(config) if config is not None else None if scan is None else scan.instrument
+    known = Known() if rig is None else Known.of_instrument(rig)
+    pcap = file.is_file() and _is_pcap(file)
+    report = inspect_pcap(file, known, card_address) if pcap else inspect_bin(file, known)
+    report.simulated = scan is not None and scan.simulated
+    if as_json:
+        from polysight.host.report import plain
+
+        sys.stdout.write(json.dumps(plain(asdict(report)), indent=1) + "\n")
+    else:
+        sys.stdout.write(main_text(report))
+    if plot is not None:
+        plot_profile(report, plot)
+        sys.stderr.write(f"range profile: {plot}\n")
+    return 0
+
+
+BOTTOM_DB = -20.0
+
+
+def plot_profile(report: Report, path: Path) -> None:
+    """Write the range profile, every antenna and their mean, as a PNG.
+
+    Raises
+    ------
+    DataError
+        when the recording holds no chirp, or the file cannot be written.
+    """
+    if not report.profile_db.size:
+        raise DataError(f"{report.path}: no chirp to plot", "the recording holds no data", "record again")
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for rx, profile in enumerate(report.rx_profile_db):
+        silent = " (no signal)" if profile.max() < BOTTOM_DB else ""
+        axes.plot(profile, linewidth=0.8, label=f"RX{rx}{silent}")
+    axes.plot(report.profile_db, color="black", linewidth=1.4, label="mean")
+    axes.axvline(report.peak_bin, color="grey", linestyle=":", linewidth=1.0)
+    axes.set_xlabel(f"range bin of {report.samples} samples")
+    axes.set_ylabel("power over the median [dB]")
+    name = f"{'simulated ' if report.simulated else ''}{report.path.name}"
+    axes.set_title(f"{name}: {report.chirps} chirps, peak {report.peak_db:.1f} dB at bin {report.peak_bin}")
+    axes.set_ylim(bottom=BOTTOM_DB)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", ncols=5)
+    try:
+        figure.savefig(path, format="png", dpi=120)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be written: {e.strerror}", "no such folder, or no permission") from None

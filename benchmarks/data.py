@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import scene_gate_m
-from polysight.host.store.sources.source import RowData
+from polysight.host.store.source import RowData
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.raster import RasterPlan, Row, plan_raster
@@ -88,6 +88,12 @@ class RepeatedRows:
     files: dict[str, list[Path]]
     simulated: bool = True
     scan_id: str = "benchmark"
+    mirrored: bool = False
+    synchronised: bool = False
+
+    def recording_facts(self) -> dict[str, Any]:
+        """None are known."""
+        return {}
 
     @property
     def plan(self) -> RasterPlan:

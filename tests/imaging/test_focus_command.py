@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.imaging.focus import Focus
 from polysight.host.jobs import process as offline
 from polysight.shared.config import load_instrument

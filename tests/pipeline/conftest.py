@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.scene import decode_scene

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.plan import Changes
 from polysight.host.store import manifest
 from polysight.host.store.events import EventWriter

@@ -72,7 +72,7 @@ def scanned(rig, tmp_path_factory):
             scan = [
                 sys.executable,
                 "-m",
-                "polysight.host.cli",
+                "polysight.host",
                 "scan",
                 "--config",
                 ready.removeprefix("ready ").strip(),

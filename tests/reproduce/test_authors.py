@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.materials import Library, knn
 from polysight.host.polarimetry import ratio_from_permittivity
 from polysight.papers.sensys2026 import dataset_figures as authors_items

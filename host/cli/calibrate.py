@@ -1,4 +1,4 @@
-"""The options of `polysight calibrate`."""
+"""The commands that measure the rig with itself: calibrate, leakage."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from polysight.host.cli_materials import Add
-from polysight.host.cli_numbers import count, number
+from polysight.host.cli.options import Add, count, number
 
 _FORM = argparse.RawDescriptionHelpFormatter
 
@@ -36,10 +35,16 @@ def _start_frequency(args: argparse.Namespace) -> int:
     return start_frequency(args.scan, args.config, args.out, args.json)
 
 
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    _add_calibrate(add)
+    _add_leakage(add)
+
+
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 
 
-def add_calibrate_command(add: Add) -> None:
+def _add_calibrate(add: Add) -> None:
     """`polysight calibrate` and its actions."""
     sub = add(
         "calibrate",
@@ -123,3 +128,44 @@ def add_calibrate_command(add: Add) -> None:
         "polysight calibrate start-frequency scans/first-light",
     )
     part.add_argument("scan", type=Path, metavar="SCAN", help="any scan")
+
+
+def _leakage(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.calibrate import leakage
+
+    return leakage(args.plate, args.strips, args.config, args.json)
+
+
+def _add_leakage(add: Add) -> None:
+    """`polysight leakage`."""
+    sub = add(
+        "leakage",
+        _leakage,
+        "cross-polar leakage of both receivers, from metal at two orientations: lines for the rig file",
+        "polysight leakage scans/plate --strips 0=scans/vertical --strips 90=scans/horizontal",
+    )
+    sub.add_argument("plate", type=Path, metavar="PLATE", help="scan of a whole metal plate over the plane")
+    sub.add_argument(
+        "--strips",
+        type=_turned,
+        action="append",
+        required=True,
+        metavar="DEG=SCAN",
+        help="scan of thin metal strips in its place, turned by so much from the vertical towards +x; give two, best 0"
+        " and 90 (one alone: both receivers are taken to leak alike)",
+    )
+    sub.add_argument(
+        "--config", type=Path, default=None, metavar="FILE", help="rig file for unsynced/<scan>, as instrument.toml"
+    )
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+
+def _turned(text: str) -> tuple[float, Path]:
+    degrees, _, folder = text.partition("=")
+    try:
+        angle = float(degrees)
+    except ValueError:
+        angle = float("nan")
+    if not -180 <= angle <= 180 or not folder:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form DEGREES=SCAN, e.g. 90=scans/horizontal")
+    return angle, Path(folder)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan
 
 
@@ -34,11 +36,6 @@ class RowData:
     frames_expected: int
     crc32: str = ""
 
-    @classmethod
-    def none(cls, positions: int) -> RowData:
-        """What stands for a row that was synchronised elsewhere: a frame for each position, and no bytes."""
-        return cls(np.zeros(0, np.uint8), [], positions)
-
     @property
     def missing_bytes(self) -> int:
         """Number of bytes that never arrived."""
@@ -55,12 +52,32 @@ class RowData:
         return mask
 
 
+@dataclass(frozen=True)
+class CubeRow:
+    """One board's row of a scan that another program has synchronised: no bytes of the card are known of it.
+
+    Attributes
+    ----------
+    cube
+        complex64 [rx, position, sample], positions as they were met, referenced as the other program left them.
+    """
+
+    cube: NDArray[np.complex64]
+    missing_bytes: int = 0
+    crc32: str = ""
+
+    @property
+    def frames_expected(self) -> int:
+        """One for each position."""
+        return self.cube.shape[1]
+
+
 class Scan(Protocol):
     """What every scan tells, however it was recorded."""
 
     @property
     def instrument(self) -> Instrument:
-        """The rig file the scan was made with."""
+        """The rig file the scan was made with; of a mirrored scan the rig mirrored in x = y."""
         ...
 
     @property
@@ -78,26 +95,53 @@ class Scan(Protocol):
         """Name of the scan."""
         ...
 
+
+class Source(Scan, Protocol):
+    """Recorded rows of one scan: a scan folder of ours, or the published data read as one."""
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether it was recorded column by column: rig, plan and images are then mirrored in x = y."""
+        ...
+
+    @property
+    def synchronised(self) -> bool:
+        """Whether another program has synchronised it already: the chirps are not in it."""
+        ...
+
     def rows(self) -> Iterator[int]:
         """Indices of the rows that hold data, ascending."""
         ...
 
+    def read_row(self, board_name: str, row: int) -> RowData | CubeRow:
+        """One board's recording of one row. Raises DataError when it is absent or damaged."""
+        ...
 
-class ScanSource(Scan, Protocol):
-    """A recorded scan: a scan folder, or another layout read as one."""
+    def recording_facts(self) -> dict[str, Any]:
+        """Entries of quality.json on how the scan was recorded: rows retaken, losses by board, notices."""
+        ...
+
+
+class RawSource(Source, Protocol):
+    """A source with the chirps still in it. Build with :func:`raw_source`."""
 
     def read_row(self, board_name: str, row: int) -> RowData:
         """One board's recording of one row. Raises DataError when it is absent or damaged."""
         ...
 
 
-class SyncedSource(Scan, Protocol):
-    """A scan that another program has synchronised."""
+def raw_source(source: Source, where: Path) -> RawSource:
+    """The same source, when the chirps are in it.
 
-    def read_synced(self, board_name: str, row: int) -> NDArray[np.complex64]:
-        """One board's row, complex64 [rx, column, sample], column 0 the smallest x. Raises DataError."""
-        ...
-
-    def recording(self) -> dict[str, Any]:
-        """What quality.json says of how it was recorded."""
-        ...
+    Raises
+    ------
+    DataError
+        when another program has synchronised it.
+    """
+    if source.synchronised:
+        raise DataError(
+            f"{where}: the chirps are not in it",
+            "these cubes were synchronised already, by the authors",
+            "give the same scan's unsynced/ folder",
+        )
+    return cast(RawSource, source)

@@ -1,27 +1,16 @@
-"""The options of the commands on materials: permittivity, concentration, classify."""
+"""The commands on materials: materials, report, permittivity, concentration, classify, train, export."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
-from polysight.host.cli_numbers import count, number
+from polysight.host.cli.options import Add, add_config_option, add_model_option, count, number
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
     from polysight.host.materials.layers import Layer
-
-
-class Add(Protocol):
-    """How a command is added to `polysight`."""
-
-    def __call__(
-        self, name: str, run: Callable[[argparse.Namespace], int], text: str, example: str
-    ) -> argparse.ArgumentParser:
-        """A parser for the command's own options."""
-        ...
 
 
 def _materials(args: argparse.Namespace) -> int:
@@ -90,15 +79,17 @@ _percent = number(float, "a percentage from 0 to 100", lambda value: 0 <= value 
 _share = number(float, "a share from 0.5 to below 1", lambda value: 0.5 <= value < 1)
 
 
-def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
-    """`--model`: which classifier; `none`: whether naming can be left out."""
-    names = ["knn", "discriminant", "own-spread", *(["none"] if none else [])]
-    told = "classifier instead of the one that was chosen for the library by leaving scans out; knn is the paper's"
-    sub.add_argument("--model", choices=names, help=told + ("; none names nothing" if none else ""))
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    _add_results(add)
+    _add_permittivity(add)
+    _add_concentration(add)
+    _add_classify(add)
+    _add_train(add)
+    _add_export(add)
 
 
-def add_material_commands(add: Add) -> None:
-    """`materials`, `report`, `permittivity`, `concentration` and `classify`."""
+def _add_results(add: Add) -> None:
     sub = add(
         "materials",
         _materials,
@@ -118,6 +109,8 @@ def add_material_commands(add: Add) -> None:
     )
     sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder, or a folder that polysight process wrote")
 
+
+def _add_permittivity(add: Add) -> None:
     sub = add(
         "permittivity",
         _permittivity,
@@ -157,6 +150,8 @@ def add_material_commands(add: Add) -> None:
     )
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")
 
+
+def _add_concentration(add: Add) -> None:
     sub = add(
         "concentration",
         _concentration,
@@ -175,6 +170,8 @@ def add_material_commands(add: Add) -> None:
     sub.add_argument("--confidence", type=_share, default=0.9, help="of the intervals (default: 0.9)")
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")
 
+
+def _add_classify(add: Add) -> None:
     sub = add(
         "classify",
         _classify,
@@ -192,3 +189,64 @@ def add_material_commands(add: Add) -> None:
     sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
     add_model_option(sub)
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+
+def _train(args: argparse.Namespace) -> int:
+    if args.authors is not None and (args.data or args.simulate):
+        raise ConfigError(
+            f"{'DATA' if args.data else '--simulate'} and --authors together",
+            "a library is made of scans of this rig, or of the published files: not of both",
+            "give one of them",
+        )
+    if args.authors is not None:
+        from polysight.papers.sensys2026.dataset import train_authors
+
+        return train_authors(args.authors, args.config, args.out)
+    from polysight.host.jobs.process import train
+
+    return train(args.simulate, args.data, args.config, args.out)
+
+
+def _add_train(add: Add) -> None:
+    sub = add(
+        "train",
+        _train,
+        "make the classifier's reference library from scans of known plates",
+        "polysight train --simulate examples/library --out library.npz",
+    )
+    add_config_option(sub)
+    sub.add_argument("data", type=Path, nargs="*", metavar="DATA", help="scan folders with truth.json")
+    sub.add_argument(
+        "--simulate", type=Path, default=None, metavar="DIR", help="simulate every scene in DIR and use it"
+    )
+    sub.add_argument(
+        "--authors", type=Path, default=None, metavar="DIR", help="the published data set: its materials/ and labels/"
+    )
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE", help="library to write (.npz)")
+
+
+_FORMATS = {
+    "hdf5": "image.h5: arrays with axes as dimension scales, units, config, versions (needs h5py)",
+    "mat": "image.mat: the same for MATLAB and Octave",
+    "png": "amplitude (dB) and phase (degrees) of H, V and P, and the materials",
+    "csv": "materials.csv: a line a patch, permittivity with standard errors",
+}
+
+
+def _export(args: argparse.Namespace) -> int:
+    from polysight.host.report.export import export
+
+    return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
+
+
+def _add_export(add: Add) -> None:
+    sub = add(
+        "export",
+        _export,
+        "write the products of a processed scan for other programs: HDF5, MATLAB, PNG, CSV",
+        "polysight export out/one --hdf5 --csv",
+    )
+    sub.add_argument("products", type=Path, metavar="DIR", help="folder that polysight process wrote, or a scan folder")
+    for name, text in _FORMATS.items():
+        sub.add_argument(f"--{name}", action="store_true", help=text)
+    sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")

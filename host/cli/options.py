@@ -3,33 +3,35 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Protocol, TypeVar
 
-from polysight.host.cli_materials import add_model_option
 from polysight.shared.errors import ConfigError
-
-if TYPE_CHECKING:
-    from polysight.host.process.request import Options
 
 RIG = Path("instrument.toml")
 
 
-def options_of(args: argparse.Namespace) -> Options:
-    """What the options of :func:`add_material_options` ask for; the label file is read here.
+class Add(Protocol):
+    """Adds a command to `polysight`, and returns its parser."""
+
+    def __call__(
+        self, name: str, run: Callable[[argparse.Namespace], int], text: str, example: str
+    ) -> argparse.ArgumentParser:
+        """A parser for the options of the command."""
+        ...
+
+
+def material_request(args: argparse.Namespace) -> dict[str, Any]:
+    """Fields of a ProcessRequest from the options of :func:`add_material_options`.
 
     Raises
     ------
     ConfigError
-        when one of them would do nothing.
-    DataError
-        when the label file is none.
+        when an option would have no effect.
     """
-    from polysight.host.materials.patch_files import read_labels
-    from polysight.host.process.request import Options
-
     given = {"--library": args.library, "--metal": args.metal, "--labels": args.labels, "--model": args.model}
     asked = [name for name, value in given.items() if value is not None]
     if asked and getattr(args, "no_process", False):
@@ -40,13 +42,22 @@ def options_of(args: argparse.Namespace) -> Options:
         )
     if args.library is not None and args.model == "none":
         raise ConfigError("--library with --model none would do nothing", "nothing is named", "leave one of them out")
-    labels = None if args.labels is None else read_labels(args.labels)
-    return Options(metal_box_mm=args.metal, library=args.library, model=args.model, labels=labels)
+    return {
+        "metal_box_mm": args.metal,
+        "library": text_of(args.library),
+        "model": args.model,
+        "labels": text_of(args.labels),
+    }
 
 
-def rig_file(args: argparse.Namespace) -> Path | None:
-    """The rig file that was given, or the one that lies with the data, or here."""
-    return args.config or next((rig for rig in (args.data / RIG, RIG) if rig.exists()), None)
+def text_of(path: Path | None) -> str | None:
+    """A path as a request holds it."""
+    return None if path is None else str(path)
+
+
+def rig_file(config: Path | None, data: Path) -> Path | None:
+    """The rig file that was given, or else the one in the folder of the data, or in the current folder."""
+    return config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
 
 
 def box(text: str) -> tuple[float, float, float, float]:
@@ -71,6 +82,13 @@ def joined(words: Sequence[str]) -> list[str]:
         else:
             out.append(word)
     return out
+
+
+def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
+    """`--model`: which classifier; `none`: whether naming can be left out."""
+    names = ["knn", "discriminant", "own-spread", *(["none"] if none else [])]
+    told = "classifier instead of the one that was chosen for the library by leaving scans out; knn is the paper's"
+    sub.add_argument("--model", choices=names, help=told + ("; none names nothing" if none else ""))
 
 
 def add_config_option(sub: argparse.ArgumentParser) -> None:
@@ -98,3 +116,25 @@ def add_material_options(sub: argparse.ArgumentParser) -> None:
         " authors' label file; a box named metal or copper is the reference",
     )
     add_model_option(sub, none=True)
+
+
+Number = TypeVar("Number", int, float)
+
+
+def number(kind: Callable[[str], Number], rule: str, holds: Callable[[Number], bool]) -> Callable[[str], Number]:
+    """A `type` for argparse: a number for which `holds` is true; else the error is "... is not `rule`"."""
+
+    def convert(text: str) -> Number:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not holds(value):
+            raise argparse.ArgumentTypeError(f"{text} is not {rule}")
+        return value
+
+    return convert
+
+
+positive = number(float, "a number above 0", lambda value: 0 < value < math.inf)
+count = number(int, "a whole number, 1 or more", lambda value: value >= 1)

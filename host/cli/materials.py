@@ -214,7 +214,7 @@ def _add_train(add: Add) -> None:
         "make the classifier's reference library from scans of known plates",
         "polysight train --simulate examples/library --out library.npz",
     )
-    add_config_option(sub)
+    add_config_option(sub, shipped=True)
     sub.add_argument("data", type=Path, nargs="*", metavar="DATA", help="scan folders with truth.json")
     sub.add_argument(
         "--simulate", type=Path, default=None, metavar="DIR", help="simulate every scene in DIR and use it"

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from polysight.data import packaged
 from polysight.shared.errors import ConfigError
 
 RIG = Path("instrument.toml")
@@ -91,9 +92,11 @@ def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
     sub.add_argument("--model", choices=names, help=told + ("; none names nothing" if none else ""))
 
 
-def add_config_option(sub: argparse.ArgumentParser) -> None:
-    """The rig file."""
-    sub.add_argument("--config", type=Path, default=RIG, metavar="FILE", help="rig file (default: instrument.toml)")
+def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> None:
+    """Add `--config`. `shipped`: without hardware, the rig file that comes with polysight will do where none is here."""
+    where = "instrument.toml here, or else the one that comes with polysight" if shipped else "instrument.toml"
+    default = packaged(RIG) if shipped else RIG
+    sub.add_argument("--config", type=Path, default=default, metavar="FILE", help=f"rig file (default: {where})")
 
 
 def add_material_options(sub: argparse.ArgumentParser) -> None:

@@ -167,7 +167,7 @@ def _add_plan(add: Add) -> None:
         "time, resolution, noise, aliases and data of a scan before it is made; or the best scan within a time",
         "polysight plan --minutes 30\n  polysight plan --speed-mm-s 100 --pulses 16 --period-us 750",
     )
-    add_config_option(sub)
+    add_config_option(sub, shipped=True)
     for flag, kind, text in _NUMBERS:
         sub.add_argument(flag, type=kind, metavar="N", help=f"{text} (default: the rig file's)")
     sub.add_argument("--minutes", type=positive, metavar="M", help="propose the best plans within this time")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from polysight.data import packaged
 from polysight.host.cli.options import RIG, Add, add_config_option, positive
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError
@@ -27,7 +28,7 @@ def _simulate(args: argparse.Namespace) -> int:
 
 
 def _reproduce(args: argparse.Namespace) -> int:
-    if args.config != RIG:
+    if args.config != packaged(RIG):
         load_instrument(args.config)  # a wrong one is told now, not with the first item that needs it
     if args.authors is not None:
         from polysight.papers.sensys2026.dataset_run import reproduce_authors
@@ -49,11 +50,11 @@ def add_commands(add: Add) -> None:
         "scan a scene with the whole rig simulated, and make the report; no hardware is needed",
         "polysight demo --out out/demo",
     )
-    add_config_option(sub)
+    add_config_option(sub, shipped=True)
     sub.add_argument(
         "--scene",
         type=Path,
-        default=Path("examples/nine-materials.toml"),
+        default=packaged(Path("examples/nine-materials.toml")),
         metavar="FILE",
         help="what to scan (default: nine materials)",
     )
@@ -74,7 +75,7 @@ def add_commands(add: Add) -> None:
         "make the raw data of a scene, with truth.json, in one step and without processes",
         "polysight simulate examples/point-targets.toml --out out/points",
     )
-    add_config_option(sub)
+    add_config_option(sub, shipped=True)
     sub.add_argument("scene", type=Path, metavar="SCENE.toml", help="what to scan, e.g. examples/metal-plate.toml")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
     sub.add_argument(
@@ -97,7 +98,7 @@ def _add_reproduce(add: Add) -> None:
     )
     sub.add_argument("items", nargs="*", metavar="ITEM", help="fig3, fig18, table2 ... (default: all there are)")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the page and the files")
-    add_config_option(sub)
+    add_config_option(sub, shipped=True)
     sub.add_argument("--quick", action="store_true", help="fewer draws, models and placements")
     sub.add_argument(
         "--authors",

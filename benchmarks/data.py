@@ -23,10 +23,7 @@ from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.raster import RasterPlan, Row, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.layouts import OwnLayout
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import Scene, apply_scene, load_scene
-from polysight.simulators.simulate import row_offsets_mm
+from polysight.simulators.scene import OwnLayout, Scene, SimulatedRig, apply_scene, load_scene, row_offsets_mm
 
 ROOT = Path(__file__).parents[1]
 RIG = ROOT / "instrument.toml"

@@ -44,9 +44,7 @@ from polysight.host.polarimetry import incidence_choice
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.raster import plan_raster
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import Scene, load_scene
-from polysight.simulators.simulate import row_offsets_mm, truth
+from polysight.simulators.scene import Scene, SimulatedRig, load_scene, row_offsets_mm, truth
 
 ROOT = Path(__file__).parents[1]
 ITERATIONS = 40

@@ -10,9 +10,9 @@ from pathlib import Path
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.raster import check_burst_fits
-from polysight.simulators import simulate
-from polysight.simulators._process import command_line
+from polysight.simulators.process import command_line
 from polysight.simulators.scene import apply_scene, load_scene
+from polysight.simulators.scene import simulated_scan as simulate
 
 
 def _check(args: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ import shutil
 import signal
 from pathlib import Path
 
-from polysight.simulators.build_cache import compiled
+from polysight.simulators.builds import compiled
 
 ENABLING_COMMAND = "sudo apt-get install gcc libc6-dev"
 VANISH = signal.SIGUSR1

@@ -186,9 +186,9 @@ def test_a_stage_that_is_silent(live):
 
 def _stage_is_compiled():
     """Whether the stage is the sketch itself, not its Python stand-in."""
-    from polysight.simulators.stage import compiler
+    from polysight.simulators.builds import sketch_compiler
 
-    return compiler() is not None
+    return sketch_compiler() is not None
 
 
 def _wait(condition, limit_s=60.0):

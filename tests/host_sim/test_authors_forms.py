@@ -16,9 +16,7 @@ from polysight.host.sync.synchronised import recognise
 from polysight.shared.config import Image, load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins
-from polysight.simulators.authors_forms import write_cube
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate, write_cube
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))

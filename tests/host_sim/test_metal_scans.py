@@ -19,8 +19,7 @@ from polysight.host.materials.layers import fit_layer
 from polysight.host.materials.sub_bands import bands_of_row
 from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 pytestmark = pytest.mark.xdist_group("metal_scans")
 

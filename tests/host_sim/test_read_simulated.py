@@ -9,9 +9,7 @@ from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.open import open_source
 from polysight.host.store.validate import validate
 from polysight.shared.config import load_instrument
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import lost_bytes, simulate
+from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")

@@ -206,8 +206,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 def test_real_scans_end_to_end(tmp_path, capsys):
     """A simulated scan and a damaged one by the real program; then the mark holds."""
     from polysight.shared.config import load_instrument
-    from polysight.simulators.scene import decode_scene
-    from polysight.simulators.simulate import simulate
+    from polysight.simulators.scene import decode_scene, simulate
 
     rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
     scene = {

@@ -17,8 +17,7 @@ from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 
 REPO = Path(__file__).resolve().parents[2]
 RIG = REPO / "instrument.toml"

@@ -12,8 +12,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.source import RowData
 from polysight.shared.config import load_instrument
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 from tests.small_scene import small_scene
 
 from .arrival_model import PAYLOAD, Load, pulse_times, receive

@@ -14,14 +14,10 @@ import pytest
 
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DeviceError
-from polysight.simulators.card_endpoint import CardEndpoint
-from polysight.simulators.card_faults import Faults, read_faults
-from polysight.simulators.card_sender import CardSender, Pace, bound_udp
-from polysight.simulators.dca1000 import Network
+from polysight.simulators.cards import CardEndpoint, CardSender, Network, Pace, SimulatedCard, StageTrack, bound_udp
+from polysight.simulators.faults import Faults, read_faults
 from polysight.simulators.loopback import on_free_subnet
-from polysight.simulators.pattern import PatternSource, pattern_frames
-from polysight.simulators.simulated_card import SimulatedCard
-from polysight.simulators.sync_in import StageTrack
+from polysight.simulators.scene import PatternSource, pattern_frames
 
 ROOT = Path(__file__).parents[2]
 FRAME, PERIOD_NS = 4096, 1_500_000

@@ -12,7 +12,7 @@ from polysight.host.store.sources.published_settings import mirrored
 from polysight.shared.config import Burst, Grid, load_instrument
 from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
 from polysight.shared.raster import plan_raster
-from polysight.simulators.authors_layout import AuthorsLayout
+from polysight.simulators.scene import AuthorsLayout
 
 ROOT = Path(__file__).parents[2]
 COLUMNS, ROWS, PULSES = 9, 4, 3

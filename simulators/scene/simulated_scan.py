@@ -21,11 +21,11 @@ from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import incidence_deg, specular_midpoint_m
 from polysight.shared.raster import Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight.shared.tables import to_builtins
-from polysight.simulators.authors_layout import AuthorsLayout, Skipped
-from polysight.simulators.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.receiver import stream_key
-from polysight.simulators.scene import Scene, apply_scene, load_scene
+from polysight.simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
+from polysight.simulators.scene.published_layout import AuthorsLayout, Skipped
+from polysight.simulators.scene.radar import SimulatedRig
+from polysight.simulators.scene.receiver import stream_key
+from polysight.simulators.scene.scene_file import Scene, apply_scene, load_scene
 
 Progress = Callable[[int, int], None]
 
@@ -131,7 +131,7 @@ def simulate(
     progress
         Called with rows done and rows in all.
     by_columns, skipped
-        Authors' layout only: see :class:`polysight.simulators.authors_layout.AuthorsLayout`.
+        Authors' layout only: see :class:`polysight.simulators.scene.published_layout.AuthorsLayout`.
 
     Returns
     -------

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.simulators.card_faults import Faults
-from polysight.simulators.dca1000 import DATA_HEADER_BYTES, Status
-from polysight.simulators.sync_in import Pulse
+from polysight.simulators.cards.dca1000 import DATA_HEADER_BYTES, Status
+from polysight.simulators.cards.sync_in import Pulse
+from polysight.simulators.faults import Faults
 
 Rows = NDArray[np.uint8]
 

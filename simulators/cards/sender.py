@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.errors import DeviceError
-from polysight.simulators.dca1000 import DATA_HEADER_BYTES
+from polysight.simulators.cards.dca1000 import DATA_HEADER_BYTES
 
 Rows = NDArray[np.uint8]
 _UDP_SEGMENT = 103  # linux/udp.h: the kernel cuts one buffer into equal datagrams

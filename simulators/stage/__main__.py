@@ -1,23 +1,33 @@
-"""The far end of the USB cable for the Python stand-in of the stage: a pseudo terminal with a fixed name."""
+"""The stage of a simulated rig: a serial port that behaves like the board, trigger and motion on the simulated wires.
+
+It is the sketch's own code, compiled for this machine (arduino_stage/pc); without a C++ compiler, or with `--python`,
+a stand-in with the same dialogue and the same step times.
+"""
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import os
 import select
 import struct
+import sys
 import termios
 import time
 import tty
 from pathlib import Path
 from threading import Event as Signal
 
-from polysight.shared.errors import DeviceError
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DeviceError, PolysightError
 from polysight.shared.units import NS_PER_MS
 from polysight.shared.wires import WireClient
-from polysight.simulators.stage_motion import TICK_HZ
-from polysight.simulators.stage_python import PythonStage
+from polysight.simulators.builds import build_sketch, sketch_compiler
+from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.stage.motion import TICK_HZ
+from polysight.simulators.stage.python_stage import PythonStage, Rig
 
+BOOT_MS = 200
 STEP_POLL_MS, REST_POLL_MS = 2, 20
 _IN_CLOSE, _IN_OPEN = 0x08 | 0x10, 0x20  # inotify(7)
 _EVENT = struct.Struct("iIII")
@@ -26,7 +36,7 @@ LONGEST_LEAP_NS = 20 * NS_PER_MS
 
 
 class SerialPort:
-    """A pseudo terminal behind the symbolic link `link`. Raises DeviceError when it cannot be made."""
+    """The far end of the USB cable for the Python stand-in: a pseudo terminal behind the symbolic link `link`. Raises DeviceError when it cannot be made."""
 
     def __init__(self, link: Path) -> None:
         self._link = link
@@ -140,3 +150,53 @@ def serve(
         if is_open and stage.replies:
             port.write(bytes(stage.replies))
         stage.replies.clear()
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    p = command_line("polysight.simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
+    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
+    p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires; without it no edges")
+    p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")
+    p.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="motion runs X times the wall clock")
+    p.add_argument("--boot-ms", type=int, default=BOOT_MS, metavar="N", help="reset to banner, wall time")
+    p.add_argument("--python", action="store_true", help="the Python stand-in, even where a C++ compiler exists")
+    return p
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run until SIGTERM or SIGINT."""
+    p = parser()
+    args = p.parse_args(argv)
+    if not args.time_scale > 0:
+        p.error("--time-scale must be positive")
+    die_with_parent()
+    try:
+        rig = load_instrument(args.config)
+        gxx = None if args.python else sketch_compiler()
+        if gxx is not None:
+            program = str(build_sketch(gxx))
+            command = [program, "--link", str(args.link), "--time-scale", repr(args.time_scale)]
+            command += ["--boot-ms", str(args.boot_ms), "--trigger-line", str(rig.pi.trigger_in)]
+            command += ["--steps-per-mm", repr(rig.stage.steps_per_mm)]
+            command += ["--wires", str(args.wires)] if args.wires else []
+            os.execv(program, command)
+        if not args.python:
+            sys.stderr.write("stage: no C++ compiler or no sketch here: the Python stand-in runs instead\n")
+        stop = stop_requested()
+        wires = WireClient(args.wires) if args.wires else None
+        port = SerialPort(args.link)
+        try:
+            announce_ready(str(args.link))
+            stage = PythonStage(Rig(rig.stage.steps_per_mm, rig.pi.trigger_in))
+            serve(stage, port, wires, args.time_scale, args.boot_ms, stop)
+        finally:
+            port.close()
+    except PolysightError as e:
+        sys.stderr.write(f"stage: {e}\n")
+        return e.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,5 +1,6 @@
-"""Writers of the other three forms of the published data set: `raw/` cubes, `labels/` and `materials/`.
+"""Writers of the published data set's forms: `unsynced/<scan>` folders, `raw/` cubes, `labels/` and `materials/`.
 
+The byte formats are the published data set's description; written here independently of the host that reads them.
 Cubes hold the simulated rig's echoes as perfect synchronisation leaves them. The images of `labels/` and the pixels of
 `materials/` are drawn, not imaged: Fresnel's reflection of each box, with speckle and phase errors; what they are for
 is to have files of the exact form with a known truth.
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,18 +18,170 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.shared.config import Instrument
+from polysight.shared.config import Board, Instrument
+from polysight.shared.raster import Row
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.authors_layout import write_settings
-from polysight.simulators.fresnel import half_space
-from polysight.simulators.layouts import new_folder
-from polysight.simulators.optics import antennas, direct_factor
-from polysight.simulators.radar import reference_cube, sample_frequencies_hz
-from polysight.simulators.scene import Scene, apply_scene
+from polysight.simulators.scene.layouts import Gaps, blank, new_folder, packet_payload_bytes
+from polysight.simulators.scene.optics import antennas, direct_factor, half_space
+from polysight.simulators.scene.radar import reference_cube, sample_frequencies_hz
+from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 Complex = NDArray[np.complexfloating]
+Skipped = Mapping[tuple[str, int], Collection[int]]
 PIXELS = 150  # of an image's side
 METAL = "copper"
+
+
+class AuthorsLayout:
+    """The published data set's raw folder: `unsynced/<scan>/<board>/<x>_<y>.bin`, packet logs and three JSON files.
+
+    Parameters
+    ----------
+    path, rig, scan_id, started_s
+        Where, with which rig, under which name, and the unix time of the first packet.
+    zero_filling
+        Lost packets are zeros in the file; otherwise they are absent from it.
+    by_columns
+        The rows that are written are columns: the stage runs along y.
+    skipped
+        Points of a row, by board name and row, at which the radar did not start: nothing of them is in the file.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rig: Instrument,
+        scan_id: str,
+        started_s: float,
+        zero_filling: bool = True,
+        by_columns: bool = False,
+        skipped: Skipped | None = None,
+    ) -> None:
+        self.folder = path / "unsynced" / scan_id
+        self._rig, self._by_columns, self._skipped = rig, by_columns, skipped or {}
+        self._now_s, self._zero_filling = started_s, zero_filling
+
+    def start(self) -> None:
+        """Make the folder and write the three JSON files. Raises DataError when it is not empty."""
+        new_folder(self.folder)
+        write_settings(self.folder, self._rig, self._zero_filling, self._by_columns)
+
+    def write_row(self, row: Row, payloads: dict[str, NDArray[np.int16]], gaps: dict[str, Gaps]) -> None:
+        """One file for each board, named by the grid index where the row starts, and its packet log."""
+        step_s = abs(row.step_mm) / self._rig.stage.speed_mm_s
+        start = row.column(0)
+        stem = f"{row.index}_{start}" if self._by_columns else f"{start}_{row.index}"
+        for name, payload in payloads.items():
+            skipped = self._skipped.get((name, row.index), frozenset())
+            points = [i for i in range(row.points) if i not in skipped]
+            sent = payload.reshape(row.points, -1, *payload.shape[1:])[points]
+            lost = [(a, min(b, sent.nbytes)) for a, b in gaps[name] if a < sent.nbytes]
+            folder = self.folder / name
+            folder.mkdir(exist_ok=True)
+            raw = blank(sent, lost)
+            if not self._zero_filling:
+                ends = [0, *(e for gap in lost for e in gap), len(raw)]
+                kept = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]
+            else:
+                kept = [raw]
+            (folder / f"{stem}.bin").write_bytes(b"".join(kept))
+            (folder / f"{stem}_log.csv").write_text(self._log(len(raw), lost, points, step_s), encoding="ascii")
+        self._now_s += row.points * step_s + 2.0
+
+    def end(self) -> None:
+        """Nothing more is written."""
+
+    def _log(self, size: int, lost: Gaps, points: list[int], step_s: float) -> str:
+        """One line for each packet that arrived: sequence number, payload bytes, unix time."""
+        full, frame = packet_payload_bytes(self._rig), self._rig.frame_bytes
+        pulses, period_s = self._rig.burst.pulses, self._rig.burst.period_us * 1e-6
+        gone = {start // full for a, b in lost for start in range(a - a % full, b, full)}
+        lines = []
+        for k, start in enumerate(range(0, size, full)):
+            if k in gone:
+                continue
+            stop = min(start + full, size)
+            position, chirp = divmod((stop - 1) // frame, pulses)
+            at_s = self._now_s + points[position] * step_s + chirp * period_s + 2e-4
+            lines.append(f"{k + 1},{stop - start},{at_s:.6f}\n")
+        return "".join(lines)
+
+
+def write_settings(folder: Path, rig: Instrument, zero_filling: bool, by_columns: bool) -> None:
+    """The three JSON files of a scan."""
+    for name, content in (
+        ("data_collection_cfg", _collection(rig, folder.name, zero_filling, by_columns)),
+        ("devices_comm_cfg", _devices(rig)),
+        ("radar_id", _radars(rig)),
+    ):
+        (folder / f"{name}.json").write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+
+
+def _collection(rig: Instrument, scan: str, zero_filling: bool, by_columns: bool) -> dict[str, Any]:
+    h, v = rig.receivers
+    tilt = [s.shift_mm for s in h.mount if s.shift_mm is not None][-2]
+    return {
+        "dx": rig.grid.step_x_mm,
+        "dy": rig.grid.step_y_mm,
+        "total_x": rig.grid.columns,
+        "total_y": rig.grid.rows,
+        "moving_direction": "col" if by_columns else "row",
+        "num_trigger": rig.burst.pulses,
+        "period_frame": rig.burst.period_us / 1e3,
+        "num_frame": rig.burst.pulses,
+        "num_chirp": 1,
+        "num_config": 1,
+        "num_adc": rig.chirp.samples,
+        "num_ch": len(rig.antennas.rx_mm),
+        "packet_zero_filling": zero_filling,
+        "object_distance": rig.geometry.object_distance_mm,
+        "board_dist": (_last_shift(h) - _last_shift(rig.transmitter)) / 1e3,
+        "txboard_angle_y": _turn(rig.transmitter, "y", -1),
+        "rxboard_v_angle_y": _turn(v, "y", 0),
+        "rxboard_angle_y": _turn(h, "y", -1),
+        "rxboard_angle_z": _turn(h, "z", -1),
+        "rxboard_tilt_offset": list(tilt),
+        "description": f"simulated: {scan}",
+    }
+
+
+def _devices(rig: Instrument) -> dict[str, Any]:
+    c = rig.chirp
+    chirp = {
+        "f0": c.start_hz,
+        "slope": c.slope_hz_per_s,
+        "ramp_time": c.ramp_end_us * 1e-6,
+        "adc_start_time": c.adc_start_us * 1e-6,
+        "num_adc": c.samples,
+        "Fs": c.sample_rate_hz,
+        "activated_tx": [rig.transmitter.tx_antenna],
+    }
+    return {"activated_radar": list(range(len(rig.boards))), "chirp_configs": [chirp]}
+
+
+def _radars(rig: Instrument) -> dict[str, Any]:
+    return {
+        str(i): {
+            "idx": i,
+            "name": b.name,
+            "ip": b.card_address,
+            "cfg_port": b.command_port,
+            "data_port": b.data_port,
+        }
+        for i, b in enumerate(rig.boards)
+    }
+
+
+def _turn(board: Board, axis: str, which: int) -> float:
+    """A mount's turn about an axis, degrees; 0 when it has none."""
+    turns = [s.turn_deg for s in board.mount if s.about == axis and s.turn_deg is not None]
+    return turns[which] if turns else 0.0
+
+
+def _last_shift(board: Board) -> float:
+    """Last shift of a mount along x, mm: where the board's origin is."""
+    shifts = [s.shift_mm[0] for s in board.mount if s.shift_mm is not None]
+    return shifts[-1] if shifts else 0.0
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,14 @@ A chirp is the sum of direct path and object, times a factor that is new for eve
 F is the undisturbed signal, f_n,k the middle of the signal's band shifted by that chirp's offset, and
 F1 = (dF/dt) / (2 pi j) - middle F. This is the filter's response to first order about the middle of a signal that is
 only some 50 kHz wide; the error is H'' df^2 / 2, below 1e-3 for the published offset of about 1 MHz.
+
+Another source of frames, for bit-exact tests, is a counting pattern: :class:`PatternSource`.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +22,10 @@ from numpy.typing import NDArray
 from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.field import ObjectField, build_field, node_matrix
-from polysight.simulators.optics import antennas, direct_factor
-from polysight.simulators.receiver import high_pass, per_chirp, power_on, pulse_uniform, stream_key, sync_delay_s
-from polysight.simulators.scene import Scene, apply_scene
+from polysight.simulators.scene.field import ObjectField, build_field, node_matrix
+from polysight.simulators.scene.optics import antennas, direct_factor
+from polysight.simulators.scene.receiver import high_pass, per_chirp, power_on, pulse_uniform, stream_key, sync_delay_s
+from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 _BATCH = 64  # chirps worked on at once: their arrays fit the cache
 _FULL_SCALE = 32767
@@ -72,7 +75,7 @@ class SimulatedRig:
         Draws gains, timing, phases and noise; None takes the scene's. The same seed gives the same data for the same
         pulse numbers, however they are batched.
     cache_dir
-        Where object fields are kept between runs (polysight.simulators.field); None keeps nothing.
+        Where object fields are kept between runs (polysight.simulators.scene.field); None keeps nothing.
 
     Attributes
     ----------
@@ -287,3 +290,49 @@ def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) ->
             cube[:, row.index, order] = np.einsum("prq,rqk->rpk", nodes, expand.astype(np.complex64), optimize=True)
         cubes[board.name] = cube
     return cubes
+
+
+class SignalSource(Protocol):
+    """Where the frames come from."""
+
+    def chirps(
+        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
+    ) -> NDArray[np.int16]:
+        """Frames of one chirp each, int16 [n, samples, 8], for stage offsets x_mm [n], y_mm [n].
+
+        `first_pulse` numbers the first one's SYNC_IN pulse since power-up. The eight values of a sample are I of
+        RX1..RX4, then Q of RX1..RX4.
+        """
+        ...
+
+
+def pattern_frames(board: int, first: int, n: int, samples: int) -> NDArray[np.int16]:
+    """Frames `first` .. `first + n - 1` of the pattern, int16 [n, samples, 8].
+
+    Every 32-bit word is `board << 28 | word count since the first frame`, little-endian: any byte that is lost, doubled
+    or misplaced shows, in 1 GiB per board.
+    """
+    words = samples * 4
+    count = np.arange(n * words, dtype="<u4")
+    count += np.uint32(first * words % (1 << 28))  # may wrap at 32 bits, which 28 bits do not notice
+    count &= np.uint32((1 << 28) - 1)
+    count |= np.uint32(board << 28)
+    return count.view("<i2").reshape(n, samples, 8)
+
+
+class PatternSource:
+    """Sends :func:`pattern_frames`, wherever the stage is: frame k comes from SYNC_IN pulse k."""
+
+    def __init__(self, rig: Instrument) -> None:
+        self._samples = rig.chirp.samples
+        self._board = {b.name: i for i, b in enumerate(rig.boards)}
+        self._next = dict.fromkeys(self._board, 0)
+
+    def chirps(
+        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
+    ) -> NDArray[np.int16]:
+        """The frames of len(x_mm) pulses from `first_pulse` on; None goes on from this board's last call."""
+        del y_mm
+        first = self._next[board_name] if first_pulse is None else first_pulse
+        self._next[board_name] = first + len(x_mm)
+        return pattern_frames(self._board[board_name], first, len(x_mm), self._samples)

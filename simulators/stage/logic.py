@@ -7,7 +7,7 @@ from enum import Enum
 
 from polysight.shared.faults import StageError
 from polysight.shared.stage_line import Immediate, Parameter
-from polysight.simulators.stage_motion import EMERGENCY, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
+from polysight.simulators.stage.motion import EMERGENCY, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
 
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999

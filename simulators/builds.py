@@ -1,9 +1,10 @@
-"""Programs compiled on demand, once for the same sources and command."""
+"""Programs compiled on demand, once for the same sources and command; the sketch compiled for this machine is one."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -11,7 +12,9 @@ from pathlib import Path
 
 from polysight.shared.errors import DeviceError
 
-FOLDER = Path(__file__).resolve().parents[1] / "arduino_stage" / "build"  # ignored by git, removed by `make clean`
+SKETCH_DIR = Path(__file__).resolve().parents[1] / "arduino_stage"
+FOLDER = SKETCH_DIR / "build"  # ignored by git, removed by `make clean`
+_FLAGS = ("-std=gnu++11", "-O2", "-Wall", "-Wextra", "-fno-exceptions", "-fno-rtti")
 
 
 def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_failure: tuple[str, str]) -> Path:
@@ -77,3 +80,23 @@ def _folder() -> Path:
     if fallback.stat().st_uid != os.getuid():
         raise DeviceError(f"{fallback} belongs to another user", "somebody made it first", "set TMPDIR")
     return fallback
+
+
+def sketch_compiler() -> str | None:
+    """The C++ compiler's path; None without one, or without the sketch's sources."""
+    return shutil.which("g++") if (SKETCH_DIR / "pc" / "main.cpp").is_file() else None
+
+
+def build_sketch(gxx: str, flags: tuple[str, ...] = _FLAGS) -> Path:
+    """The sketch compiled for this machine. Raises DeviceError when the compiler fails."""
+    sources = [*SKETCH_DIR.glob("*.cpp"), *(SKETCH_DIR / "pc").glob("*.cpp")]
+    headers = [*SKETCH_DIR.glob("*.h"), *(SKETCH_DIR / "pc").glob("*.h")]
+    return compiled(
+        "stage",
+        [*sources, *headers],
+        [gxx, *flags, "-o", "{folder}/stage", *map(str, sorted(sources))],
+        (
+            "the sources were changed, or the compiler is too old",
+            "correct them, or use the Python stand-in: --python",
+        ),
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.config import Board, Chirp, Instrument
-from polysight.simulators.scene import Disturbances, Scene
+from polysight.simulators.scene.scene_file import Disturbances, Scene
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]

@@ -13,7 +13,7 @@ from polysight.shared.errors import ConfigError
 from polysight.shared.raster import burst_middle_s, plan_raster
 from polysight.shared.units import us_to_ns
 from polysight.shared.wires import WireMotion
-from polysight.simulators.radar_board import RadarBoard
+from polysight.simulators.radars import RadarBoard
 
 RECOVERY_US = 150.0  # between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger)
 _KEEP = 4096

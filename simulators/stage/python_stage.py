@@ -13,8 +13,8 @@ from polysight.shared.errors import ProtocolError
 from polysight.shared.faults import StageError
 from polysight.shared.stage_line import MAX_LINE_BYTES, PROTOCOL_VERSION, Command, Parameter, Reply, crc16
 from polysight.shared.wires import WireEdge, WireMessage, WireMotion
-from polysight.simulators.stage_logic import MOTION_VERBS, Event, Refused, StageLogic
-from polysight.simulators.stage_motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
+from polysight.simulators.stage.logic import MOTION_VERBS, Event, Refused, StageLogic
+from polysight.simulators.stage.motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
 
 FIRMWARE = "0.1.0"
 TELL_TICKS = TICK_HZ // 100  # while the speed changes, tell it every 10 ms

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,16 +14,15 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from polysight.shared.config import Grid, Instrument, load_instrument
-from polysight.shared.errors import ConfigError
+from polysight.shared.config import Board, Grid, Instrument
 from polysight.shared.geometry import incidence_deg, specular_midpoint_m
-from polysight.shared.raster import Row, check_burst_fits, mean_burst_travel_mm, plan_raster
+from polysight.shared.raster import RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight.shared.tables import to_builtins
 from polysight.simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
 from polysight.simulators.scene.published_layout import AuthorsLayout, Skipped
 from polysight.simulators.scene.radar import SimulatedRig
 from polysight.simulators.scene.receiver import stream_key
-from polysight.simulators.scene.scene_file import Scene, apply_scene, load_scene
+from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 Progress = Callable[[int, int], None]
 
@@ -116,21 +113,18 @@ def simulate(
     ----------
     rig, scene
         Rig file and scene; the scene's overrides are applied.
-    out
-        Folder to write; made when absent, refused when not empty.
-    layout
-        "own": a scan folder at `out`. "authors": `out`/unsynced/<scan>, the transmitting board's data included.
+    out, layout
+        Folder to write, made when absent. "own": a scan folder at `out`. "authors": `out`/unsynced/<scan>, with the
+        transmitting board's data.
     seed
         None takes the scene's. The same seed gives the same raw bytes.
     started_s
         Unix time written as the scan's start; None is now.
-    zero_filling
-        Authors' layout only: lost packets are zeros in the file instead of absent.
     cache_dir
         Where object fields are kept between runs; None keeps nothing.
     progress
         Called with rows done and rows in all.
-    by_columns, skipped
+    zero_filling, by_columns, skipped
         Authors' layout only: see :class:`polysight.simulators.scene.published_layout.AuthorsLayout`.
 
     Returns
@@ -146,19 +140,40 @@ def simulate(
     """
     radar = SimulatedRig(rig, _wider(scene, rig) if by_columns else scene, seed, cache_dir)
     rig = apply_scene(rig, scene)
-    grid = _by_columns(rig.grid) if by_columns else rig.grid
-    check_burst_fits(grid, rig.burst, rig.stage)
-    plan = plan_raster(grid)
+    plan = _plan(rig, by_columns)
     started_s = time.time() if started_s is None else started_s
     scan_id = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
-    writer: Layout
     if layout == "own":
         stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
-        folder, boards = out, rig.recorded
-        writer = OwnLayout(out, rig, plan, scan_id, stamp)
+        _write_rows(OwnLayout(out, rig, plan, scan_id, stamp), radar, plan, rig.recorded, by_columns, progress)
+        folder = out
     else:
         writer = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
-        folder, boards = writer.folder, rig.boards
+        _write_rows(writer, radar, plan, rig.boards, by_columns, progress)
+        folder = writer.folder
+        # Their files tell neither geometry nor filter nor leakage; a scan folder's manifest does.
+        (folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
+    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
+    (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return folder
+
+
+def _plan(rig: Instrument, by_columns: bool) -> RasterPlan:
+    """The plan of the rig's grid. Raises ConfigError when a burst does not end before the next point."""
+    grid = _by_columns(rig.grid) if by_columns else rig.grid
+    check_burst_fits(grid, rig.burst, rig.stage)
+    return plan_raster(grid)
+
+
+def _write_rows(
+    writer: Layout,
+    radar: SimulatedRig,
+    plan: RasterPlan,
+    boards: Sequence[Board],
+    by_columns: bool,
+    progress: Progress | None,
+) -> None:
+    """Write every row of the plan, of these boards; `by_columns`: the stage runs along y."""
     writer.start()
     for row in plan:
         x, y = row_offsets_mm(radar, row)
@@ -169,11 +184,6 @@ def simulate(
         if progress is not None:
             progress(row.index + 1, plan.rows)
     writer.end()
-    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
-    (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    if layout == "authors":  # their files tell neither geometry nor filter nor leakage; a scan folder's manifest does
-        (folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-    return folder
 
 
 def _by_columns(grid: Grid) -> Grid:
@@ -185,48 +195,3 @@ def _wider(scene: Scene, rig: Instrument) -> Scene:
     """The scene with a row more above and below, for bursts that travel along y."""
     grid = to_builtins(apply_scene(rig, scene).grid)
     return msgspec.structs.replace(scene, grid={**grid, "rows": grid["rows"] + 2})
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `simulate`."""
-    parser.add_argument("scene", type=Path, help="scene file (docs/spec/scene-file.md)")
-    parser.add_argument("--config", type=Path, default=Path("instrument.toml"), help="rig file")
-    parser.add_argument("--out", type=Path, required=True, help="folder to write")
-    parser.add_argument(
-        "--layout", choices=("own", "authors"), default="own", help="scan folder, or the published data set's"
-    )
-    parser.add_argument("--seed", type=int, default=None, help="instead of the scene's seed")
-    parser.add_argument("--columns", action="store_true", help="authors' layout: taken column by column")
-    parser.add_argument("--absent", action="store_true", help="authors' layout: lost packets are absent, not zeros")
-    parser.add_argument("--json", action="store_true", help="one JSON line instead of words")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Carry out `simulate`. Raises PolysightError."""
-    if args.layout == "own" and (args.columns or args.absent):
-        given = "--columns" if args.columns else "--absent"
-        raise ConfigError(f"{given} with --layout own", "the published data has such scans", "add --layout authors")
-    rig, scene = load_instrument(args.config), load_scene(args.scene)
-    began = time.perf_counter()
-
-    def show(done: int, rows: int) -> None:
-        left = (time.perf_counter() - began) / done * (rows - done)
-        sys.stderr.write(f"\rsimulated row {done} of {rows}, {left:.0f} s left ")
-
-    quiet = args.json or not sys.stderr.isatty()
-    folder = simulate(
-        rig,
-        scene,
-        args.out,
-        args.layout,
-        args.seed,
-        zero_filling=not args.absent,
-        progress=None if quiet else show,
-        by_columns=args.columns,
-    )
-    seconds = time.perf_counter() - began
-    if args.json:
-        sys.stdout.write(json.dumps({"folder": str(folder), "seconds": round(seconds, 2), "simulated": True}) + "\n")
-    else:
-        sys.stdout.write(f"{'' if quiet else chr(10)}simulated scan in {folder}, {seconds:.1f} s\n")
-    return 0

@@ -36,7 +36,10 @@ LONGEST_LEAP_NS = 20 * NS_PER_MS
 
 
 class SerialPort:
-    """The far end of the USB cable for the Python stand-in: a pseudo terminal behind the symbolic link `link`. Raises DeviceError when it cannot be made."""
+    """The far end of the USB cable for the Python stand-in: a pseudo terminal behind the symbolic link `link`.
+
+    Raises DeviceError when it cannot be made.
+    """
 
     def __init__(self, link: Path) -> None:
         self._link = link

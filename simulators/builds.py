@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from polysight.shared.errors import DeviceError
@@ -34,8 +35,9 @@ def compiled(product: str, sources: Iterable[Path], command: Sequence[str], on_f
     Returns
     -------
     Path
-        Named by the product and the hash of sources and command, in arduino_stage/build or, where that cannot be
-        written, in a folder of this user's below the temporary folder. Several processes may ask at once.
+        Named by the product and the hash of sources and command: in arduino_stage/build; where that cannot be written,
+        in ~/.cache/polysight/build; else in a folder of this user's below the temporary folder. Several processes may
+        ask at once.
 
     Raises
     ------
@@ -68,13 +70,17 @@ def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
 
 
 def _folder() -> Path:
-    try:
-        FOLDER.mkdir(exist_ok=True)
-    except OSError:
-        pass
-    else:
-        if os.access(FOLDER, os.W_OK):
-            return FOLDER
+    """The folder for compiled programs, made when absent. Raises DeviceError when the last choice is another user's."""
+    places = [FOLDER]
+    with suppress(RuntimeError):  # a user without a home
+        places.append(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "polysight" / "build")
+    for folder in places:
+        try:
+            folder.mkdir(exist_ok=True, parents=folder != FOLDER)  # no arduino_stage: installed without the repository
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
     fallback = Path(tempfile.gettempdir()) / f"polysight-build-{os.getuid()}"
     fallback.mkdir(mode=0o700, exist_ok=True)
     if fallback.stat().st_uid != os.getuid():

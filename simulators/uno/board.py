@@ -184,7 +184,19 @@ def emulator() -> Path:
 
 
 def firmware() -> Path:
-    """The image that `make flash` puts on a board, a .hex file. Raises DeviceError when it does not compile."""
+    """The image that `make flash` puts on a board, a .hex file.
+
+    Raises
+    ------
+    DeviceError
+        when it does not compile, or its sources are not there.
+    """
+    if not SKETCH_DIR.is_dir():
+        raise DeviceError(
+            f"{SKETCH_DIR}: no such folder",
+            "polysight is installed without its repository, which holds the sketch",
+            "run from a clone of the repository, or use the stage without the emulated board",
+        )
     sources = [p for p in SKETCH_DIR.iterdir() if p.suffix in (".cpp", ".h", ".ino", ".mk")]
     command = ["make", "-s", "-C", str(SKETCH_DIR), "firmware", "AVR_B={folder}"]
     return compiled("arduino_stage.hex", sources, command, _ON_FAILURE)

@@ -13,10 +13,10 @@ from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.plan.timing import scan_time
 from polysight.host.process.request import Options
 from polysight.host.radar.constraints import require
-from polysight.shared.backends import is_simulated
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import incidence_deg
+from polysight.shared.messages import is_simulated
 from polysight.shared.raster import check_burst_fits
 
 SPARE = 2.0  # the disk should take so many times what comes

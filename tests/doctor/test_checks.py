@@ -16,8 +16,7 @@ from polysight.host.doctor.bench import Bench, Finding, System, Wanted, error, o
 from polysight.host.doctor.check_capture import check_network
 from polysight.host.doctor.check_host import check_config, check_disk, check_time
 from polysight.host.doctor.walk import CHECKS, _try, walk
-from polysight.shared.backends import GPIOD, GPIOMEM, WIRES
-from polysight.shared.messages import HelloReply
+from polysight.shared.messages import GPIOD, GPIOMEM, WIRES, HelloReply
 from polysight.shared.tables import to_builtins
 
 # --- the command ---

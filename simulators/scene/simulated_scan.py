@@ -120,10 +120,8 @@ def simulate(
         None takes the scene's. The same seed gives the same raw bytes.
     started_s
         Unix time written as the scan's start; None is now.
-    cache_dir
-        Where object fields are kept between runs; None keeps nothing.
-    progress
-        Called with rows done and rows in all.
+    cache_dir, progress
+        Where object fields are kept between runs (None keeps nothing); called with rows done and rows in all.
     zero_filling, by_columns, skipped
         Authors' layout only: see :class:`polysight.simulators.scene.published_layout.AuthorsLayout`.
 

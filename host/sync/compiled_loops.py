@@ -25,8 +25,10 @@ def _forget_stale() -> None:
     """Numba sees that the file of a cached function changed, but not the files of what was compiled into it."""
     here = Path(__file__).parent
     with suppress(OSError):  # an installation that cannot be written cannot be edited either
-        newest = max((here / f"{name}.py").stat().st_mtime for name in ("compiled", "kernels", "plain", "tone"))
-        for name in ("compiled", "kernels"):
+        newest = max(
+            (here / f"{name}.py").stat().st_mtime for name in ("compiled", "compiled_loops", "numpy_passes", "tone")
+        )
+        for name in ("compiled", "compiled_loops"):
             for index in (here / "__pycache__").glob(f"{name}.*.nbi"):
                 if index.stat().st_mtime < newest:
                     index.unlink(missing_ok=True)

@@ -18,6 +18,12 @@ from types import FrameType, TracebackType
 
 from polysight.shared.errors import ScanError
 
+CONTROL = "control"
+ALIVE = "alive"
+_LOOK_S = 0.2
+_BEAT_S = 1.0
+_TAKEN_LIMIT_S = 5.0
+
 
 class StopRequest:
     """Counts the requests to stop. Safe from any thread and from signal handlers."""
@@ -86,13 +92,6 @@ def interrupts_wait() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-CONTROL = "control"
-ALIVE = "alive"
-_LOOK_S = 0.2
-_BEAT_S = 1.0
-_TAKEN_LIMIT_S = 5.0
 
 
 class Wish(StrEnum):

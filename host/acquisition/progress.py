@@ -20,6 +20,7 @@ from polysight.shared.messages import ExitStatus
 
 OnRow = Callable[[int], None]
 NICE = 5
+_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a rig that was sped up
 
 
 class ProcessingQueue:
@@ -118,9 +119,6 @@ class ScanResult:
 
 
 OnProgress = Callable[[ScanProgress], None]
-
-
-_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a rig that was sped up
 
 
 def usual_row_s(row_seconds: Sequence[float]) -> float:

@@ -19,6 +19,7 @@ from polysight.shared.stage_line import HOMING_LIMIT_S
 
 _HOMING_LIMIT_S = HOMING_LIMIT_S + 30.0  # longer than the Pi, whose reason is the exact one
 STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # homed by hand, after a look: `polysight-pi home`
+UNTOLD = "the Pi does not tell its [stage], so nobody compares it with this rig file's: install this release on the Pi"
 
 
 def make_ready(
@@ -108,9 +109,6 @@ def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
             f"free space, then `polysight resume {folder}`; or lower limits.free_disk_bytes in instrument.toml, and add"
             " --config instrument.toml",
         )
-
-
-UNTOLD = "the Pi does not tell its [stage], so nobody compares it with this rig file's: install this release on the Pi"
 
 
 def pi_fact(hello: HelloReply) -> Fact:

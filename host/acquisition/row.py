@@ -24,6 +24,10 @@ from polysight.shared.messages import Capture, RowFinished
 from polysight.shared.raster import Row
 from polysight.shared.units import NS_PER_S
 
+_TURN_MS = 50  # how often stop requests and limits are looked at
+_ABORT_LIMIT_S = 10.0
+_DISK_NOTICE_S = 2.0
+
 
 class RowState(StrEnum):
     """Where one take of a row is."""
@@ -78,11 +82,6 @@ class RowTransaction:
         """End as failed, unless it has ended already."""
         if TRANSITIONS[self.state]:
             self.to(RowState.FAILED)
-
-
-_TURN_MS = 50  # how often stop requests and limits are looked at
-_ABORT_LIMIT_S = 10.0
-_DISK_NOTICE_S = 2.0
 
 
 class RowTaker:

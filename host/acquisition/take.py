@@ -19,6 +19,26 @@ from polysight.shared.faults import explain
 from polysight.shared.messages import RowFinished
 from polysight.shared.raster import Row
 
+_KINDS = (
+    "packets",
+    "duplicates",
+    "late",
+    "late_by_bytes",
+    "outside",
+    "disagreeing",
+    "malformed",
+    "strangers",
+    "stale",
+    "leftover",
+    "kernel_drops",
+    "head_bytes",
+    "gaps",
+    "gap_bytes",
+    "tail_bytes",
+    "card_status",
+)
+"""What the manifest says of each board's reception, beside what makes the row count."""
+
 
 class FaultKind(StrEnum):
     """What is wrong with a take. The manifest holds the values: none is ever given another meaning."""
@@ -194,27 +214,6 @@ def _unlocated(capture: RowCapture) -> FaultKind:
     if capture.lost_before_packets:
         return FaultKind.CARD_DROPPED
     return FaultKind.FRAMES_MISSING if capture.slipped else FaultKind.UNLOCATED
-
-
-_KINDS = (
-    "packets",
-    "duplicates",
-    "late",
-    "late_by_bytes",
-    "outside",
-    "disagreeing",
-    "malformed",
-    "strangers",
-    "stale",
-    "leftover",
-    "kernel_drops",
-    "head_bytes",
-    "gaps",
-    "gap_bytes",
-    "tail_bytes",
-    "card_status",
-)
-"""What the manifest says of each board's reception, beside what makes the row count."""
 
 
 def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[TakeFault], events: Fact) -> None:

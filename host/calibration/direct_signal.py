@@ -31,6 +31,8 @@ from polysight.shared.errors import DataError
 
 FULL_SCALE = 32767
 PASSBAND = 0.9  # of the sample rate
+ROWS = 4  # of a scan that are looked at
+FOUND = 0.25  # part of the chirps in which a direct path must be found to be believed
 
 
 @dataclass(frozen=True)
@@ -158,10 +160,6 @@ def _power(
     still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
     folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
-
-
-ROWS = 4
-FOUND = 0.25  # part of the chirps in which a direct path must be found to be believed
 
 
 def fit_start(source: ScanSource, board_name: str) -> BoardStart:

@@ -23,6 +23,9 @@ from polysight.shared.errors import ConfigError, DeviceError, ProtocolError
 
 ATTEMPTS = 3
 EEPROM_REPORT_S = 0.5
+_PORTS = struct.Struct("<HH")  # in the EEPROM
+DEFAULT_MAC = "12:34:56:78:90:12"
+_OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
 
 class CardClient:
@@ -209,11 +212,6 @@ class CardClient:
         tried = f"{attempts} attempts" if attempts > 1 else "asked once"
         what = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
         return silent_card(self.board, what, self._kernel_root)
-
-
-_PORTS = struct.Struct("<HH")
-DEFAULT_MAC = "12:34:56:78:90:12"
-_OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
 
 @dataclass(frozen=True)

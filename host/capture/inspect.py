@@ -26,6 +26,10 @@ DRAW = 0.02
 """Layouts whose disorder differs by less are not told apart: the likelier one is taken."""
 _MOST_CHIRPS = 4096  # enough for the statistics
 _CHIRPS_TRIED = 512
+_LOOKED_AT = 16  # headers that tell whether a file holds whole packets
+_FULL_SCALE = 32767  # ADC counts
+_MUCH_DC = 0.05 * _FULL_SCALE
+_CLEARLY = 4 * DRAW  # so much less disorder in another layout contradicts the one that was given
 
 
 @dataclass(frozen=True)
@@ -122,9 +126,6 @@ def is_offset_binary(words: NDArray[np.int16]) -> bool:
     return bool(some.size and (some ^ np.int16(-0x8000)).std() < some.std() / 4)
 
 
-_LOOKED_AT = 16
-
-
 def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
     """The packets of a file that holds full packets one after another, the last perhaps short; none of any other.
 
@@ -159,11 +160,6 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     for packet in packets:
         placement.place_packet(packet)
     return out, placement.finish()
-
-
-_FULL_SCALE = 32767
-_MUCH_DC = 0.05 * _FULL_SCALE
-_CLEARLY = 4 * DRAW  # so much less disorder in another layout contradicts the one that was given
 
 
 @dataclass(frozen=True)

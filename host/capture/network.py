@@ -31,6 +31,9 @@ _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _STRIDE = 1536  # room for the largest packet and for seeing that one is too long
 _MSG_DONTWAIT = socket.MSG_DONTWAIT if hasattr(socket, "MSG_DONTWAIT") else 0x40
+_GATEWAY, _UP = 0x2, 0x1  # flags in /proc/net/route
+_ARP_COMPLETE = 0x2  # flag in /proc/net/arp
+_ROOT = Path("/")
 
 
 class _IoVec(ctypes.Structure):
@@ -222,11 +225,6 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
     if granted < wanted:
         return f"{name}: receive buffer of {granted} bytes granted, {wanted} asked for ({limit}); {remedy}"
     return ""
-
-
-_GATEWAY, _UP = 0x2, 0x1
-_ARP_COMPLETE = 0x2
-_ROOT = Path("/")
 
 
 class Hop(Enum):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from polysight.host.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, SEQUENCE_BITS
 
 Gap = tuple[int, int]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,6 @@ class Placed:
     def complete(self) -> bool:
         """Whether every byte is there and nothing more came."""
         return self.located and not self.missing
-
-
-Bytes = NDArray[np.uint8]
 
 
 @dataclass

@@ -17,6 +17,9 @@ from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError
 
+_START_LIMIT_S = 30.0
+_ANSWER_LIMIT_S = 60.0  # ending a row waits for the disk
+
 
 class _Words(msgspec.Struct, frozen=True, tag=True):
     pass
@@ -160,6 +163,7 @@ class Failed(_Words, frozen=True):
 
 Request = Open | BeginRow | EndRow | Discard | Report
 Answer = Opened | Began | Progress | RowCapture | Discarded | Failed
+A = TypeVar("A", bound=Answer)
 _encoder = msgspec.msgpack.Encoder()
 _requests: Any = msgspec.msgpack.Decoder(Request)
 _answers: Any = msgspec.msgpack.Decoder(Answer)
@@ -181,11 +185,6 @@ def next_request(connection: Connection) -> Request:
 def next_answer(connection: Connection) -> Answer:
     """The next answer. Raises EOFError when the receiver is gone."""
     return _answers.decode(connection.recv_bytes())
-
-
-_START_LIMIT_S = 30.0
-_ANSWER_LIMIT_S = 60.0  # ending a row waits for the disk
-A = TypeVar("A", bound=Answer)
 
 
 class ReceiverProcess:

@@ -22,6 +22,9 @@ from polysight.shared.raster import RasterPlan
 from polysight.shared.sockets import HOST_KEYS, is_loopback
 
 SIMULATED = "simulated wires: no hardware is driven"
+POINTS = 8  # of the row that is run
+_LIMIT_S = 120.0
+_LOOK_MS = 100
 
 
 def check_keys(bench: Bench) -> Finding:
@@ -82,11 +85,6 @@ def check_free(bench: Bench) -> Finding:
             "wait for its end, or end it with `polysight resume`; restarting polysight-pi forgets it",
         )
     return ok("no scan is begun")
-
-
-POINTS = 8
-_LIMIT_S = 120.0
-_LOOK_MS = 100
 
 
 def check_trigger(bench: Bench) -> Finding:

@@ -15,6 +15,8 @@ from polysight.shared.backends import is_simulated
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError, PolysightError
 
+_WIDTH = 16  # of the column of names
+
 
 def _calibration(bench: Bench) -> Finding:
     from polysight.host.doctor.check_host import check_calibration
@@ -130,9 +132,6 @@ def _try(check: Check, bench: Bench, board: Board | None) -> Finding:
         return of_error(
             DeviceError(f"{where}{e.strerror or e}", "a path, a permission or a device", "see what it says")
         )
-
-
-_WIDTH = 16
 
 
 def doctor(wanted: Wanted, as_json: bool, system: System = System()) -> int:  # noqa: B008 - immutable

@@ -20,6 +20,10 @@ from polysight.shared.errors import DataError
 from polysight.shared.raster import plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
+Image = NDArray[np.complex64]
+_log = logging.getLogger(__name__)
+_AT_ONCE = 120  # positions of one product: more are slower by half (OpenBLAS)
+
 
 class Imager(Protocol):
     """Matched filter of an aperture's samples at its pixels, and its adjoint; sums, not means.
@@ -67,11 +71,6 @@ def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.c
 def mirror_reduced(antennas: Antennas, z_m: float, chirp: Chirp, reduction: Reduction) -> NDArray[np.complex128]:
     """The same after the range gate, [rx, frequency]."""
     return mirror_samples(antennas, z_m, chirp) @ reduction.matrix.T
-
-
-Image = NDArray[np.complex64]
-_log = logging.getLogger(__name__)
-_AT_ONCE = 120  # positions of one product: more are slower by half (OpenBLAS)
 
 
 class BoardSamples:

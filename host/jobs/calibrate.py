@@ -31,6 +31,8 @@ from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import to_builtins
 
+LEAST_PIXELS = 100  # of a plate that serves as reference
+
 
 def _tell(path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool) -> int:
     """Say what was found and what to set; 0."""
@@ -171,9 +173,6 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
         ]
         what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
     return _tell(path, file, lines, what_to_set, as_json)
-
-
-LEAST_PIXELS = 100
 
 
 def _reference(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:

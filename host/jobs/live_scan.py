@@ -29,6 +29,9 @@ from polysight.host.store.scan_folder import MANIFEST, ScanFolder, check_same_sc
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, PolysightError, ScanError, advice
 
+PRODUCTS = "products"
+Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
+
 
 def _clock(seconds: float | None) -> str:
     """`1:02:03` or `2:03` left; empty when unknown."""
@@ -91,9 +94,6 @@ class ScanBar:
                 self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
 
 
-PRODUCTS = "products"
-
-
 class _Live:
     """Feeds committed rows to a pipeline, which is made when the first row is there."""
 
@@ -109,9 +109,6 @@ class _Live:
             self.pipeline = Pipeline(self._source, live=True)
         self._source.reload()
         self.pipeline.add_row(row)
-
-
-Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
 @hangups_pass()

@@ -28,6 +28,7 @@ from polysight.shared.errors import ConfigError, DataError
 
 LAST = "?"
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
+REPORT = "report.html"
 
 
 def parse_layer(text: str) -> Layer:
@@ -175,9 +176,6 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
         f" truth in {100 * result.covered:.0f} % of the patches\n"
     )
     return 0
-
-
-REPORT = "report.html"
 
 
 def materials(data: Sequence[Path], as_json: bool) -> int:

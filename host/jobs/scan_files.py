@@ -24,6 +24,9 @@ from polysight.host.store.validate import to_json, validate
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError, DataError, PolysightError
 
+WORD = "drop"  # confirms the removal of raw rows
+BOTTOM_DB = -20.0  # of the plot of a range profile
+
 
 def typed(what: str, word: str, yes: bool) -> str:
     """Say what would be done, and return what is typed in answer; `word` unasked when `yes` was given."""
@@ -33,9 +36,6 @@ def typed(what: str, word: str, yes: bool) -> str:
     sys.stdout.write(f"type {word} to do it: ")
     sys.stdout.flush()
     return sys.stdin.readline().strip()
-
-
-WORD = "drop"
 
 
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
@@ -206,9 +206,6 @@ def inspect_file(file: Path, config: Path | None, plot: Path | None, card_addres
         plot_profile(report, plot)
         sys.stderr.write(f"range profile: {plot}\n")
     return 0
-
-
-BOTTOM_DB = -20.0
 
 
 def plot_profile(report: Report, path: Path) -> None:

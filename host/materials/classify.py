@@ -20,6 +20,9 @@ DISCRIMINANT = "discriminant of error sources"
 OWN_SPREAD = "discriminant of error sources, own spread"
 SLOW = "metric learning (NCA) + KNN"
 """Takes seconds to fit, too long for every start of a program: judged, but not chosen."""
+SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT, "own-spread": OWN_SPREAD}
+"""What the commands call some of them."""
+UNKNOWN = "unknown"
 
 
 class Learnt(Model):
@@ -81,11 +84,6 @@ MODELS: dict[str, Callable[[str], Model]] = {
     "linear discriminant of logarithms": lambda channels: _sklearn(channels, "log", "scale", "lda"),
     "quadratic discriminant": lambda channels: _sklearn(channels, "scale", "qda"),
 }
-SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT, "own-spread": OWN_SPREAD}
-"""What the commands call some of them."""
-
-
-UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True)

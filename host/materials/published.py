@@ -36,6 +36,21 @@ TURNS = {
     "x and y swapped, y from the last row": lambda a: a.T[::-1],
 }
 _CLEARLY = 0.05  # how much more of the brightness another reading must explain
+_ADMITTED = {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("builtins", "complex"),
+    ("_codecs", "encode"),
+    *(
+        (module, name)
+        for module, names in {
+            "multiarray": ("_reconstruct", "scalar"),
+            "numeric": ("_frombuffer",),
+        }.items()
+        for name in names
+        for module in (f"numpy.core.{module}", f"numpy._core.{module}")
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -201,23 +216,6 @@ def told_angle(texts: Iterable[str]) -> float | None:
         if found:
             return float(found[1])
     return None
-
-
-_ADMITTED = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("builtins", "complex"),
-    ("_codecs", "encode"),
-    *(
-        (module, name)
-        for module, names in {
-            "multiarray": ("_reconstruct", "scalar"),
-            "numeric": ("_frombuffer",),
-        }.items()
-        for name in names
-        for module in (f"numpy.core.{module}", f"numpy._core.{module}")
-    ),
-}
 
 
 class _Restricted(pickle.Unpickler):

@@ -27,6 +27,8 @@ from polysight.shared.errors import DataError
 
 FOLDS = 8
 OPTIMISTIC = "by pixel (optimistic)"
+PIXELS = 16
+"""Pixels of a patch that models are judged on."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +199,6 @@ def strangers(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str
                 missed += list(found.distance[np.searchsorted(found.patches, mine)] > 1)
         out[str(name)] = float(np.mean(missed))
     return out
-
-
-PIXELS = 16
-"""Pixels of a patch that models are judged on."""
 
 
 def fit_library(library: Library) -> Library:

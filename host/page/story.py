@@ -65,6 +65,8 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     ),
 }
 """Likely cause of a fault and what to do. Those of the Pi are in shared/faults.py."""
+RowMark = Literal["committed", "kept", "rejected"]
+_RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,6 @@ def of_kept(row: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) 
     """A row that is kept though something of it is missing."""
     why, do = _cause(faults)
     return Notice("warn", f"Row {row} is kept with gaps, which are masked", why, do, "; ".join(reasons), row, utc)
-
-
-RowMark = Literal["committed", "kept", "rejected"]
-_RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
 @dataclass

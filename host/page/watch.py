@@ -29,6 +29,11 @@ from polysight.shared.errors import PolysightError, ProtocolError
 from polysight.shared.messages import AnyEvent, unpack_kept
 
 _HEAD = 256
+_TURN_S = 0.2
+_LAPSE_S = 15.0  # the scan program touches its file once a second
+_GRACE_S = 6.0  # from a manifest's first line to the first sign of life
+_PI_LIMIT_S = 6.0
+_UNATTENDED_ROWS = 3.0  # a scan without signs of life lives while rows come, and for so many rows' time
 
 
 class GrowingFile:
@@ -108,13 +113,6 @@ class EventTail:
         except (msgpack.OutOfData, msgpack.UnpackException, ValueError, ProtocolError):
             self.file.take(end)
         return events
-
-
-_TURN_S = 0.2
-_LAPSE_S = 15.0  # the scan program touches its file once a second
-_GRACE_S = 6.0  # from a manifest's first line to the first sign of life
-_PI_LIMIT_S = 6.0
-_UNATTENDED_ROWS = 3.0  # a scan without signs of life lives while rows come, and for so many rows' time
 
 
 class Versioned(NamedTuple):

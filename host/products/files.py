@@ -24,6 +24,11 @@ from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import decode, to_builtins
 
+SCAN = "scan.json"
+IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
+FINISHED = ".finished.json"  # says what the products were made with, when several scans are processed
+_PRODUCTS = "products"  # of a scan folder
+
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file under a temporary name beside it, flush it to disk, then take its place."""
@@ -103,9 +108,6 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-SCAN = "scan.json"
-
-
 def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
     """Gain and phase of each RX against its board's first one, by board: from the direct path, divided out."""
     out = {}
@@ -129,11 +131,6 @@ def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelIm
     }
     write_json(out / SCAN, facts)
     return facts
-
-
-IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
-FINISHED = ".finished.json"  # says what the products were made with, when several scans are processed
-_PRODUCTS = "products"  # of a scan folder
 
 
 @dataclass(frozen=True)

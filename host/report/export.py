@@ -25,6 +25,14 @@ _COLUMNS = (
     "permittivity_loss", "permittivity_loss_standard_error", "p_real", "p_imag", "p_abs_db", "p_phase_deg",
     "inverse_p_standard_error", "true_name", "true_permittivity_real", "true_permittivity_loss",
 )  # fmt: skip
+CONVENTION = (
+    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
+    " column 0 the smallest x; rig frame; permittivity is real - j loss"
+)
+_UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
+_LONGEST_NAME = 63  # of a MATLAB struct's field
+FORMATS = ("hdf5", "mat", "png", "csv")
+_FOLDER = "export"
 
 
 def material_columns(products: SavedProducts) -> dict[str, list[Any]]:
@@ -82,13 +90,6 @@ def write_csv(path: Path, products: SavedProducts) -> None:
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
     write_atomically(path, text.getvalue().encode("utf-8"))
-
-
-CONVENTION = (
-    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
-    " column 0 the smallest x; rig frame; permittivity is real - j loss"
-)
-_UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
 
 
 def _h5py() -> Any:
@@ -160,9 +161,6 @@ def _write_materials(h5py: Any, group: Any, columns: dict[str, list[Any]]) -> No
         unit = _UNITS.get(name.rpartition("_")[2])
         if unit or name.startswith(("permittivity", "true_permittivity", "p_", "inverse", "confidence")):
             group[name].attrs["units"] = unit or "1"
-
-
-_LONGEST_NAME = 63
 
 
 def write_mat(path: Path, products: SavedProducts) -> None:
@@ -238,10 +236,6 @@ def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
         paths.append(folder / f"{name}.png")
         write_atomically(paths[-1], data)
     return paths
-
-
-FORMATS = ("hdf5", "mat", "png", "csv")
-_FOLDER = "export"
 
 
 def export(folder: Path, formats: list[str], out: Path | None) -> int:

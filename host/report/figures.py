@@ -38,6 +38,7 @@ FIGURES: dict[str, str] = {
     "phase_v": "Phase V",
     "phase_p": "Phase of P = H / V",
 }
+_RANGE_DB = 30.0  # of the images of a focus sweep
 
 
 def colours_of(ctx: ReportContext) -> dict[str, str]:
@@ -337,9 +338,6 @@ def figures(ctx: ReportContext) -> dict[str, bytes]:
     if ctx.truth:
         out["truth"] = map_figure(ctx, draw_truth, "Truth")
     return out
-
-
-_RANGE_DB = 30.0
 
 
 def focus_figure(

@@ -15,6 +15,19 @@ from polysight.shared.raster import RasterPlan
 
 _COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: told apart without colour
 _INK, _MUTED, _STAMP = "#1b2330", "#5b6675", "#b3261e"
+_ROWS: tuple[tuple[str, str], ...] = (
+    ("masked_positions", "Positions masked"),
+    ("rows_without_data", "Rows without any data"),
+    ("loss_db", "Loss of a point's sum by masked positions (dB)"),
+    ("frequencies", "Frequency samples after the range gate"),
+    ("point_width_mm", "Point response at half power, x × y (mm)"),
+    ("point_limit_mm", "Geometry's limit without taper, x × y (mm)"),
+    ("point_paper_mm", "The paper's r λ / L, x × y (mm)"),
+    ("point_sidelobe_db", "Strongest sidelobe, x, y (dB)"),
+)
+Table = dict[str, Any]
+_NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
+UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
 
 def masked_positions(ctx: ReportContext) -> dict[str, npt.NDArray[np.bool_]]:
@@ -71,18 +84,6 @@ def coverage_figure(ctx: ReportContext, masks: dict[str, npt.NDArray[np.bool_]])
     return fig
 
 
-_ROWS: tuple[tuple[str, str], ...] = (
-    ("masked_positions", "Positions masked"),
-    ("rows_without_data", "Rows without any data"),
-    ("loss_db", "Loss of a point's sum by masked positions (dB)"),
-    ("frequencies", "Frequency samples after the range gate"),
-    ("point_width_mm", "Point response at half power, x × y (mm)"),
-    ("point_limit_mm", "Geometry's limit without taper, x × y (mm)"),
-    ("point_paper_mm", "The paper's r λ / L, x × y (mm)"),
-    ("point_sidelobe_db", "Strongest sidelobe, x, y (dB)"),
-)
-
-
 def imaging_table(imaging: Any) -> dict[str, Any] | None:
     """Table of quality.json's `imaging`, a column for each board; None without it."""
     boards = {k: v for k, v in imaging.items() if isinstance(v, dict)} if isinstance(imaging, dict) else {}
@@ -111,10 +112,6 @@ def _number(value: Any, between: str = " × ") -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-Table = dict[str, Any]
-_NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
-
-
 def text(value: Any) -> str:
     """A value as a person reads it: thousands grouped, few digits, yes and no, lists with commas."""
     if value is None:
@@ -133,9 +130,6 @@ def text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(text(v) for v in value) or "none"
     return str(value)
-
-
-UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
 
 def pretty(key: str) -> str:

@@ -9,6 +9,13 @@ from pathlib import Path
 
 from polysight.shared.errors import DeviceError
 
+try:
+    from zlib_ng.zlib_ng import crc32
+except ImportError:
+    from zlib import crc32
+
+__all__ = ["AppendFile", "crc32", "sync_folder"]
+
 
 class AppendFile:
     """A file open for durable appending. No buffer: what one call could not write, no later call writes by surprise.
@@ -111,11 +118,3 @@ def sync_folder(path: Path) -> None:
             "the disk is full or fails",
             f"free space below {path}, then go on",
         ) from None
-
-
-try:
-    from zlib_ng.zlib_ng import crc32
-except ImportError:
-    from zlib import crc32
-
-__all__ = ["crc32"]

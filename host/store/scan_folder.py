@@ -32,6 +32,10 @@ ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
 
 SERIAL = ("port", "baud")
 """Of the stage: the Pi has its own. Calibration is not compared either: a scan keeps copies of its files."""
+FORMAT = 1
+MANIFEST = "manifest.jsonl"
+EVENTS = "events.msgpack"
+PART = ".part"  # suffix of a row that is being received
 
 
 def connection_of(rig: Instrument) -> dict[str, Any]:
@@ -89,12 +93,6 @@ def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
 
 def _told(value: Any) -> str:
     return "not given" if value is None else repr(value)
-
-
-FORMAT = 1
-MANIFEST = "manifest.jsonl"
-EVENTS = "events.msgpack"
-PART = ".part"  # suffix of a row that is being received
 
 
 class BoardRow(msgspec.Struct, frozen=True):

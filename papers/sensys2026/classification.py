@@ -26,6 +26,8 @@ CHOICE, RESULT = 17, 20
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 OTHER_DRAWS = tuple(range(21, 29))
 """Seeds of more draws, for how much chance there is in one."""
+Panel = tuple[Score, npt.NDArray[np.float64], str]
+TRIALS = 4000  # draws behind a bound
 
 
 def _draws(quick: bool) -> int:
@@ -250,9 +252,6 @@ def fig20(run: Run) -> Item:
     )
 
 
-Panel = tuple[Score, npt.NDArray[np.float64], str]
-
-
 def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) -> Figure:
     """One panel for each score and matrix, with its title."""
     n = len(materials)
@@ -298,9 +297,6 @@ def _confused(panels: Sequence[Panel], shown: int = 5) -> str:
                 lines.append(f"   {found.names[i]} named {found.names[j]}: {100 * apart[i, j]:.0f} %")
         lines += [""] if apart.any() else ["   none", ""]
     return "\n".join(lines)
-
-
-TRIALS = 4000
 
 
 @cache

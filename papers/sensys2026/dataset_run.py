@@ -21,12 +21,16 @@ from polysight.papers.sensys2026.run import Origin, write_item, write_page
 from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.errors import ConfigError, DataError, PolysightError
 
+Complex = npt.NDArray[np.complexfloating]
+
 MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "table2": lambda judge: authors_table2(judge.data),
     "fig18": authors_fig18,
     "fig20": authors_fig20,
     "fig21": lambda judge: authors_fig21(judge.data),
 }
+AXIAL_RATIO, METAL_FACTOR, PERCENTILES = 0.05, 1 / 0.8, (30, 70)
+"""What the authors apply before Eq. 3: leakage, a factor on |P| relative to metal, and the pixels by |P| they keep."""
 
 
 def reproduce_authors(
@@ -144,11 +148,6 @@ def _wrapped(text: str, width: int) -> list[str]:
             out.append("")
         out[-1] = f"{out[-1]} {word}".strip()
     return out
-
-
-AXIAL_RATIO, METAL_FACTOR, PERCENTILES = 0.05, 1 / 0.8, (30, 70)
-"""What the authors apply before Eq. 3: leakage, a factor on |P| relative to metal, and the pixels by |P| they keep."""
-Complex = npt.NDArray[np.complexfloating]
 
 
 def without_leakage(p: Complex, axial_ratio: float) -> Complex:

@@ -38,6 +38,15 @@ FIG13_DISTANCE_MM = 598.0
 PHASE_DEG = 30.0
 """Range of the phase that Fig. 14 shows, to either side."""
 
+# Fig. 4.
+FRONT_ON_MM = 60.0
+"""Distance of each board from the middle in the front-on rig: 1.4 degrees of incidence."""
+FRONT_ON_GRID = {"columns": 81, "rows": 81, "step_x_mm": 4.5, "step_y_mm": 4.5}
+"""Monostatic, a step d makes ghosts at wavelength * distance / 2 d: 216 mm for 4.5 mm, outside the plates."""
+ROWS = (3, 6, 15)
+"""Acrylic, PET and glass in Table 2."""
+FRONT_ON_PLACES_MM = ((-60.0, 0.0), (60.0, 0.0), (0.0, 60.0))
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -233,15 +242,6 @@ def fig14(run: Run) -> Item:
         },
         data,
     )
-
-
-FRONT_ON_MM = 60.0
-"""Distance of each board from the middle in the front-on rig: 1.4 degrees of incidence."""
-FRONT_ON_GRID = {"columns": 81, "rows": 81, "step_x_mm": 4.5, "step_y_mm": 4.5}
-"""Monostatic, a step d makes ghosts at wavelength * distance / 2 d: 216 mm for 4.5 mm, outside the plates."""
-ROWS = (3, 6, 15)
-"""Acrylic, PET and glass in Table 2."""
-FRONT_ON_PLACES_MM = ((-60.0, 0.0), (60.0, 0.0), (0.0, 60.0))
 
 
 def front_on(config: Path, folder: Path) -> Path:

@@ -16,11 +16,18 @@ from polysight.papers.sensys2026.patches import calibrated_errors, draw, groups
 from polysight.papers.sensys2026.scenes import imaged, plate, scanned
 from polysight.papers.sensys2026.table2 import Published, published, table2
 
+Complex = npt.NDArray[np.complex128]
+
 COMMON = (1, 3, 6, 12, 13, 15, 21)
 CONTRAST = (1, 13, 16, 12, 18, 6, 3)
 CLUTTERED = ("Cardboard", "PET (1 mm)", "Acrylic (3 mm)")
 WATER = Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "literature value quoted in section 9.2")
 LINES = ("-", "--", "-.", ":")
+# Fig. 17.
+PLACEMENTS = 8
+REACH_MM, APART_MM = 60.0, 60.0
+MATERIALS = {"PET": 6, "ceramic": 12}
+"""Rows of Table 2."""
 
 
 def _rows(numbers: tuple[int, ...]) -> tuple[Published, ...]:
@@ -179,13 +186,6 @@ def table2_item(run: Run) -> Item:
         {"permittivity": Picture(fig, "Recovered against published; the dotted line is equality.")},
         {"materials": data},
     )
-
-
-Complex = npt.NDArray[np.complex128]
-PLACEMENTS = 8
-REACH_MM, APART_MM = 60.0, 60.0
-MATERIALS = {"PET": 6, "ceramic": 12}
-"""Rows of Table 2."""
 
 
 def places(seed: int, count: int = 3) -> list[tuple[float, float]]:

@@ -27,6 +27,14 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 Complex = npt.NDArray[np.complex64]
 UNITS = ("frequency (Hz)", "phase (rad)", "relative amplitude")
 
+# Fig. 9.
+GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
+OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
+USUAL_HZ = 870e3
+SKIRT_HZ = (60e3, 200e3)
+"""Where the smear of a bent chirp lies, from its tone."""
+_PADDED = 4096  # points of a spectrum
+
 
 @dataclass(frozen=True)
 class SyncScan:
@@ -208,14 +216,6 @@ def fig15(run: Run) -> Item:
         {"stages": Picture(fig, "Errors after each stage, on a logarithmic axis, with the bounds of one tone.")},
         summary,
     )
-
-
-GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
-OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
-USUAL_HZ = 870e3
-SKIRT_HZ = (60e3, 200e3)
-"""Where the smear of a bent chirp lies, from its tone."""
-_PADDED = 4096
 
 
 def tones(chirps: npt.NDArray[np.complex64], chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray]:

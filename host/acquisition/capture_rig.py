@@ -1,4 +1,7 @@
-"""All recorded boards at once: their cards and their receiving processes."""
+"""All recorded boards at once: their cards and their receiving processes.
+
+`CaptureRig` starts and stops the records of a row; `record_ending` decides when one board's record has ended.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""The host's end of the two sockets to the Pi: commands with time-out and retry, events without gaps."""
+"""The host's end of the sockets to the Pi: commands with time-out and retry, events without gaps, and the heartbeat.
+
+`PiClient` sends commands and reads events; a gap in their sequence is filled from the Pi's journal. `HostHeartbeat`
+tells the Pi that this process lives, from a thread and a socket of its own.
+"""
 
 from __future__ import annotations
 

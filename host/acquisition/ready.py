@@ -1,4 +1,8 @@
-"""What has to be there before a row begins: a homed stage, and room on the disk."""
+"""What has to be true before a row begins: a homed stage, room on the disk, and the Pi the scan was begun with.
+
+`make_ready` waits for the first and homes where that is safe. `check_same_stage` compares the Pi's own `[stage]` with
+the rig file's: a Pi that would place rows elsewhere is refused.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Takes rows: from arming the radars to what the receivers got."""
+"""Takes rows: from arming the radars to what the receivers got.
+
+`RowTransaction` is the state machine of one take (docs/spec/row.md); `RowTaker` drives it with Pi, radars and cards.
+"""
 
 from __future__ import annotations
 

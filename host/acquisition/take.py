@@ -1,4 +1,8 @@
-"""What one take of a row brought, and why it is not complete."""
+"""One take of a row: what it brought, what is wrong with it, and how it is committed or rejected.
+
+`Take` compares what every board received with the pulses that were sent, and lists the faults (`TakeFault`).
+`commit_row` makes its files durable and writes the manifest's line that makes the row count; `reject_row` removes them.
+"""
 
 from __future__ import annotations
 

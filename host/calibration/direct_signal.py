@@ -1,4 +1,5 @@
-"""The direct path in a short capture: its IF chirp by chirp, and what that says of start frequency, trigger, crystal.
+"""The direct path in a short capture: its IF chirp by chirp, and what that says of start frequency, trigger,
+crystal.
 
 IF of the direct path, with tau its delay, dt how much later the board started than the transmitter, and p what its
 crystal is faster by:
@@ -6,6 +7,7 @@ crystal is faster by:
     f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
 
 A crystal shows by itself: it makes the IF drift by 2 p K within the chirp. What remains beside the geometry is dt.
+`fit_start` takes a scan's direct path and finds the start offset that puts it in the middle of the band.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Control of one DCA1000 over UDP.
+"""Control of one DCA1000 over UDP: starting, stopping and resetting it, and the addresses in its EEPROM.
 
-The socket is never connected: replies leave the card from source port 1024 whatever port the command went to. A
-command is sent again only where twice does no harm. When nothing comes back, the error says which hop is silent.
+The socket is never connected: replies leave the card from source port 1024, whatever port the command went to. A
+command is sent again only where twice does no harm. When nothing comes back, the error names the hop that is silent.
+`program_eeprom` writes new addresses and a new MAC address, which take effect when the card is next switched on.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class CardClient:
     def write_eeprom(self, body: bytes) -> Status:
         """Send the 18 bytes of command 0x04, once; returns the status bits the card reported meanwhile.
 
-        Not sent again when no reply comes: it may be writing. Callers use :func:`polysight.host.capture.card.program_eeprom`.
+        Not sent again when no reply comes: it may be writing. Callers use :func:`program_eeprom`.
         Raises DeviceError when the card refuses or is silent.
         """
         self._status = Status(0)

@@ -1,7 +1,8 @@
 """What is in a recording of a DCA1000: shape, range profile, clipping, missing antennas, order of I and Q.
 
-What is not known is guessed from the statistics, and called a guess. `inspect_pcap.py` reads packet captures,
-`inspect_text.py` says it for people, `plot.py` draws it.
+What is not known is guessed from the statistics, and called a guess: of all layouts that fit, the one whose spectra
+have the least disorder is taken. A file of whole packets, headers included, is recognised and placed by byte count
+first. `inspect_pcap.py` reads packet captures; `polysight.host.jobs.scan_files` prints and plots the report.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""What is in a packet capture of a DCA1000: the card's replies and its record, placed as live data is."""
+"""What is in a packet capture of a DCA1000: the card's replies and its record, placed as live data is.
+
+`read_pcap` reads the UDP datagrams of a classic pcap file of Ethernet packets; a pcapng file is refused, with the
+command that converts it. `inspect_pcap` splits them into replies and data packets, and inspects the record of one card.
+"""
 
 from __future__ import annotations
 

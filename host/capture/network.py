@@ -1,6 +1,9 @@
-"""UDP sockets for the capture card: binding with a clear error, a large buffer that is read back, receiving in batches.
+"""UDP sockets for the capture cards, and the network path to a card that does not answer.
 
-`recvmmsg` fetches many packets with one system call into one block of memory, so that the cost of a packet is its copy.
+A socket is bound with a clear error, and its receive buffer is read back, because the kernel may grant less than was
+asked for. `recvmmsg` fetches many packets with one system call into one block of memory, so that the cost of a packet
+is its copy. `silent_hop` finds the first hop to a silent card that does not work (address, route, link, card), and the
+errors of silent cards and radars say it.
 """
 
 from __future__ import annotations

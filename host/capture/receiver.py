@@ -1,4 +1,9 @@
-"""The host's handle of one receiving process."""
+"""The host's handle of one receiving process, and the messages between the two.
+
+Requests and answers are msgpack structs on a connection that the process inherits. A row is one round: `BeginRow` with
+the file to write, `Progress` while packets come, `EndRow`, and a `RowCapture` that says what was received. The process
+itself is `receiver_process.py`.
+"""
 
 from __future__ import annotations
 
@@ -98,8 +103,8 @@ class RowCapture(_Words, frozen=True):
     `bytes` is what was placed, `missing` the byte ranges that are not (the whole row when `located` is false).
     Arrival times are the host's monotonic clock, 0 when no packet came. Counts of packets as in
     :class:`polysight.host.capture.placement.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
-    :class:`polysight.host.capture.placement.Losses`. `card_status` is what the card reported by itself during the row. `holes`
-    and `slipped` as in :class:`polysight.host.capture.placement.Placed`.
+    :class:`polysight.host.capture.placement.Losses`. `card_status` is what the card reported by itself during the row.
+    `holes` and `slipped` as in :class:`polysight.host.capture.placement.Placed`.
     """
 
     row: int
@@ -197,7 +202,7 @@ class ReceiverProcess:
     buffer_bytes
         Receive buffer to ask the kernel for.
     core
-        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None leaves it free.
+        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None: any.
 
     Attributes
     ----------

@@ -1,6 +1,8 @@
-"""What the checks share: the rig file once it is read, the link to the Pi, what the cards and the capture told.
+"""What the checks share: their findings, the rig file once it is read, the link to the Pi, the cards, and a capture
+at rest.
 
-Clock, disk and kernel are passed in, so that every fault can be tried without having it.
+A `Finding` is one line of the doctor. `Bench` is one run, and `capture` records a few bursts of every board. Clock,
+disk and kernel are passed in (`System`), so that every fault can be tried without having it.
 """
 
 from __future__ import annotations

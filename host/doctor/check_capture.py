@@ -1,6 +1,8 @@
-"""SYNC_IN and the radars: a few pulses at rest, and the frames that must follow.
+"""Checks of the capture side: network, cards, SYNC_IN pulses, radars, and the signal itself.
 
-Nothing moves. Radars that are armed transmit for as long as the pulses last, some tens of milliseconds.
+First each card's link, the card and its receive buffer. Then a few pulses at rest and the frames that must follow, and
+from these frames level, direct path and the receivers' skew. Nothing moves. Radars that are armed transmit for as long
+as the pulses last, some tens of milliseconds.
 """
 
 from __future__ import annotations

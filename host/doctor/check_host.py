@@ -1,4 +1,4 @@
-"""Room and speed of the disk, and how long a scan takes."""
+"""Checks of the host: rig file, calibration and library; the disk, the scan's duration, the clocks."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""The trigger line, from the stage's pin to the Pi's: a short row, every point of which must be an edge.
+"""Checks of the Pi and the stage: keys, the Pi's answer and release, the stage's state, and the trigger line.
 
-The only check that moves something; it runs with `--move` alone.
+The trigger line, from the stage's pin to the Pi's, is checked with a short row, every point of which must be an edge.
+That is the only check that moves something; it runs with `--move` alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The order of the checks, and what each of them needs: a hop behind one that is wrong is not tried."""
+"""The order of the checks, what each of them needs, and the command that walks them.
+
+A hop behind one that is wrong is not tried. `walk` yields findings as they come; `doctor` prints them.
+"""
 
 from __future__ import annotations
 

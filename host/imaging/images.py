@@ -1,4 +1,8 @@
-"""From synchronised rows to the two channel images."""
+"""From synchronised rows to the two channel images: of the whole sweep, and of its sub-bands.
+
+`ImageBuilder` collects rows in any order and forms both images of those it has. `SubBandImages` does the same for parts
+of the sweep that overlap by half.
+"""
 
 from __future__ import annotations
 

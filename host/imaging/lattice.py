@@ -1,4 +1,8 @@
-"""How regular positions and pixels fit together for the spectral imagers (docs/decisions/0002-imaging.md)."""
+"""How regular positions and pixels fit together for the spectral imagers (docs/decisions/0002-imaging.md).
+
+A `Lattice` holds periods, pitches and strides. The kernels' spectra along x are made here, for every spectral imager,
+and kept in memory: images of one aperture are made again and again.
+"""
 
 from __future__ import annotations
 

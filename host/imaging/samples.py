@@ -1,4 +1,9 @@
-"""One board's reduced samples, as rows come in, and its image."""
+"""One board's reduced samples, as rows come in, and its image.
+
+`BoardSamples` reduces each row to the range gate, keeps it, and has it imaged by the fastest imager that is exact for
+the aperture (`choose_imager`). Samples of an ideal mirror on the object plane (`mirror_samples`) give the illumination
+by which images are divided.
+"""
 
 from __future__ import annotations
 

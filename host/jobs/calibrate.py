@@ -1,6 +1,8 @@
-"""`polysight calibrate`: each command looks at recorded scans, writes one dated file, and says what that changes.
+"""`polysight calibrate` and `polysight leakage`: what recorded scans say of the rig.
 
-Nothing else is written: neither the scans nor the rig file.
+Each `calibrate` command looks at scans, writes one dated file, and says what that changes; neither the scans nor the
+rig file are written. `leakage` prints what belongs into the rig file's [polarimetry]. Scans of a metal plate become the
+reference by position (`load_reference`).
 """
 
 from __future__ import annotations

@@ -27,7 +27,10 @@ TIME_SCALE = 40.0
 
 
 def run_simulator(arguments: Sequence[str]) -> int:
-    """Run `python -m polysight.simulators ...` and return its exit status. Raises ConfigError when it is not installed."""
+    """Run `python -m polysight.simulators ...` and return its exit status.
+
+    Raises ConfigError when it is not installed.
+    """
     _require_simulators()
     return subprocess.run([sys.executable, "-m", "polysight.simulators", *arguments], check=False).returncode
 

@@ -1,4 +1,7 @@
-"""A scan that is processed while it runs: rows go into the images as they are committed."""
+"""`polysight scan` and `resume`: a scan that is processed while it runs, with a progress bar.
+
+Rows go into the images as they are committed, so that the products are there soon after the last row.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Commands on materials that were found already: permittivity through layers, and concentration."""
+"""Commands on materials in saved products: the table, names, permittivity through layers, and concentration.
+
+`classify` names the patches of several scans together, or judges the models on a library; `report` finds the report of
+a scan, or makes it again from the raw rows.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`polysight drop-raw`: give the space of raw rows back once they are processed."""
+"""Commands on files: `drop-raw`, `validate` and `inspect`.
+
+`drop_raw` removes raw rows once saved products were made from them, after a word typed in confirmation (`typed`).
+`validate_folder` prints every fault of a scan folder. `inspect_file` says what is in a capture, and plots its range
+profile.
+"""
 
 from __future__ import annotations
 

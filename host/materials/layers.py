@@ -1,9 +1,10 @@
 """The permittivity of one unknown layer in a stack: sheets thinner than the wave, liquids behind a container's wall.
 
 Eq. 3 of the paper sees one interface. A sheet has two, a filled container three, and the wave that returns from the
-ones behind is as strong as the first. Here the whole stack is the model (:func:`polysight.host.polarimetry.multilayer`), the
-measured quantities are those of the sub-bands of the sweep, and the unknown is found by least squares from every
-promising start. What the data cannot tell apart is listed, not hidden.
+ones behind is as strong as the first. Here the whole stack is the model
+(:func:`polysight.host.polarimetry.multilayer`), the measured quantities are those of the sub-bands of the sweep
+(`Spectrum`, `Bands`), and `fit_layer` finds the unknown by least squares from every promising start. What the data
+cannot tell apart is listed, not hidden.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class Spectrum:
     def of(cls, chirp: Chirp, bands: int = 1, window: str = "hann") -> Spectrum:
         """Sub-bands of the linear part of a chirp: windows that overlap by half, as in Welch's method.
 
-        One band is the whole linear part under the image's own window (:func:`polysight.host.imaging.reduce.reduction`).
+        One band is the whole linear part under the image's own window
+        (:func:`polysight.host.imaging.reduce.reduction`).
         """
         first, last = chirp.linear_samples
         length = 2 * (last - first) / (bands + 1)

@@ -1,4 +1,8 @@
-"""Committed rows on their way into the looker's own images: the instrument's pipeline, in a thread that may be slow."""
+"""What the live view shows of committed rows: images and range profiles, made by the instrument's own pipeline.
+
+`RowViewer` takes rows in a thread that may be slow; what it shows is replaced as a whole (`Shown`). `draw` makes
+amplitude and phase of H, V and P as PNG.
+"""
 
 from __future__ import annotations
 

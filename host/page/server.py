@@ -2,7 +2,7 @@
 
 State is changed by POST only, with the token in a header: no link, form or image of another page can send that. Pages
 of other sites cannot read anything here either: no cross-origin header is ever sent, and bound to loopback the server
-answers to loopback's names only.
+answers to loopback's names only. `preview` runs it at low priority until Ctrl-C.
 """
 
 from __future__ import annotations

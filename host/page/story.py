@@ -1,7 +1,7 @@
 """What a scan's own files say about it: rows, takes, counts of each board, times, and what went wrong.
 
 Gathered fact by fact and event by event, without files or clocks, so that the same files tell the same story to whoever
-begins to look later.
+begins to look later. What went wrong becomes a `Notice`: a sentence with likely cause and remedy (`CAUSES`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Keeps looking at one scan, and keeps the newest snapshot of it: what every page gets, whenever it comes.
 
-A snapshot is made once and kept as bytes, so that pages cost nothing but sending, however many there are and however
-slow they are, and all see the same.
+The scan's manifest and event log are followed as they grow (`ManifestTail`, `EventTail`). A snapshot is made once and
+kept as bytes, so that pages cost nothing but sending, however many there are and however slow they are, and all see the
+same.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""What a scan with this rig file will take and give."""
+"""What a scan with this rig file will take and give, and what is wrong with it.
+
+`forecast` computes time, data, point response, alias-free field, noise and the cost of motion. `warnings_of` turns them
+into sentences, and says which of them stage, Pi or radars would refuse.
+"""
 
 from __future__ import annotations
 

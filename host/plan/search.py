@@ -1,4 +1,8 @@
-"""The best plans within a time: speeds, steps and bursts tried, the aperture kept."""
+"""Plans that differ from the rig file, and the best of them within a time.
+
+`Changes` is what a plan has otherwise than the rig file; `rig_lines` writes the differences as lines of a rig file.
+`propose` tries speeds, steps and bursts, and keeps the aperture.
+"""
 
 from __future__ import annotations
 

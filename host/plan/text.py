@@ -1,4 +1,8 @@
-"""A forecast in words, and as plain numbers."""
+"""`polysight plan`: a forecast in words and as plain numbers, with the noise and overhead of an earlier scan on
+request.
+
+`plan` prints the forecast or the proposals. `noise_of` and `row_overhead_of` measure what a recorded scan had.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Products of a processed scan, read back: the one place that knows how a folder of them is laid out and found."""
+"""The files of a processed scan: how each is written and read back, the one place that knows their names and
+content.
+
+image.npz, materials.json, quality.json and scan.json are written here, each whole or not at all. `SavedProducts` reads
+a folder of them; `find_products` finds the folder.
+"""
 
 from __future__ import annotations
 

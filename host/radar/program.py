@@ -1,4 +1,5 @@
-"""What a board is told from power-up to its frames, from the rig file.
+"""What a board is told from power-up to its frames, from the rig file; and how a firmware image is downloaded in
+parts.
 
 Order: ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. Not run on hardware yet.
 """

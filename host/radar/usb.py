@@ -1,5 +1,7 @@
-"""Opens the four channels of a DCA1000's FT4232H by its serial number, with pyftdi (the host's extra `radar`).
+"""Word links to a board: the DCA1000's FT4232H over USB, or its four channels over TCP.
 
+`UsbWords` turns words, interrupt, reset and sense lines into MPSSE commands on the chip's four channels. `open_usb`
+opens them by serial number with pyftdi (the extra `radar`); `open_tcp` reaches channels that another program serves.
 Not run on hardware yet.
 """
 

@@ -1,4 +1,8 @@
-"""HDF5: arrays with their axes as dimension scales, units on everything, the rest as attributes."""
+"""Saved products as files for other programs: HDF5, MATLAB, PNG and CSV (`polysight export`).
+
+HDF5: arrays with their axes as dimension scales, units on everything, the rest as attributes. MATLAB: the same arrays,
+structs for the rest. The table of materials has the same columns in all of them (`material_columns`).
+"""
 
 from __future__ import annotations
 
@@ -107,8 +111,8 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
     """Write a file of these products.
 
     /h, /v, /p complex64 [y, x], /valid bool [y, x]; /x, /y float64 in metres, the dimension scales of all four; group
-    /materials with a column for each of :func:`polysight.host.report.export.material_columns`; attributes scan_id, simulated,
-    convention, and as JSON instrument, versions, quality, materials.
+    /materials with a column for each of :func:`material_columns`; attributes scan_id, simulated, convention, and as
+    JSON instrument, versions, quality, materials.
 
     Raises
     ------

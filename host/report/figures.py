@@ -1,4 +1,4 @@
-"""Figures of a report: channel images and material maps as PNG.
+"""Figures of a report as PNG: channel images, material maps, permittivities, the overview, and a focus sweep.
 
 Amplitude in a perceptually uniform, colour-blind safe map (cividis), phase in a cyclic one (twilight), materials in the
 colour-blind safe palette of Paul Tol ("muted", then "light"). Axes are millimetres from the image centre. Matplotlib's

@@ -1,4 +1,8 @@
-"""Numbers of a report: the headline figures and the quality tables, from the content of quality.json."""
+"""Numbers of a report, from the content of quality.json: headline figures, quality tables, and the map of positions.
+
+Tables are plain dicts (caption, head, rows) for the page's template. The map shows which stage positions of each board
+are masked.
+"""
 
 from __future__ import annotations
 

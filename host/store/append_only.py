@@ -1,4 +1,7 @@
-"""A file that only grows, and whose end is known: what the manifest and the event log are made of."""
+"""A file that only grows, and whose end is known: what the manifest and the event log are made of.
+
+Also `sync_folder`, which makes names in a folder durable, and `crc32`, which is zlib-ng's where that is installed.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The scan folder: raw rows and the manifest that says which of them count (docs/spec/scan-folder.md)."""
+"""The scan folder: raw rows and the manifest that says which of them count (docs/spec/scan-folder.md).
+
+`ScanFolder` is a scan on disk, read; its `writer` opens it for appending. A scan is resumed with the rig file it was
+begun with. Only the connection may differ: `connection_of` and `reconnected` take addresses and limits from another rig
+file, and `check_same_scan` refuses one that differs in anything else.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small compiled loops of `polysight.host.sync.compiled`, over one chirp of four RX at a time, or one burst of sixteen chirps.
+"""Small compiled loops of `compiled.py`, over one chirp of four RX at a time, or one burst of sixteen chirps.
 
 What makes them fast: every loop runs over values that lie next to each other, so it becomes vector instructions. The
 card's integers are sorted into that order before they become numbers, since they are half as wide. Strides are
@@ -278,7 +278,7 @@ def fold(signal, out):
 
 @compiled
 def extend(signal, s):
-    """Continue what lies inside by s values to either side, by the parabola through three; as `hpf.shifted` does."""
+    """Continue what lies inside by s values to either side, by the parabola through three, as `high_pass.shifted`."""
     n = signal.size
     for j in range(s):
         signal[j] = 3 * (signal[s + j] - signal[2 * s + j]) + signal[3 * s + j]

@@ -1,4 +1,7 @@
-"""Fig. 18 (solids under one and two angles, liquids, powders, with confusion matrices) and Fig. 20 (channels)."""
+"""Fig. 18 (solids under one and two angles, liquids, powders, with confusion matrices) and Fig. 20 (channels).
+
+Pixels are drawn with the errors of `patches.py`. `pixel_bound` is the share that no classifier can pass.
+"""
 
 from __future__ import annotations
 

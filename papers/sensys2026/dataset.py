@@ -1,6 +1,7 @@
 """The published data set as libraries: its `materials/`, its `labels/`, and images made here from its raw data.
 
-Each source is judged on its own. Materials carry the names of Table 2's rows, where their own names mean one.
+Each source is judged on its own. Materials carry the names of Table 2's rows, where their own names mean one
+(`row_of`). `train_authors` makes one library of the first two for `polysight train`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""`polysight reproduce --authors`: Table 2, Fig. 18, 20 and 21 from the published files, beside the paper's values."""
+"""`polysight reproduce --authors`: Table 2, Fig. 18, 20 and 21 from the published files, beside the paper's values.
+
+The page and the terminal's tables are made here, and Table 2 by three recipes, the authors' among them; the figures are
+in `dataset_figures.py`.
+"""
 
 from __future__ import annotations
 

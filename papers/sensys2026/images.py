@@ -1,4 +1,6 @@
-"""Fig. 13 and 19 (images of materials) and Fig. 14 (phase of H, V and P), from scans of the simulated rig."""
+"""Images from scans of the simulated rig: Fig. 13 and 19 (materials), Fig. 14 (phase), Fig. 4 (front-on against
+steep).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`polysight reproduce`: make the items, write the files as they come, then the page."""
+"""`polysight reproduce`: what can be made, and making it: items, their files as they come, then the page."""
 
 from __future__ import annotations
 

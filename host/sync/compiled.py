@@ -186,11 +186,7 @@ def _against_others(words, frequency, taps, good, linear, edges, times):
                 j, h = slice(r * (blocks + 2), r * (blocks + 2) + blocks), r % 2 * 2
                 kernels.add_products(re[k, j], im[k, j], all_re[j], all_im[j], product[h], product[h + 1], product[4])
             for h in range(5):
-                for i in range(parts):
-                    total = np.float32(0)
-                    for m in range(edges[i], edges[i + 1]):
-                        total += product[h, m]
-                    part[h, i] = total
+                kernels.add_up(product[h], edges, part[h])
             own[p, k] = part[4].sum()
             for i in range(parts):
                 even[i], odd[i] = complex(part[0, i], part[1, i]), complex(part[2, i], part[3, i])

@@ -311,6 +311,16 @@ def add_products(x, y, u, v, re, im, energy):
 
 
 @compiled
+def add_up(values, edges, part):
+    """Sums of float32 values between neighbouring edges, into part."""
+    for i in range(part.size):
+        total = np.float32(0)
+        for m in range(edges[i], edges[i + 1]):
+            total += values[m]
+        part[i] = total
+
+
+@compiled
 def newton(blocks, times, count):
     """`tone.refine` of one record of blocks complex128 [block]: radians a sample, and complex amplitude."""
     limit = 2 * np.pi / (times[-1] - times[0])

@@ -149,9 +149,8 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
 
     Returns its bytes, uint8 [n], and what became of the packets. Raises DataError when they are not of one record.
     """
-    first = dca1000.decode_packet_header(packets[0])[1]
-    half, whole = 1 << (dca1000.BYTE_COUNT_BITS - 1), 1 << dca1000.BYTE_COUNT_BITS
-    ahead = [(dca1000.decode_packet_header(p)[1] - first + half) % whole - half for p in packets]
+    counts = [dca1000.decode_packet_header(p)[1] for p in packets]
+    ahead = [dca1000.counter_difference(c, counts[0], dca1000.BYTE_COUNT_BITS) for c in counts]
     ends = [a + len(p) - dca1000.PACKET_HEADER_BYTES for a, p in zip(ahead, packets, strict=True)]
     size = max(ends) - min(ahead)
     if size > 1 << 34:

@@ -1,5 +1,4 @@
-"""The direct path in a short capture: its IF chirp by chirp, and what that says of start frequency, trigger,
-crystal.
+"""The direct path in a short capture: its IF chirp by chirp, and what it says of start frequency, trigger, crystal.
 
 IF of the direct path, with tau its delay, dt how much later the board started than the transmitter, and p what its
 crystal is faster by:

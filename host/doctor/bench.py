@@ -1,5 +1,4 @@
-"""What the checks share: their findings, the rig file once it is read, the link to the Pi, the cards, and a capture
-at rest.
+"""What the checks share: findings, the rig file once it is read, the link to the Pi, cards, a capture at rest.
 
 A `Finding` is one line of the doctor. `Bench` is one run, and `capture` records a few bursts of every board. Clock,
 disk and kernel are passed in (`System`), so that every fault can be tried without having it.

@@ -1,5 +1,4 @@
-"""`polysight plan`: a forecast in words and as plain numbers, with the noise and overhead of an earlier scan on
-request.
+"""`polysight plan`: a forecast in words and as plain numbers, with what an earlier scan tells of noise and overhead.
 
 `plan` prints the forecast or the proposals. `noise_of` and `row_overhead_of` measure what a recorded scan had.
 """

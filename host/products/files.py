@@ -1,5 +1,4 @@
-"""The files of a processed scan: how each is written and read back, the one place that knows their names and
-content.
+"""The files of a processed scan, written and read back: the one place that knows their names and content.
 
 image.npz, materials.json, quality.json and scan.json are written here, each whole or not at all. `SavedProducts` reads
 a folder of them; `find_products` finds the folder.

@@ -1,5 +1,4 @@
-"""What a board is told from power-up to its frames, from the rig file; and how a firmware image is downloaded in
-parts.
+"""What a board is told from power-up to its frames, and the parts in which a firmware image is downloaded.
 
 Order: ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. Not run on hardware yet.
 """

@@ -22,14 +22,13 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
 from polysight.host.report.context import ReportContext
-from polysight.host.report.tables import coverage_figure, masked_positions
+from polysight.host.report.tables import INK, MUTED, STAMP, coverage_figure, masked_positions
 
 PALETTE = (
     "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",
     "#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#99DDFF", "#44BB99", "#BBCC33", "#AAAA00",
 )  # fmt: skip
 UNKNOWN_COLOUR = "#BBBBBB"
-INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
 FIGURES: dict[str, str] = {
     "amplitude_h": "Amplitude H (s-polarised)",
     "amplitude_v": "Amplitude V (p-polarised)",

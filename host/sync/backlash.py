@@ -106,7 +106,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     return Backlash(shift, std) if std < plan.step_x_mm / 4 else None
 
 
-def _spectrum(row: NDArray[np.complex64], k: NDArray[np.float64], off_mm: float) -> NDArray[np.complex128]:
+def _spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], off_mm: float) -> NDArray[np.complex128]:
     """A row along x from the smallest, [rx, 2 position], brought back by `off_mm` to the plan's positions.
 
     It goes there and back, so that no jump between its ends rings through it. `k` is in radians a millimetre.

@@ -154,9 +154,10 @@ class TaskScores:
     def of(task: str, quick: bool) -> TaskScores:
         """Judge both models on a task."""
         best = better_model(task, quick)[0]
-        models = (judged(task, m, "H+V+P", by_pixel, quick) for m in (PAPER, best) for by_pixel in (False, True))
+        knn, knn_pixel = (judged(task, PAPER, "H+V+P", by_pixel, quick) for by_pixel in (False, True))
+        better, better_pixel = (judged(task, best, "H+V+P", by_pixel, quick) for by_pixel in (False, True))
         h, h_pixel = (judged(task, PAPER, "H", by_pixel, quick) for by_pixel in (False, True))
-        return TaskScores(task, *models, h, h_pixel)
+        return TaskScores(task, knn, knn_pixel, better, better_pixel, h, h_pixel)
 
     def row(self) -> tuple[str, ...]:
         """A line of the table, published shares beside simulated ones."""

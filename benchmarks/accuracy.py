@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 from benchmarks.data import published
-from benchmarks.estimators import alignment, one_tone, two_tones
+from benchmarks.estimators import Alignment, alignment, one_tone, two_tones
 from benchmarks.matched_filter import image_error
 from benchmarks.measure import one_core
 from benchmarks.table import Line, add_arguments, show, write
@@ -26,10 +27,17 @@ def run(args: argparse.Namespace) -> int:
         tones = {snr: one_tone(snr, trials=30_000 // few) for snr in TONE_SNR_DB}
         pairs = {b.name: two_tones(rig, b, BINS, TWO_TONE_SNR_DB, trials=6000 // few) for b in rig.receivers}
         images = {b.name: image_error(rig, b) for b in rig.receivers}
+    lines = [*_alignment_lines(aligned), *_tone_lines(tones, pairs), _image_line(images)]
+    show("accuracy, simulated signals of known truth", lines, args.quick)
+    write(args.json, "accuracy", lines, alignment=[asdict(a) for a in aligned], one_tone=tones, two_tones=pairs)
+    return 0
+
+
+def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
     ratios = [a.ours_hz / a.division_hz for a in aligned]
     chirps = sum(a.chirps for a in aligned)
     gross, theirs = sum(a.ours_gross for a in aligned), sum(a.division_gross for a in aligned)
-    lines = [
+    return [
         Line(
             "alignment at 0-5 dB: frequency error over division's",
             " / ".join(f"{a.ours_hz:.0f}" for a in aligned) + " Hz",
@@ -50,6 +58,11 @@ def run(args: argparse.Namespace) -> int:
             higher_is_better=False,
             note="more than half an FFT bin from the truth",
         ),
+    ]
+
+
+def _tone_lines(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str, tuple[float, float]]) -> list[Line]:
+    return [
         Line(
             "one tone, 7-30 dB: rms error over Cramer-Rao",
             " / ".join(f"{max(t):.3f}" for t in tones.values()),
@@ -70,17 +83,17 @@ def run(args: argparse.Namespace) -> int:
             higher_is_better=False,
             note="direct path beside an equal echo, all RX, the worse board; 6,000 trials know it to 0.9 %",
         ),
-        Line(
-            "image against a float64 matched filter, of the peak",
-            " / ".join(f"{name} {e:.1e}" for name, e in images.items()),
-            "",
-            max(images.values()),
-            1e-5,
-            1e-6,
-            higher_is_better=False,
-            note="nine points, 2,000 positions of the full grid, all linear samples, 60 pixels and the peak",
-        ),
     ]
-    show("accuracy, simulated signals of known truth", lines, args.quick)
-    write(args.json, "accuracy", lines, alignment=[asdict(a) for a in aligned], one_tone=tones, two_tones=pairs)
-    return 0
+
+
+def _image_line(images: Mapping[str, float]) -> Line:
+    return Line(
+        "image against a float64 matched filter, of the peak",
+        " / ".join(f"{name} {e:.1e}" for name, e in images.items()),
+        "",
+        max(images.values()),
+        1e-5,
+        1e-6,
+        higher_is_better=False,
+        note="nine points, 2,000 positions of the full grid, all linear samples, 60 pixels and the peak",
+    )

@@ -74,45 +74,56 @@ def run(args: argparse.Namespace) -> int:
         beside_scan = live.run()
         memory = max(batch.end(), live.end())
     scale = rig.grid.rows / count
-    seconds = statistics.median((r["cpu_s"] - r["once_cpu_s"]) * scale + r["once_cpu_s"] for r in ours)
-    last = statistics.median(beside_scan["last_row_wall_s"])
-    last_cpu = statistics.median(beside_scan["last_row_cpu_s"])
-    published_s, tuned_s = statistics.median(theirs), statistics.median(theirs_tuned)
     size = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers) * count
     part = f"{count} of {rig.grid.rows} rows ({size / 1e9:.1f} GB)" if scale > 1 else f"all {size / 1e9:.1f} GB"
+    seconds = statistics.median((r["cpu_s"] - r["once_cpu_s"]) * scale + r["once_cpu_s"] for r in ours)
     lines = [
-        Line(
-            "raw to image, two boards, 9.2 GB",
-            f"{seconds:.1f} s",
-            f"{published_s:.0f} s",
-            published_s / seconds,
-            60,
-            120,
-            note=f"ours from {part}; published method from 70 positions and one board's image, scaled;"
-            f" in single precision {tuned_s:.0f} s: {tuned_s / seconds:.0f}x",
-        ),
-        Line(
-            "last committed row to final image, s",
-            f"{last:.2f} s",
-            "",
-            last,
-            1.0,
-            0.1,
-            higher_is_better=False,
-            note=f"median of {len(beside_scan['last_row_wall_s'])}, wall seconds ({last_cpu:.2f} s of CPU): reading,"
-            " synchronising and imaging the last row of both boards, then both images",
-        ),
-        Line(
-            "anonymous memory of a full scan, GB",
-            f"{memory / 1e9:.2f} GB",
-            "",
-            memory / 1e9,
-            1.0,
-            0.4,
-            higher_is_better=False,
-            note=f"highest RssAnon of the processing process, at once and row by row; {part}",
-        ),
+        _time_line(seconds, statistics.median(theirs), statistics.median(theirs_tuned), part),
+        _last_row_line(beside_scan),
+        _memory_line(memory, part),
     ]
     show("a whole scan, one core, simulated rows repeated", lines, args.quick)
     write(args.json, "whole", lines, ours=ours, live=beside_scan, published_s=theirs, published_tuned_s=theirs_tuned)
     return 0
+
+
+def _time_line(seconds: float, published_s: float, tuned_s: float, part: str) -> Line:
+    return Line(
+        "raw to image, two boards, 9.2 GB",
+        f"{seconds:.1f} s",
+        f"{published_s:.0f} s",
+        published_s / seconds,
+        60,
+        120,
+        note=f"ours from {part}; published method from 70 positions and one board's image, scaled;"
+        f" in single precision {tuned_s:.0f} s: {tuned_s / seconds:.0f}x",
+    )
+
+
+def _last_row_line(live: dict[str, list[float]]) -> Line:
+    last = statistics.median(live["last_row_wall_s"])
+    last_cpu = statistics.median(live["last_row_cpu_s"])
+    return Line(
+        "last committed row to final image, s",
+        f"{last:.2f} s",
+        "",
+        last,
+        1.0,
+        0.1,
+        higher_is_better=False,
+        note=f"median of {len(live['last_row_wall_s'])}, wall seconds ({last_cpu:.2f} s of CPU): reading,"
+        " synchronising and imaging the last row of both boards, then both images",
+    )
+
+
+def _memory_line(memory: int, part: str) -> Line:
+    return Line(
+        "anonymous memory of a full scan, GB",
+        f"{memory / 1e9:.2f} GB",
+        "",
+        memory / 1e9,
+        1.0,
+        0.4,
+        higher_is_better=False,
+        note=f"highest RssAnon of the processing process, at once and row by row; {part}",
+    )

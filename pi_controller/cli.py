@@ -19,6 +19,7 @@ from polysight.shared.faults import explain
 from polysight.shared.raster import WIDTH_TEXT
 
 Command = Callable[[argparse.Namespace], int]
+AddCommand = Callable[[str, Command, str, str], argparse.ArgumentParser]  # name, action, help, example
 
 
 def _write(text: str) -> None:
@@ -170,47 +171,68 @@ def _parser() -> argparse.ArgumentParser:
         )
         return p
 
-    def stage_port(p: argparse.ArgumentParser) -> None:
-        p.add_argument("--stage-port", metavar="TTY", help="serial port of the stage, instead of stage.port")
+    _add_service(add)
+    _add_bench(add)
+    _add_events(add)
+    _add_keys(add)
+    return parser
 
-    def wires(p: argparse.ArgumentParser) -> None:
-        p.add_argument("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
 
-    def as_json(p: argparse.ArgumentParser) -> None:
-        p.add_argument("--json", action="store_true", help="print JSON, for programs")
+def _stage_port(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--stage-port", metavar="TTY", help="serial port of the stage, instead of stage.port")
 
-    p = add("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml")
-    wires(p)
-    stage_port(p)
+
+def _wires(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
+
+
+def _journal(p: argparse.ArgumentParser) -> None:
     p.add_argument("--journal", type=Path, metavar="DIR", help="folder of the journals, instead of pi.journal_dir")
+
+
+def _json(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--json", action="store_true", help="print JSON, for programs")
+
+
+def _add_service(add: AddCommand) -> None:
+    """`run`, and `check` before it."""
+    p = add("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml")
+    _wires(p)
+    _stage_port(p)
+    _journal(p)
     p.add_argument("--command-address", metavar="tcp://HOST:PORT", help="instead of pi.command_address")
     p.add_argument("--event-address", metavar="tcp://HOST:PORT", help="instead of pi.event_address")
 
     p = add(
         "check", _check, "check every line, port, permission, key and disk; nothing moves", "--config instrument.toml"
     )
-    wires(p)
-    stage_port(p)
-    p.add_argument("--journal", type=Path, metavar="DIR", help="folder of the journals, instead of pi.journal_dir")
-    as_json(p)
+    _wires(p)
+    _stage_port(p)
+    _journal(p)
+    _json(p)
 
+
+def _add_bench(add: AddCommand) -> None:
+    """What drives lines and stage by hand: `pulse`, `jog`, `home`."""
     p = add("pulse", _pulse, "send bursts on SYNC_IN and tell their width and jitter", "--count 100")
-    wires(p)
+    _wires(p)
     p.add_argument("--count", type=_positive, default=10, metavar="N", help="how many bursts (%(default)s)")
     p.add_argument("--pause-ms", type=float, default=10.0, metavar="MS", help="pause between bursts (%(default)s)")
-    as_json(p)
+    _json(p)
 
     p = add("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5")
-    stage_port(p)
+    _stage_port(p)
     p.add_argument("--dx", type=float, default=0.0, metavar="MM", help="along x, millimetres (0)")
     p.add_argument("--dy", type=float, default=0.0, metavar="MM", help="along y, millimetres (0)")
     p.add_argument("--speed", type=_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)")
-    as_json(p)
+    _json(p)
 
     p = add("home", _home, "home the stage, through the running service if there is one", "--config instrument.toml")
-    stage_port(p)
-    as_json(p)
+    _stage_port(p)
+    _json(p)
 
+
+def _add_events(add: AddCommand) -> None:
     p = add("events", _events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1")
     p.add_argument("--scan-id", metavar="ID", help="replay this scan from the journal instead of following live events")
     p.add_argument("--from-seq", type=_positive, default=1, metavar="N", help="first event of a replay (%(default)s)")
@@ -219,10 +241,11 @@ def _parser() -> argparse.ArgumentParser:
         "--limit-s", type=float, default=10.0, metavar="S", help="give up after so long without an event (%(default)s)"
     )
 
+
+def _add_keys(add: AddCommand) -> None:
     p = add("keys", _keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys")
     p.add_argument("--dir", type=Path, metavar="DIR", help="folder, instead of pi.key_dir")
     p.add_argument("--replace", action="store_true", help="replace keys that are there already")
-    return parser
 
 
 def _positive(text: str) -> int:

@@ -1,4 +1,7 @@
-"""All recorded boards at once: their cards and their receiving processes."""
+"""All recorded boards at once: their cards and their receiving processes.
+
+`CaptureRig` starts and stops the records of a row; `record_ending` decides when one board's record has ended.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,7 @@ TAIL_S = 2.0
 """Silence after which a card sends what does not fill a packet (seen)."""
 GRACE_NS = 200_000_000
 """Silence after which nothing comes any more, once the card said so: status and data come on different ports."""
+_COMPLETED_LIMIT_S = 0.2  # from a record's stop to its last packet and its status
 
 
 class Ending(Enum):
@@ -55,9 +59,6 @@ def record_ending(progress: Progress, status: Status, since_ns: int, now_ns: int
     if silent_ns >= GRACE_NS and progress.ended:
         return Ending.TAIL
     return Ending.SILENCE if silent_ns >= silence_ns else None
-
-
-_COMPLETED_LIMIT_S = 0.2  # from a record's stop to its last packet and its status
 
 
 class CaptureRig:

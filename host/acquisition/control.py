@@ -1,8 +1,10 @@
-"""Asking a running scan for something from outside its terminal: an empty file in `<scan>/control/`, named for it.
+"""Asking a running scan to stop, pause or go on: by signals, and by files in `<scan>/control/`.
 
-The scan makes that folder when it begins, obeys what it finds there by removing it, touches `alive` once a second, and
-removes the folder at its end. A file's name is written whole or not at all, so there is nothing to parse and nothing
-can be torn; `touch SCAN/control/pause` in a shell does the same. Specification: docs/spec/scan-folder.md.
+Ctrl-C and SIGTERM become a `StopRequest`, which any thread can look at. From outside the terminal a scan is asked by an
+empty file named for the wish. The scan makes that folder when it begins, obeys what it finds there by removing it,
+touches `alive` once a second, and removes the folder at its end. A file's name is written whole or not at all, so there
+is nothing to parse and nothing can be torn; `touch SCAN/control/pause` in a shell does the same. Specification:
+docs/spec/scan-folder.md.
 """
 
 from __future__ import annotations
@@ -17,6 +19,12 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 from polysight.shared.errors import ScanError
+
+CONTROL = "control"
+ALIVE = "alive"
+_LOOK_S = 0.2
+_BEAT_S = 1.0
+_TAKEN_LIMIT_S = 5.0
 
 
 class StopRequest:
@@ -86,13 +94,6 @@ def interrupts_wait() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-CONTROL = "control"
-ALIVE = "alive"
-_LOOK_S = 0.2
-_BEAT_S = 1.0
-_TAKEN_LIMIT_S = 5.0
 
 
 class Wish(StrEnum):

@@ -1,4 +1,8 @@
-"""The host's end of the two sockets to the Pi: commands with time-out and retry, events without gaps."""
+"""The host's end of the sockets to the Pi: commands with time-out and retry, events without gaps, and the heartbeat.
+
+`PiClient` sends commands and reads events; a gap in their sequence is filled from the Pi's journal. `HostHeartbeat`
+tells the Pi that this process lives, from a thread and a socket of its own.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +51,14 @@ from polysight.shared.messages import (
 )
 from polysight.shared.sockets import requester, subscriber
 
-REAL_TIME = 1  # below the receiving processes
+ATTEMPTS = 3  # to ask a question
+REAL_TIME = 1  # of the heartbeat: below the receiving processes
 _REPLY_LIMIT_S = 1.0  # then the question was lost, and another one is asked
+AT_WORK: tuple[State, ...] = ("homing", "running", "held", "done")  # which change by themselves
+_REST_LIMIT_S = 10.0
+_LOOK_S = 0.05
+_REPLAY_LIMIT = 1000  # events
+R = TypeVar("R", bound=AnyReply)
 
 
 class HostHeartbeat:
@@ -89,14 +99,6 @@ class HostHeartbeat:
         """No more."""
         self._stop.set()
         self._thread.join()
-
-
-ATTEMPTS = 3
-AT_WORK: tuple[State, ...] = ("homing", "running", "held", "done")  # which change by themselves
-_REST_LIMIT_S = 10.0
-_LOOK_S = 0.05
-_REPLAY_LIMIT = 1000
-R = TypeVar("R", bound=AnyReply)
 
 
 class RefusedError(ScanError):

@@ -1,8 +1,9 @@
-"""Committed rows on their way through processing, in order, beside the scan and behind capture.
+"""How a scan proceeds: rows on their way through processing, progress and time left, and the result at its end.
 
-One worker thread. Capture goes first: the receivers are processes of their own with real-time priority or a negative
-nice value, and this thread has a nice value of its own above the program's (`NICE`), so that even where the system
-grants the receivers nothing the kernel prefers them by three to one.
+`ProcessingQueue` hands committed rows to processing, in order, from one worker thread. Capture goes first: the
+receivers are processes of their own with real-time priority or a negative nice value, and this thread has a nice value
+of its own above the program's (`NICE`), so that even where the system grants the receivers nothing the kernel prefers
+them by three to one.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from polysight.shared.messages import ExitStatus
 
 OnRow = Callable[[int], None]
 NICE = 5
+_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a rig that was sped up
 
 
 class ProcessingQueue:
@@ -118,9 +120,6 @@ class ScanResult:
 
 
 OnProgress = Callable[[ScanProgress], None]
-
-
-_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a rig that was sped up
 
 
 def usual_row_s(row_seconds: Sequence[float]) -> float:

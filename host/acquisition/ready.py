@@ -1,4 +1,8 @@
-"""What has to be there before a row begins: a homed stage, and room on the disk."""
+"""What has to be true before a row begins: a homed stage, room on the disk, and the Pi the scan was begun with.
+
+`make_ready` waits for the first and homes where that is safe. `check_same_stage` compares the Pi's own `[stage]` with
+the rig file's: a Pi that would place rows elsewhere is refused.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,7 @@ from polysight.shared.stage_line import HOMING_LIMIT_S
 
 _HOMING_LIMIT_S = HOMING_LIMIT_S + 30.0  # longer than the Pi, whose reason is the exact one
 STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # homed by hand, after a look: `polysight-pi home`
+UNTOLD = "the Pi does not tell its [stage], so nobody compares it with this rig file's: install this release on the Pi"
 
 
 def make_ready(
@@ -108,9 +113,6 @@ def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
             f"free space, then `polysight resume {folder}`; or lower limits.free_disk_bytes in instrument.toml, and add"
             " --config instrument.toml",
         )
-
-
-UNTOLD = "the Pi does not tell its [stage], so nobody compares it with this rig file's: install this release on the Pi"
 
 
 def pi_fact(hello: HelloReply) -> Fact:

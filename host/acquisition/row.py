@@ -1,4 +1,7 @@
-"""Takes rows: from arming the radars to what the receivers got."""
+"""Takes rows: from arming the radars to what the receivers got.
+
+`RowTransaction` is the state machine of one take (docs/spec/row.md); `RowTaker` drives it with Pi, radars and cards.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,10 @@ from polysight.shared.faults import explain
 from polysight.shared.messages import Capture, RowFinished
 from polysight.shared.raster import Row
 from polysight.shared.units import NS_PER_S
+
+_TURN_MS = 50  # how often stop requests and limits are looked at
+_ABORT_LIMIT_S = 10.0
+_DISK_NOTICE_S = 2.0
 
 
 class RowState(StrEnum):
@@ -78,11 +85,6 @@ class RowTransaction:
         """End as failed, unless it has ended already."""
         if TRANSITIONS[self.state]:
             self.to(RowState.FAILED)
-
-
-_TURN_MS = 50  # how often stop requests and limits are looked at
-_ABORT_LIMIT_S = 10.0
-_DISK_NOTICE_S = 2.0
 
 
 class RowTaker:

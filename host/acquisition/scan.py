@@ -103,7 +103,8 @@ def resume_scan(
     """Go on with a scan at its first row that is not committed; committed rows are compared with their digests.
 
     A row that is not what was committed is taken again. `rig_now` says how the Pi and the boards are reached from now
-    on, and the limits; in all else it has to be the rig that the scan was begun with (:mod:`polysight.host.store.scan_folder`).
+    on, and the limits; in all else it has to be the rig that the scan was begun with
+    (:func:`polysight.host.store.scan_folder.check_same_scan`).
 
     Parameters and errors as :func:`run_scan`. `on_row` is called for the rows committed earlier too.
     """

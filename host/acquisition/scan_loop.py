@@ -63,7 +63,10 @@ class RunningScan:
         self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
 
     def run(self) -> ScanResult:
-        """Take every missing row, and write down how it ended. Raises what :func:`polysight.host.acquisition.scan.run_scan` does."""
+        """Take every missing row, and write down how it ended.
+
+        Raises what :func:`polysight.host.acquisition.scan.run_scan` does.
+        """
         for warning in self.result.warnings:
             self._say("warning", warning)
         begun = False

@@ -1,4 +1,8 @@
-"""What one take of a row brought, and why it is not complete."""
+"""One take of a row: what it brought, what is wrong with it, and how it is committed or rejected.
+
+`Take` compares what every board received with the pulses that were sent, and lists the faults (`TakeFault`).
+`commit_row` makes its files durable and writes the manifest's line that makes the row count; `reject_row` removes them.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,26 @@ from polysight.shared.errors import DeviceError, ScanError, advice
 from polysight.shared.faults import explain
 from polysight.shared.messages import RowFinished
 from polysight.shared.raster import Row
+
+_KINDS = (
+    "packets",
+    "duplicates",
+    "late",
+    "late_by_bytes",
+    "outside",
+    "disagreeing",
+    "malformed",
+    "strangers",
+    "stale",
+    "leftover",
+    "kernel_drops",
+    "head_bytes",
+    "gaps",
+    "gap_bytes",
+    "tail_bytes",
+    "card_status",
+)
+"""What the manifest says of each board's reception, beside what makes the row count."""
 
 
 class FaultKind(StrEnum):
@@ -194,27 +218,6 @@ def _unlocated(capture: RowCapture) -> FaultKind:
     if capture.lost_before_packets:
         return FaultKind.CARD_DROPPED
     return FaultKind.FRAMES_MISSING if capture.slipped else FaultKind.UNLOCATED
-
-
-_KINDS = (
-    "packets",
-    "duplicates",
-    "late",
-    "late_by_bytes",
-    "outside",
-    "disagreeing",
-    "malformed",
-    "strangers",
-    "stale",
-    "leftover",
-    "kernel_drops",
-    "head_bytes",
-    "gaps",
-    "gap_bytes",
-    "tail_bytes",
-    "card_status",
-)
-"""What the manifest says of each board's reception, beside what makes the row count."""
 
 
 def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: list[TakeFault], events: Fact) -> None:

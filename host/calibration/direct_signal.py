@@ -1,4 +1,4 @@
-"""The direct path in a short capture: its IF chirp by chirp, and what that says of start frequency, trigger, crystal.
+"""The direct path in a short capture: its IF chirp by chirp, and what it says of start frequency, trigger, crystal.
 
 IF of the direct path, with tau its delay, dt how much later the board started than the transmitter, and p what its
 crystal is faster by:
@@ -6,6 +6,7 @@ crystal is faster by:
     f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
 
 A crystal shows by itself: it makes the IF drift by 2 p K within the chirp. What remains beside the geometry is dt.
+`fit_start` takes a scan's direct path and finds the start offset that puts it in the middle of the band.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from polysight.shared.errors import DataError
 
 FULL_SCALE = 32767
 PASSBAND = 0.9  # of the sample rate
+ROWS = 4  # of a scan that are looked at
+FOUND = 0.25  # part of the chirps in which a direct path must be found to be believed
 
 
 @dataclass(frozen=True)
@@ -158,10 +161,6 @@ def _power(
     still = raw * cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
     folded = still.reshape(len(words), n // FOLD, FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
-
-
-ROWS = 4
-FOUND = 0.25  # part of the chirps in which a direct path must be found to be believed
 
 
 def fit_start(source: RawSource, board_name: str) -> BoardStart:

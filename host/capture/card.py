@@ -1,7 +1,8 @@
-"""Control of one DCA1000 over UDP.
+"""Control of one DCA1000 over UDP: starting, stopping and resetting it, and the addresses in its EEPROM.
 
-The socket is never connected: replies leave the card from source port 1024 whatever port the command went to. A
-command is sent again only where twice does no harm. When nothing comes back, the error says which hop is silent.
+The socket is never connected: replies leave the card from source port 1024, whatever port the command went to. A
+command is sent again only where twice does no harm. When nothing comes back, the error names the hop that is silent.
+`program_eeprom` writes new addresses and a new MAC address, which take effect when the card is next switched on.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from polysight.shared.errors import ConfigError, DeviceError, ProtocolError
 
 ATTEMPTS = 3
 EEPROM_REPORT_S = 0.5
+_PORTS = struct.Struct("<HH")  # in the EEPROM
+DEFAULT_MAC = "12:34:56:78:90:12"
+_OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
 
 class CardClient:
@@ -80,7 +84,7 @@ class CardClient:
     def write_eeprom(self, body: bytes) -> Status:
         """Send the 18 bytes of command 0x04, once; returns the status bits the card reported meanwhile.
 
-        Not sent again when no reply comes: it may be writing. Callers use :func:`polysight.host.capture.card.program_eeprom`.
+        Not sent again when no reply comes: it may be writing. Callers use :func:`program_eeprom`.
         Raises DeviceError when the card refuses or is silent.
         """
         self._status = Status(0)
@@ -209,11 +213,6 @@ class CardClient:
         tried = f"{attempts} attempts" if attempts > 1 else "asked once"
         what = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
         return silent_card(self.board, what, self._kernel_root)
-
-
-_PORTS = struct.Struct("<HH")
-DEFAULT_MAC = "12:34:56:78:90:12"
-_OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
 
 @dataclass(frozen=True)

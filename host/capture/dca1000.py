@@ -83,6 +83,20 @@ class Version:
         return f"{self.major}.{self.minor}{' (playback)' if self.playback else ''}"
 
 
+@dataclass(frozen=True)
+class Counters:
+    """The card's counters at a packet: byte count of its first byte, and its sequence. Both wrap."""
+
+    byte_count: int
+    sequence: int
+
+    def after(self, size: int, packets: int) -> Counters:
+        """The counters so many bytes and packets later."""
+        return Counters(
+            (self.byte_count + size) % (1 << BYTE_COUNT_BITS), (self.sequence + packets) % (1 << SEQUENCE_BITS)
+        )
+
+
 def encode_request(code: int, data: bytes = b"") -> bytes:
     """A request as sent to the card. Raises ProtocolError when `data` is longer than the card takes."""
     if len(data) > MAX_REQUEST_DATA:
@@ -151,3 +165,9 @@ def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
         raise ProtocolError(f"data packet of {len(packet)} bytes holds no payload")
     sequence, low, high = _PACKET.unpack_from(packet)
     return sequence, low | high << 32
+
+
+def counter_difference(counter: int, origin: int, bits: int) -> int:
+    """`counter - origin` of the card's counters, which wrap after so many bits; nearest to zero."""
+    half = 1 << (bits - 1)
+    return (counter - origin + half) % (2 * half) - half

@@ -1,7 +1,8 @@
 """What is in a recording of a DCA1000: shape, range profile, clipping, missing antennas, order of I and Q.
 
-What is not known is guessed from the statistics, and called a guess. `inspect_pcap.py` reads packet captures,
-`inspect_text.py` says it for people, `plot.py` draws it.
+What is not known is guessed from the statistics, and called a guess: of all layouts that fit, the one whose spectra
+have the least disorder is taken. A file of whole packets, headers included, is recognised and placed by byte count
+first. `inspect_pcap.py` reads packet captures; `polysight.host.jobs.scan_files` prints and plots the report.
 """
 
 from __future__ import annotations
@@ -26,6 +27,10 @@ DRAW = 0.02
 """Layouts whose disorder differs by less are not told apart: the likelier one is taken."""
 _MOST_CHIRPS = 4096  # enough for the statistics
 _CHIRPS_TRIED = 512
+_LOOKED_AT = 16  # headers that tell whether a file holds whole packets
+_FULL_SCALE = 32767  # ADC counts
+_MUCH_DC = 0.05 * _FULL_SCALE
+_CLEARLY = 4 * DRAW  # so much less disorder in another layout contradicts the one that was given
 
 
 @dataclass(frozen=True)
@@ -122,9 +127,6 @@ def is_offset_binary(words: NDArray[np.int16]) -> bool:
     return bool(some.size and (some ^ np.int16(-0x8000)).std() < some.std() / 4)
 
 
-_LOOKED_AT = 16
-
-
 def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
     """The packets of a file that holds full packets one after another, the last perhaps short; none of any other.
 
@@ -147,9 +149,8 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
 
     Returns its bytes, uint8 [n], and what became of the packets. Raises DataError when they are not of one record.
     """
-    first = dca1000.decode_packet_header(packets[0])[1]
-    half, whole = 1 << (dca1000.BYTE_COUNT_BITS - 1), 1 << dca1000.BYTE_COUNT_BITS
-    ahead = [(dca1000.decode_packet_header(p)[1] - first + half) % whole - half for p in packets]
+    counts = [dca1000.decode_packet_header(p)[1] for p in packets]
+    ahead = [dca1000.counter_difference(c, counts[0], dca1000.BYTE_COUNT_BITS) for c in counts]
     ends = [a + len(p) - dca1000.PACKET_HEADER_BYTES for a, p in zip(ahead, packets, strict=True)]
     size = max(ends) - min(ahead)
     if size > 1 << 34:
@@ -159,11 +160,6 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     for packet in packets:
         placement.place_packet(packet)
     return out, placement.finish()
-
-
-_FULL_SCALE = 32767
-_MUCH_DC = 0.05 * _FULL_SCALE
-_CLEARLY = 4 * DRAW  # so much less disorder in another layout contradicts the one that was given
 
 
 @dataclass(frozen=True)

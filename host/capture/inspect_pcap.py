@@ -1,4 +1,8 @@
-"""What is in a packet capture of a DCA1000: the card's replies and its record, placed as live data is."""
+"""What is in a packet capture of a DCA1000: the card's replies and its record, placed as live data is.
+
+`read_pcap` reads the UDP datagrams of a classic pcap file of Ethernet packets; a pcapng file is refused, with the
+command that converts it. `inspect_pcap` splits them into replies and data packets, and inspects the record of one card.
+"""
 
 from __future__ import annotations
 
@@ -106,52 +110,52 @@ def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> 
     DataError
         when the file is no packet capture, holds nothing from a card, or several cards and none was chosen.
     """
-    replies: list[tuple[str, int]] = []
-    packets: list[bytes] = []
-    times: list[int] = []
-    status, version, address = Status(0), "", ""
-    for datagram in read_pcap(path):
-        if datagram.source[1] != dca1000.CARD_SOURCE_PORT or card_address not in ("", datagram.source[0]):
-            continue
-        if address not in ("", datagram.source[0]):
-            raise DataError(
-                f"{path}: holds packets of {address} and {datagram.source[0]}",
-                "several cards were recorded at once",
-                f"choose one: --card {address}",
-            )
-        address = datagram.source[0]
-        try:
-            reply = dca1000.decode_reply(datagram.payload)
-        except ProtocolError:
-            packets.append(datagram.payload)
-            times.append(datagram.t_ns)
-            continue
-        if reply.code == Code.STATUS:
-            status |= Status(reply.status & 0x0FFF)
-        name = Code(reply.code).name if reply.code in set(Code) else f"0x{reply.code:02x}"
-        replies.append((name, reply.status))
-        if reply.code == Code.VERSION:
-            version = str(dca1000.decode_version(reply.status))
-    card = CardReport(address, replies, version, status, None, 0, 0.0)
-    data = [p for p in packets if len(p) > dca1000.PACKET_HEADER_BYTES]
+    card, packets = _from_card(path, card_address)
+    data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]
     if not data:
-        if not replies:
+        if not card.replies:
             raise DataError(
                 f"{path}: nothing from a DCA1000{f' at {card_address}' if card_address else ''} in it",
                 "another capture, or another card",
                 "record on the card's interface",
             )
         return _empty(path, card)
-    out = place_packets(data)
-    card.record = out[1]
-    if len(data) > 1 and len(data[-1]) < len(data[0]):
-        card.tail_bytes = len(data[-1]) - dca1000.PACKET_HEADER_BYTES
-        card.tail_after_s = (times[-1] - times[-2]) / 1e9
-    report = inspect_payload(path, out[0], known)
+    payload, card.record = place_packets([d.payload for d in data])
+    if len(data) > 1 and len(data[-1].payload) < len(data[0].payload):
+        card.tail_bytes = len(data[-1].payload) - dca1000.PACKET_HEADER_BYTES
+        card.tail_after_s = (data[-1].t_ns - data[-2].t_ns) / 1e9
+    report = inspect_payload(path, payload, known)
     report.card = card
-    if out[1].missing:
-        report.remarks.append(f"{sum(b - a for a, b in out[1].missing)} bytes are missing")
+    if card.record.missing:
+        report.remarks.append(f"{sum(b - a for a, b in card.record.missing)} bytes are missing")
     return report
+
+
+def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
+    """What a card said by its replies, and every other datagram that it sent. Raises DataError for several cards."""
+    card, packets = CardReport("", [], "", Status(0), None, 0, 0.0), []
+    for datagram in read_pcap(path):
+        if datagram.source[1] != dca1000.CARD_SOURCE_PORT or card_address not in ("", datagram.source[0]):
+            continue
+        if card.address not in ("", datagram.source[0]):
+            raise DataError(
+                f"{path}: holds packets of {card.address} and {datagram.source[0]}",
+                "several cards were recorded at once",
+                f"choose one: --card {card.address}",
+            )
+        card.address = datagram.source[0]
+        try:
+            reply = dca1000.decode_reply(datagram.payload)
+        except ProtocolError:
+            packets.append(datagram)
+            continue
+        if reply.code == Code.STATUS:
+            card.status |= Status(reply.status & 0x0FFF)
+        name = Code(reply.code).name if reply.code in set(Code) else f"0x{reply.code:02x}"
+        card.replies.append((name, reply.status))
+        if reply.code == Code.VERSION:
+            card.version = str(dca1000.decode_version(reply.status))
+    return card, packets
 
 
 def _empty(path: Path, card: CardReport) -> Report:

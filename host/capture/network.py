@@ -1,6 +1,9 @@
-"""UDP sockets for the capture card: binding with a clear error, a large buffer that is read back, receiving in batches.
+"""UDP sockets for the capture cards, and the network path to a card that does not answer.
 
-`recvmmsg` fetches many packets with one system call into one block of memory, so that the cost of a packet is its copy.
+A socket is bound with a clear error, and its receive buffer is read back, because the kernel may grant less than was
+asked for. `recvmmsg` fetches many packets with one system call into one block of memory, so that the cost of a packet
+is its copy. `silent_hop` finds the first hop to a silent card that does not work (address, route, link, card), and the
+errors of silent cards and radars say it.
 """
 
 from __future__ import annotations
@@ -31,6 +34,9 @@ _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _STRIDE = 1536  # room for the largest packet and for seeing that one is too long
 _MSG_DONTWAIT = socket.MSG_DONTWAIT if hasattr(socket, "MSG_DONTWAIT") else 0x40
+_GATEWAY, _UP = 0x2, 0x1  # flags in /proc/net/route
+_ARP_COMPLETE = 0x2  # flag in /proc/net/arp
+_ROOT = Path("/")
 
 
 class _IoVec(ctypes.Structure):
@@ -222,11 +228,6 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
     if granted < wanted:
         return f"{name}: receive buffer of {granted} bytes granted, {wanted} asked for ({limit}); {remedy}"
     return ""
-
-
-_GATEWAY, _UP = 0x2, 0x1
-_ARP_COMPLETE = 0x2
-_ROOT = Path("/")
 
 
 class Hop(Enum):

@@ -14,17 +14,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, SEQUENCE_BITS
+from polysight.host.capture.dca1000 import (
+    BYTE_COUNT_BITS,
+    MAX_PAYLOAD_BYTES,
+    PACKET_HEADER_BYTES,
+    SEQUENCE_BITS,
+    Counters,
+    counter_difference,
+)
 
 Gap = tuple[int, int]
-
-
-@dataclass(frozen=True)
-class Counters:
-    """The card's counters at the start of a record: byte count of its first byte, sequence of its first packet."""
-
-    byte_count: int
-    sequence: int
+Bytes = NDArray[np.uint8]
 
 
 @dataclass
@@ -90,9 +90,6 @@ class Placed:
     def complete(self) -> bool:
         """Whether every byte is there and nothing more came."""
         return self.located and not self.missing
-
-
-Bytes = NDArray[np.uint8]
 
 
 @dataclass
@@ -172,8 +169,8 @@ class Placement:
         base = self._base
         if base is None:
             base = self._find_base(int(sequences[0]), int(byte_counts[0]), int(sizes[0]))
-        offsets = _difference(byte_counts, base, BYTE_COUNT_BITS)
-        steps = _difference(sequences.astype(np.uint64), self._anchor_sequence, SEQUENCE_BITS)
+        offsets = _differences(byte_counts, base, BYTE_COUNT_BITS)
+        steps = _differences(sequences.astype(np.uint64), self._anchor_sequence, SEQUENCE_BITS)
         # Only the last packet of a record is not full, so k packets further on are k full payloads further on.
         self._full = max(self._full, int(sizes.max()))
         agree = offsets - self._anchor_offset == steps * self._full
@@ -197,9 +194,7 @@ class Placement:
         """
         if self._base is None or self.counts.placed != 1 or not 0 < self.extent == self._last_size < size:
             return
-        behind = Counters(
-            (self._base + self.extent) % (1 << BYTE_COUNT_BITS), (self._last_sequence + 1) % (1 << SEQUENCE_BITS)
-        )
+        behind = Counters(self._base, self._last_sequence).after(self.extent, 1)
         if behind == Counters(byte_count, sequence):
             self.out[: self.extent] = 0
             self.counts.placed, self.counts.leftover = 0, self.counts.leftover + 1
@@ -212,8 +207,8 @@ class Placement:
         self._anchor_sequence = sequence
         ahead = 0
         if self.start is not None:
-            ahead = _signed(byte_count - self.start.byte_count, BYTE_COUNT_BITS)
-            lost = _signed(sequence - self.start.sequence, SEQUENCE_BITS)
+            ahead = counter_difference(byte_count, self.start.byte_count, BYTE_COUNT_BITS)
+            lost = counter_difference(sequence, self.start.sequence, SEQUENCE_BITS)
             full = ahead // lost if lost > 0 and ahead % lost == 0 else 0  # of the packets lost before this one
             head_lost = size <= full <= MAX_PAYLOAD_BYTES and 0 < ahead < self.expected
             self._full = full if head_lost else 0
@@ -353,9 +348,7 @@ class Placement:
         if self._base is not None and self.extent:
             lost = -(-(self.expected - self.extent) // self._full) if located else 0
             end = self.expected if located else self.extent
-            next_start = Counters(
-                (self._base + end) % (1 << BYTE_COUNT_BITS), (self._last_sequence + 1 + lost) % (1 << SEQUENCE_BITS)
-            )
+            next_start = Counters(self._base, self._last_sequence).after(end, 1 + lost)
         received, holes = self.received, list(self._gaps)
         return Placed(
             self.expected, received, missing, located, reason, self.counts, losses, next_start, holes, slipped
@@ -394,14 +387,8 @@ class Placement:
         return True, ""
 
 
-def _signed(value: int, bits: int) -> int:
-    """The difference of two wrapping counters, nearest to zero."""
-    value &= (1 << bits) - 1
-    return value - (1 << bits) if value >> (bits - 1) else value
-
-
-def _difference(counters: NDArray[np.uint64], origin: int, bits: int) -> NDArray[np.int64]:
-    """`counters - origin` modulo 2**bits, nearest to zero."""
+def _differences(counters: NDArray[np.uint64], origin: int, bits: int) -> NDArray[np.int64]:
+    """:func:`counter_difference` of many counters, uint64 [n], from one origin."""
     spare = 64 - bits
     wrapped = (counters - np.uint64(origin)) << np.uint64(spare)  # the top bit of the counter becomes the sign
     return wrapped.view(np.int64) >> np.int64(spare)

@@ -1,4 +1,9 @@
-"""The host's handle of one receiving process."""
+"""The host's handle of one receiving process, and the messages between the two.
+
+Requests and answers are msgpack structs on a connection that the process inherits. A row is one round: `BeginRow` with
+the file to write, `Progress` while packets come, `EndRow`, and a `RowCapture` that says what was received. The process
+itself is `receiver_process.py`.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +21,9 @@ import msgspec
 from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError
+
+_START_LIMIT_S = 30.0
+_ANSWER_LIMIT_S = 60.0  # ending a row waits for the disk
 
 
 class _Words(msgspec.Struct, frozen=True, tag=True):
@@ -95,8 +103,8 @@ class RowCapture(_Words, frozen=True):
     `bytes` is what was placed, `missing` the byte ranges that are not (the whole row when `located` is false).
     Arrival times are the host's monotonic clock, 0 when no packet came. Counts of packets as in
     :class:`polysight.host.capture.placement.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
-    :class:`polysight.host.capture.placement.Losses`. `card_status` is what the card reported by itself during the row. `holes`
-    and `slipped` as in :class:`polysight.host.capture.placement.Placed`.
+    :class:`polysight.host.capture.placement.Losses`. `card_status` is what the card reported by itself during the row.
+    `holes` and `slipped` as in :class:`polysight.host.capture.placement.Placed`.
     """
 
     row: int
@@ -160,6 +168,7 @@ class Failed(_Words, frozen=True):
 
 Request = Open | BeginRow | EndRow | Discard | Report
 Answer = Opened | Began | Progress | RowCapture | Discarded | Failed
+A = TypeVar("A", bound=Answer)
 _encoder = msgspec.msgpack.Encoder()
 _requests: Any = msgspec.msgpack.Decoder(Request)
 _answers: Any = msgspec.msgpack.Decoder(Answer)
@@ -183,11 +192,6 @@ def next_answer(connection: Connection) -> Answer:
     return _answers.decode(connection.recv_bytes())
 
 
-_START_LIMIT_S = 30.0
-_ANSWER_LIMIT_S = 60.0  # ending a row waits for the disk
-A = TypeVar("A", bound=Answer)
-
-
 class ReceiverProcess:
     """One card's receiving process: `begin_row`, then `poll` until complete or given up, then `end_row`.
 
@@ -198,7 +202,7 @@ class ReceiverProcess:
     buffer_bytes
         Receive buffer to ask the kernel for.
     core
-        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None leaves it free.
+        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None: any.
 
     Attributes
     ----------

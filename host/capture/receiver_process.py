@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.capture import receiver as words
-from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, MAX_PAYLOAD_BYTES, Status
+from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, MAX_PAYLOAD_BYTES, Counters, Status
 from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
-from polysight.host.capture.placement import Counters, Placement
+from polysight.host.capture.placement import Placement
 from polysight.host.capture.scheduling import take_core, take_priority
 from polysight.host.capture.segment import Segment, write_index
 from polysight.shared.errors import DeviceError, PolysightError

@@ -1,6 +1,7 @@
-"""What the checks share: the rig file once it is read, the link to the Pi, what the cards and the capture told.
+"""What the checks share: findings, the rig file once it is read, the link to the Pi, cards, a capture at rest.
 
-Clock, disk and kernel are passed in, so that every fault can be tried without having it.
+A `Finding` is one line of the doctor. `Bench` is one run, and `capture` records a few bursts of every board. Clock,
+disk and kernel are passed in (`System`), so that every fault can be tried without having it.
 """
 
 from __future__ import annotations
@@ -42,6 +43,13 @@ if TYPE_CHECKING:
     from polysight.host.calibration.direct_signal import DirectSignal
 
 Verdict = Literal["ok", "warning", "error", "not checked"]
+BURSTS = 4  # of a capture at rest
+_TAIL_S = 2.5  # a card sends its short last packet two seconds after the last data
+_LOOK_S = 0.05
+_STA_UNSYNC = 0x40  # of adjtimex(2)
+_SIOCETHTOOL, _ETHTOOL_GRINGPARAM = 0x8946, 0x10
+_LOST = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
+_PROBE_BYTES, _PROBE_S = 64 << 20, 2.0  # of the disk's speed
 
 
 @dataclass(frozen=True)
@@ -79,12 +87,6 @@ def not_checked(found: str, remedy: str = "") -> Finding:
 def of_error(e: PolysightError) -> Finding:
     """What an error says."""
     return error(e.what, e.why, e.remedy)
-
-
-_STA_UNSYNC = 0x40
-_SIOCETHTOOL, _ETHTOOL_GRINGPARAM = 0x8946, 0x10
-_LOST = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
-_PROBE_BYTES, _PROBE_S = 64 << 20, 2.0
 
 
 def clock_is_synchronised() -> bool | None:
@@ -156,9 +158,6 @@ def write_speed(folder: Path) -> float:
             os.fsync(file.fileno())
             written += len(block)
         return written / (time.perf_counter() - began)
-
-
-BURSTS = 4
 
 
 @dataclass(frozen=True)
@@ -240,10 +239,6 @@ class Bench:
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._stack.close()
-
-
-_TAIL_S = 2.5  # a card sends its short last packet two seconds after the last data
-_LOOK_S = 0.05
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
-"""SYNC_IN and the radars: a few pulses at rest, and the frames that must follow.
+"""Checks of the capture side: network, cards, SYNC_IN pulses, radars, and the signal itself.
 
-Nothing moves. Radars that are armed transmit for as long as the pulses last, some tens of milliseconds.
+First each card's link, the card and its receive buffer. Then a few pulses at rest and the frames that must follow, and
+from these frames level, direct path and the receivers' skew. Nothing moves. Radars that are armed transmit for as long
+as the pulses last, some tens of milliseconds.
 """
 
 from __future__ import annotations
@@ -23,6 +25,25 @@ from polysight.host.radar.interface import RadarState
 from polysight.shared.config import Board, Instrument
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import MOST_PULSES, MOST_PULSES_S
+
+# Network card: what it must carry.
+MTU = 1500
+SPEED_MBIT = 1000
+RING = 512
+_BEFORE_DATA = ("host", "route", "link", "card")  # hops of the survey
+
+# Direct path.
+HEARD = 0.9  # part of the chirps in which it must be found
+APART_S = 10e-9  # 5 ns of trigger, and some ppm of crystals
+
+# Level.
+CLIPPED = 0.01  # part of the chirps that may be clipped
+WEAK = 4.0  # counts
+
+# Skew of two receivers.
+MUCH_S = 10e-9
+TOO_MUCH_S = 20e-9
+JITTER_S = 4e-9  # two clocks of 5 ns each make 2 ns
 
 
 def check_pulses(bench: Bench) -> Finding:
@@ -107,11 +128,6 @@ def check_radar(bench: Bench, board: Board) -> Finding:
     return ok(told, **facts)
 
 
-MTU = 1500
-SPEED_MBIT = 1000
-RING = 512
-
-
 def check_network(bench: Bench, board: Board) -> Finding:
     """A gigabit link that carries whole packets. What the kernel does not tell is left out."""
     if board.card_address.startswith("127."):
@@ -155,9 +171,6 @@ def check_network(bench: Bench, board: Board) -> Finding:
     return ok(text, **facts)
 
 
-_BEFORE_DATA = ("host", "route", "link", "card")
-
-
 def check_card(bench: Bench, board: Board) -> Finding:
     """The card answers at its address; what does not, is the first hop that is silent."""
     survey = bench.surveys[board.name]
@@ -185,10 +198,6 @@ def check_buffer(bench: Bench, board: Board) -> Finding:
 
 def _as(hop: HopFinding) -> Finding:
     return Finding(hop.verdict, hop.found, hop.why, hop.remedy)
-
-
-HEARD = 0.9  # part of the chirps in which it must be found
-APART_S = 10e-9  # 5 ns of trigger, and some ppm of crystals
 
 
 def check_direct_path(bench: Bench, board: Board) -> Finding:
@@ -263,10 +272,6 @@ def judge(rig: Instrument, board: Board, signal: DirectSignal) -> Finding:
     return ok(f"{told}; {predicted}", **facts)
 
 
-CLIPPED = 0.01  # part of the chirps that may be clipped
-WEAK = 4.0  # counts
-
-
 def check_level(bench: Bench, board: Board) -> Finding:
     """Chirps with a sample at full scale are useless to synchronisation; a level of a few counts drowns in steps."""
     got = bench.captured.get(board.name)
@@ -296,11 +301,6 @@ def check_level(bench: Bench, board: Board) -> Finding:
             **facts,
         )
     return ok(told, **facts)
-
-
-MUCH_S = 10e-9
-TOO_MUCH_S = 20e-9
-JITTER_S = 4e-9  # two clocks of 5 ns each make 2 ns
 
 
 def check_skew(bench: Bench) -> Finding:

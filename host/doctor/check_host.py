@@ -1,4 +1,4 @@
-"""Room and speed of the disk, and how long a scan takes."""
+"""Checks of the host: rig file, calibration and library; the disk, the scan's duration, the clocks."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from polysight.shared.messages import is_simulated
 from polysight.shared.raster import check_burst_fits
 
 SPARE = 2.0  # the disk should take so many times what comes
+APART_S = 1.0  # the clocks of host and Pi, at most
+LOST_S = 60.0  # a clock that is earlier than this file by more has lost its time
+_NTP = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery behind its clock"
 
 
 def row_s(rig: Instrument) -> float:
@@ -114,11 +117,6 @@ def check_library(bench: Bench) -> Finding:
         "train a library at this angle (docs/how-to/add-a-material.md) and scan with --library; or --model none",
         **facts,
     )
-
-
-APART_S = 1.0
-LOST_S = 60.0
-_NTP = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery behind its clock"
 
 
 def check_host_clock(bench: Bench) -> Finding:

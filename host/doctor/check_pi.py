@@ -1,6 +1,7 @@
-"""The trigger line, from the stage's pin to the Pi's: a short row, every point of which must be an edge.
+"""Checks of the Pi and the stage: keys, the Pi's answer and release, the stage's state, and the trigger line.
 
-The only check that moves something; it runs with `--move` alone.
+The trigger line, from the stage's pin to the Pi's, is checked with a short row, every point of which must be an edge.
+That is the only check that moves something; it runs with `--move` alone.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from polysight.shared.raster import RasterPlan
 from polysight.shared.sockets import HOST_KEYS, is_loopback
 
 SIMULATED = "simulated wires: no hardware is driven"
+POINTS = 8  # of the row that is run
+_LIMIT_S = 120.0
+_LOOK_MS = 100
 
 
 def check_keys(bench: Bench) -> Finding:
@@ -81,11 +85,6 @@ def check_free(bench: Bench) -> Finding:
             "wait for its end, or end it with `polysight resume`; restarting polysight-pi forgets it",
         )
     return ok("no scan is begun")
-
-
-POINTS = 8
-_LIMIT_S = 120.0
-_LOOK_MS = 100
 
 
 def check_trigger(bench: Bench) -> Finding:

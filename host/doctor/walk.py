@@ -1,4 +1,7 @@
-"""The order of the checks, and what each of them needs: a hop behind one that is wrong is not tried."""
+"""The order of the checks, what each of them needs, and the command that walks them.
+
+A hop behind one that is wrong is not tried. `walk` yields findings as they come; `doctor` prints them.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,8 @@ from polysight.host.doctor.check_pi import SIMULATED, check_free, check_keys, ch
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError, PolysightError
 from polysight.shared.messages import is_simulated
+
+_WIDTH = 16  # of the column of names
 
 
 def _calibration(bench: Bench) -> Finding:
@@ -130,9 +135,6 @@ def _try(check: Check, bench: Bench, board: Board | None) -> Finding:
         return of_error(
             DeviceError(f"{where}{e.strerror or e}", "a path, a permission or a device", "see what it says")
         )
-
-
-_WIDTH = 16
 
 
 def doctor(wanted: Wanted, as_json: bool, system: System = System()) -> int:  # noqa: B008 - immutable

@@ -1,4 +1,8 @@
-"""What an imager is made for: antennas, stage positions, frequencies, pixels; and whether they are regular."""
+"""What an imager is made for: antennas, stage positions, frequencies, pixels; and whether they are regular.
+
+Also the array library of an array (array API), its Fourier transforms and its device, so that imagers run on NumPy,
+PyTorch and CuPy alike.
+"""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class _Scene:
 
 
 class DirectImager:
-    """An aperture imaged by direct sum: exact wherever positions and pixels are, and slow. See `imager.Imager`."""
+    """An aperture imaged by direct sum: exact wherever positions and pixels are, and slow. See `samples.Imager`."""
 
     def __init__(self, aperture: Aperture) -> None:
         self.aperture = aperture

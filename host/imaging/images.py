@@ -1,4 +1,8 @@
-"""From synchronised rows to the two channel images."""
+"""From synchronised rows to the two channel images: of the whole sweep, and of its sub-bands.
+
+`ImageBuilder` collects rows in any order and forms both images of those it has. `SubBandImages` does the same for parts
+of the sweep that overlap by half.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,8 @@ _VISIBLE = 0.15  # of the strongest footprint: weaker pixels would be mostly amp
 _NEIGHBOURS = 15  # pixels
 TAPERS: dict[str, Window] = {"none": "boxcar", "kaiser": ("kaiser", 4.0), "taylor": ("taylor", 4, 30)}
 """Windows over the aperture by their name in the rig file, as scipy names them."""
+LEAST_SAMPLES = 24
+"""Of a sub-band: fewer cannot tell the object from the direct path."""
 
 
 @dataclass(frozen=True)
@@ -155,10 +161,6 @@ class ImageBuilder:
 def _window(name: Window, n: int) -> NDArray[np.float64]:
     """A symmetric window of n points without the zeros at its ends."""
     return np.asarray(scipy.signal.get_window(name, n + 2, fftbins=False), np.float64)[1:-1]
-
-
-LEAST_SAMPLES = 24
-"""Of a sub-band: fewer cannot tell the object from the direct path."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""How regular positions and pixels fit together for the spectral imagers (docs/decisions/0002-imaging.md)."""
+"""How regular positions and pixels fit together for the spectral imagers (docs/decisions/0002-imaging.md).
+
+A `Lattice` holds periods, pitches and strides. The kernels' spectra along x are made here, for every spectral imager,
+and kept in memory: images of one aperture are made again and again.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,9 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 _FADE = 0.08  # of the kernel's length in x: room in which it fades out and in again
 _FADE_COLUMNS = 20  # at least
 _FILLED = 1e-5  # of the kernel's strongest spectral bin: weaker ones are left out
+KEEP_BYTES = 1 << 28
+"""Spectra kept in memory: two boards of the published grid are 90 MB."""
+_kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 
 @dataclass(frozen=True)
@@ -149,12 +156,6 @@ def _band(aperture: Aperture, first: float, last: float, step: float, columns: i
 def _fast(n: int) -> int:
     """A length from `n` up that transforms fast."""
     return int(scipy.fft.next_fast_len(n) or n)
-
-
-KEEP_BYTES = 1 << 28
-"""Spectra kept in memory: two boards of the published grid are 90 MB."""
-
-_kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 
 def kept(key: tuple[Any, ...], make: Callable[[], Any]) -> Any:

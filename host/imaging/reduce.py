@@ -30,6 +30,8 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Window = str | tuple[Any, ...]  # as scipy.signal.get_window takes it
 _NOISE = 1e-3  # noise power of one sample beside the gate's, for the direct path's estimate
+REACH = 4  # positions to either side
+_BAND = 0.45  # cycles a position the filter is made for
 
 
 @dataclass(frozen=True)
@@ -113,10 +115,6 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     few = np.exp(2j * np.pi * np.outer(d, frequencies))
     from_few = np.linalg.lstsq(few, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
     return Reduction(frequencies, matrix, whole, (matrix[:, a:b] @ from_few).astype(np.complex128), gate_m)
-
-
-REACH = 4  # positions to either side
-_BAND = 0.45  # cycles a position the filter is made for
 
 
 def burst_filters(rig: Instrument) -> NDArray[np.float32]:

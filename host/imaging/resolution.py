@@ -1,4 +1,8 @@
-"""Point response: measured, beside the paper's formula and the geometry's limit."""
+"""Point response: measured, beside the paper's formula and the geometry's limit.
+
+`point_response` images a point in the middle of the scene with the aperture's own taper and mask; `imaging_facts` puts
+that and what is masked into quality.json.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""One board's reduced samples, as rows come in, and its image."""
+"""One board's reduced samples, as rows come in, and its image.
+
+`BoardSamples` reduces each row to the range gate, keeps it, and has it imaged by the fastest imager that is exact for
+the aperture (`choose_imager`). Samples of an ideal mirror on the object plane (`mirror_samples`) give the illumination
+by which images are divided.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +24,10 @@ from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.raster import plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
+
+Image = NDArray[np.complex64]
+_log = logging.getLogger(__name__)
+_AT_ONCE = 120  # positions of one product: more are slower by half (OpenBLAS)
 
 
 class Imager(Protocol):
@@ -67,11 +76,6 @@ def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.c
 def mirror_reduced(antennas: Antennas, z_m: float, chirp: Chirp, reduction: Reduction) -> NDArray[np.complex128]:
     """The same after the range gate, [rx, frequency]."""
     return mirror_samples(antennas, z_m, chirp) @ reduction.matrix.T
-
-
-Image = NDArray[np.complex64]
-_log = logging.getLogger(__name__)
-_AT_ONCE = 120  # positions of one product: more are slower by half (OpenBLAS)
 
 
 class BoardSamples:

@@ -17,6 +17,11 @@ import numpy as np
 from polysight.host.imaging.aperture import Aperture, fft_of, row_starts_m
 from polysight.host.imaging.lattice import Lattice, kept, key_of, lattice, lattice_key, spectra_along_x
 
+SLACK_M = 2e-3
+"""How far along x a row may start from where the aperture says."""
+_LEFT_OUT = 6e-6  # of the strongest principal component: weaker ones are left out
+_AT_ONCE = 32  # wavenumbers in double precision at once
+
 
 class RowSpectra:
     """What both spectral imagers do along x: rows into the kernel's band, and the band into pixels.
@@ -158,13 +163,6 @@ class SpectralImager(RowSpectra):
     def _inverse(self, total: Any) -> Any:
         lines = self.xp.take(self._fft.ifft(total, axis=0), self._pixel_rows, axis=0)
         return self.to_pixels(lines)
-
-
-SLACK_M = 2e-3
-"""How far along x a row may start from where the aperture says."""
-
-_LEFT_OUT = 6e-6  # of the strongest principal component: weaker ones are left out
-_AT_ONCE = 32  # wavenumbers in double precision at once
 
 
 class IncrementalImager(RowSpectra):

@@ -1,6 +1,8 @@
-"""`polysight calibrate`: each command looks at recorded scans, writes one dated file, and says what that changes.
+"""`polysight calibrate` and `polysight leakage`: what recorded scans say of the rig.
 
-Nothing else is written: neither the scans nor the rig file.
+Each `calibrate` command looks at scans, writes one dated file, and says what that changes; neither the scans nor the
+rig file are written. `leakage` prints what belongs into the rig file's [polarimetry]. Scans of a metal plate become the
+reference by position (`load_reference`).
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ from polysight.host.polarimetry import (
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import to_builtins
+
+LEAST_PIXELS = 100  # of a plate that serves as reference
 
 
 def _tell(path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool) -> int:
@@ -166,9 +170,6 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
         ]
         what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
     return _tell(path, file, lines, what_to_set, as_json)
-
-
-LEAST_PIXELS = 100
 
 
 def leakage_of_scans(

@@ -1,4 +1,7 @@
-"""A scan that is processed while it runs: rows go into the images as they are committed."""
+"""`polysight scan` and `resume`: a scan that is processed while it runs, with a progress bar.
+
+Rows go into the images as they are committed, so that the products are there soon after the last row.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +31,9 @@ from polysight.host.store.raw import require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder, check_same_scan
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, PolysightError, ScanError, advice
+
+PRODUCTS = "products"
+Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
 def _clock(seconds: float | None) -> str:
@@ -91,9 +97,6 @@ class ScanBar:
                 self._console.print(f"{p.committed} of {p.rows} rows, {_clock(p.remaining_s)}", highlight=False)
 
 
-PRODUCTS = "products"
-
-
 class _Live:
     """Feeds committed rows to a pipeline, which is made when the first row is there."""
 
@@ -109,9 +112,6 @@ class _Live:
             self.pipeline = Pipeline(self._source, live=True)
         self._source.reload()
         self.pipeline.add_row(row)
-
-
-Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
 @hangups_pass()

@@ -1,4 +1,8 @@
-"""Commands on materials that were found already: permittivity through layers, and concentration."""
+"""Commands on materials in saved products: the table, names, permittivity through layers, and concentration.
+
+`classify` names the patches of several scans together, or judges the models on a library; `report` finds the report of
+a scan, or makes it again from the raw rows.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +32,7 @@ from polysight.shared.errors import ConfigError, DataError
 
 LAST = "?"
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
+REPORT = "report.html"
 
 
 def parse_layer(text: str) -> Layer:
@@ -175,9 +180,6 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
         f" truth in {100 * result.covered:.0f} % of the patches\n"
     )
     return 0
-
-
-REPORT = "report.html"
 
 
 def materials(data: Sequence[Path], as_json: bool) -> int:

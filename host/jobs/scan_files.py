@@ -1,4 +1,9 @@
-"""`polysight drop-raw`: give the space of raw rows back once they are processed."""
+"""Commands on files: `drop-raw`, `validate` and `inspect`.
+
+`drop_raw` removes raw rows once saved products were made from them, after a word typed in confirmation (`typed`).
+`validate_folder` prints every fault of a scan folder. `inspect_file` says what is in a capture, and plots its range
+profile.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +29,9 @@ from polysight.host.store.validate import to_json, validate
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError, DataError, PolysightError
 
+WORD = "drop"  # confirms the removal of raw rows
+BOTTOM_DB = -20.0  # of the plot of a range profile
+
 
 def typed(what: str, word: str, yes: bool) -> str:
     """Say what would be done, and return what is typed in answer; `word` unasked when `yes` was given."""
@@ -33,9 +41,6 @@ def typed(what: str, word: str, yes: bool) -> str:
     sys.stdout.write(f"type {word} to do it: ")
     sys.stdout.flush()
     return sys.stdin.readline().strip()
-
-
-WORD = "drop"
 
 
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
@@ -206,9 +211,6 @@ def inspect_file(file: Path, config: Path | None, plot: Path | None, card_addres
         plot_profile(report, plot)
         sys.stderr.write(f"range profile: {plot}\n")
     return 0
-
-
-BOTTOM_DB = -20.0
 
 
 def plot_profile(report: Report, path: Path) -> None:

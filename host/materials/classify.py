@@ -1,4 +1,8 @@
-"""Naming the pixels and patches of a scan by a reference library."""
+"""Naming the pixels and patches of a scan by a reference library, and the models that can do it.
+
+`MODELS` makes each classifier: the paper's KNN, the discriminant of error sources, and others from scikit-learn to
+compare with. `Classifier` uses the one that was fitted with the library, or that is asked for.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,9 @@ DISCRIMINANT = "discriminant of error sources"
 OWN_SPREAD = "discriminant of error sources, own spread"
 SLOW = "metric learning (NCA) + KNN"
 """Takes seconds to fit, too long for every start of a program: judged, but not chosen."""
+SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT, "own-spread": OWN_SPREAD}
+"""What the commands call some of them."""
+UNKNOWN = "unknown"
 
 
 class Learnt(Model):
@@ -81,11 +88,6 @@ MODELS: dict[str, Callable[[str], Model]] = {
     "linear discriminant of logarithms": lambda channels: _sklearn(channels, "log", "scale", "lda"),
     "quadratic discriminant": lambda channels: _sklearn(channels, "scale", "qda"),
 }
-SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT, "own-spread": OWN_SPREAD}
-"""What the commands call some of them."""
-
-
-UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True)
@@ -180,8 +182,8 @@ class Classifier:
         Parameters
         ----------
         patches
-            Features of each patch's pixels, [n, 4 * angles] (:func:`polysight.host.materials.samples.feature_matrix`); pixels
-            that are not finite are unknown.
+            Features of each patch's pixels, [n, 4 * angles] (:func:`polysight.host.materials.samples.feature_matrix`);
+            pixels that are not finite are unknown.
         """
         good = [usable(x) for x in patches]
         number = np.concatenate([np.full(int(g.sum()), i) for i, g in enumerate(good)] or [np.zeros(0, int)])

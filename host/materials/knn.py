@@ -33,6 +33,7 @@ MARGIN = 2.0
 """How much farther than the library's own patches from one another a pixel may lie before it is unknown."""
 _CHUNK = 512
 _FAR = 1e9
+Distances = tuple[Real, Real, Real]
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,6 @@ class Weights:
         if w.measure not in MEASURES or min(w.h, w.v, w.p) < 0 or w.neighbours < 1:
             raise DataError(f"the library's weights make no sense: {raw}", "made by another version")
         return w
-
-
-Distances = tuple[Real, Real, Real]
 
 
 def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128], measure: Measure) -> Real:

@@ -1,9 +1,10 @@
 """The permittivity of one unknown layer in a stack: sheets thinner than the wave, liquids behind a container's wall.
 
 Eq. 3 of the paper sees one interface. A sheet has two, a filled container three, and the wave that returns from the
-ones behind is as strong as the first. Here the whole stack is the model (:func:`polysight.host.polarimetry.multilayer`), the
-measured quantities are those of the sub-bands of the sweep, and the unknown is found by least squares from every
-promising start. What the data cannot tell apart is listed, not hidden.
+ones behind is as strong as the first. Here the whole stack is the model
+(:func:`polysight.host.polarimetry.multilayer`), the measured quantities are those of the sub-bands of the sweep
+(`Spectrum`, `Bands`), and `fit_layer` finds the unknown by least squares from every promising start. What the data
+cannot tell apart is listed, not hidden.
 """
 
 from __future__ import annotations
@@ -20,9 +21,20 @@ from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError, PolysightError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_Real = npt.NDArray[np.float64]
-_Complex = npt.NDArray[np.complex128]
-_FREQUENCIES = 24
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+_FREQUENCIES = 24  # of a sub-band
+REAL_RANGE = (1.0, 40.0)
+LOSS_RANGE = (0.0, 60.0)
+"""Where permittivities are looked for: from air to beyond water at these frequencies (9.4 - j18)."""
+START_PHASE_RAD = 0.5
+"""Steps of the grid of starts in the phase of the wave's way through the layer and back: no valley lies between."""
+LOSS_STARTS = 25
+RIVAL = 9.0
+"""A second solution is a rival when its chi-square is within this of the best: three standard deviations, as wide as
+the error bars are where the model misses the data."""
+UNLIKELY = 1e-3
+"""The stack does not explain data that it would miss by as much in one of a thousand scans."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +47,15 @@ class Spectrum:
         float64 [K, n]; the weights of a sub-band add to 1.
     """
 
-    frequency_hz: _Real
-    weight: _Real
+    frequency_hz: Real
+    weight: Real
 
     @classmethod
     def of(cls, chirp: Chirp, bands: int = 1, window: str = "hann") -> Spectrum:
         """Sub-bands of the linear part of a chirp: windows that overlap by half, as in Welch's method.
 
-        One band is the whole linear part under the image's own window (:func:`polysight.host.imaging.reduce.reduction`).
+        One band is the whole linear part under the image's own window
+        (:func:`polysight.host.imaging.reduce.reduction`).
         """
         first, last = chirp.linear_samples
         length = 2 * (last - first) / (bands + 1)
@@ -78,10 +91,10 @@ class Bands:
     """
 
     spectrum: Spectrum
-    inverse_ratio: _Complex
-    sigma: _Real
-    amplitude_h: _Real | None = None
-    sigma_h: _Real | None = None
+    inverse_ratio: Complex
+    sigma: Real
+    amplitude_h: Real | None = None
+    sigma_h: Real | None = None
 
     def __post_init__(self) -> None:
         k = self.inverse_ratio.shape
@@ -96,24 +109,6 @@ class Bands:
             )
         if (self.amplitude_h is None) != (self.sigma_h is None):
             raise PolysightError("bands: amplitude_h and sigma_h go together")
-
-
-__all__ = ["Bands", "Layer", "LayerFit", "Spectrum", "fit_layer", "predict"]
-
-Real = npt.NDArray[np.float64]
-Complex = npt.NDArray[np.complex128]
-
-REAL_RANGE = (1.0, 40.0)
-LOSS_RANGE = (0.0, 60.0)
-"""Where permittivities are looked for: from air to beyond water at these frequencies (9.4 - j18)."""
-START_PHASE_RAD = 0.5
-"""Steps of the grid of starts in the phase of the wave's way through the layer and back: no valley lies between."""
-LOSS_STARTS = 25
-RIVAL = 9.0
-"""A second solution is a rival when its chi-square is within this of the best: three standard deviations, as wide as
-the error bars are where the model misses the data."""
-UNLIKELY = 1e-3
-"""The stack does not explain data that it would miss by as much in one of a thousand scans."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,15 @@ from polysight.host.materials.segment import Box, Mask, Patch, Segmentation, box
 from polysight.host.polarimetry import calibrate, correct_leakage, fresnel, permittivity_from_ratio
 from polysight.shared.errors import DataError
 
+CERTAIN_MARGIN = 1.8
+"""Metal has |r_s r_p| = 1. The dielectrics of Table 2 stay below 0.22 at 55 degrees, bare water near 0.42."""
+CERTAIN_MISMATCH = 0.035
+"""How far |H| of the other patches may lie, in the median and relative, from what their ratio says (:func:`mismatch`).
+
+With metal it is 0.01 on simulated scans. Random scenes of Table 2's materials, errors of 1 %: with this limit 2 % of
+those without metal are called certain, and 95 % of those with it.
+"""
+
 
 @dataclass(frozen=True)
 class MetalReference:
@@ -36,16 +45,6 @@ class MetalReference:
     how: str
     certain: bool = True
     margin: float = float("inf")
-
-
-CERTAIN_MARGIN = 1.8
-"""Metal has |r_s r_p| = 1. The dielectrics of Table 2 stay below 0.22 at 55 degrees, bare water near 0.42."""
-CERTAIN_MISMATCH = 0.035
-"""How far |H| of the other patches may lie, in the median and relative, from what their ratio says (:func:`mismatch`).
-
-With metal it is 0.01 on simulated scans. Random scenes of Table 2's materials, errors of 1 %: with this limit 2 % of
-those without metal are called certain, and 95 % of those with it.
-"""
 
 
 def metal_in_box(

@@ -1,4 +1,9 @@
-"""`patches.npz`: the features of every patch's pixels as a scan left them, and the same patches in several scans."""
+"""Files of patches: the features of every patch's pixels (`patches.npz`), and boxes with names (`labels.json`).
+
+`patches.npz` keeps what a scan saw, so that `match_patches` can find the same patches in several scans and have them
+named together. Label files hold boxes drawn by hand, or those of the patches that were found; `patches_from_labels` and
+`patches_from_plates` make patches of boxes and of plates whose places are known.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,11 @@
-"""The published data set's label folders: SAR pairs with boxes drawn by hand, read into library entries.
+"""The published data set's labels and material files, read into library entries; material files are written too.
 
-`labels/<scan>/{sar_h,sar_v}.npy` and `<scan>.json`. A box is [x0, y0, x1, y1] in pixels. Which way its y counts, and
-whether the images are [y, x] or [x, y], is not written anywhere; one convention holds for all scans, so that the images
-tell it: under the right one the boxes explain most of the images' brightness.
+`labels/<scan>/{sar_h,sar_v}.npy` and `<scan>.json`: images with boxes [x0, y0, x1, y1] in pixels. Which way a box's y
+counts, and whether the images are [y, x] or [x, y], is not written anywhere; one convention holds for all scans, so
+that the images tell it: under the right one the boxes explain most of the images' brightness.
+
+`materials/<name>_<angle>.pkl`: pixels of one material and of its metal reference. The pickles are read with an
+unpickler that admits arrays and plain types only.
 """
 
 from __future__ import annotations
@@ -36,6 +39,21 @@ TURNS = {
     "x and y swapped, y from the last row": lambda a: a.T[::-1],
 }
 _CLEARLY = 0.05  # how much more of the brightness another reading must explain
+_ADMITTED = {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("builtins", "complex"),
+    ("_codecs", "encode"),
+    *(
+        (module, name)
+        for module, names in {
+            "multiarray": ("_reconstruct", "scalar"),
+            "numeric": ("_frombuffer",),
+        }.items()
+        for name in names
+        for module in (f"numpy.core.{module}", f"numpy._core.{module}")
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -201,23 +219,6 @@ def told_angle(texts: Iterable[str]) -> float | None:
         if found:
             return float(found[1])
     return None
-
-
-_ADMITTED = {
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("builtins", "complex"),
-    ("_codecs", "encode"),
-    *(
-        (module, name)
-        for module, names in {
-            "multiarray": ("_reconstruct", "scalar"),
-            "numeric": ("_frombuffer",),
-        }.items()
-        for name in names
-        for module in (f"numpy.core.{module}", f"numpy._core.{module}")
-    ),
-}
 
 
 class _Restricted(pickle.Unpickler):

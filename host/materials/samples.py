@@ -1,4 +1,8 @@
-"""Labelled pixels as classifiers see them: features, material, scan and patch of each pixel."""
+"""Labelled pixels as classifiers see them, and what every classifier does with them.
+
+`Samples` holds features, material, scan and patch of each pixel. A `Model` learns from samples and names pixels; the
+result for one scan is a `NamedScan`, whose patches are named by `majority` or by the model itself.
+"""
 
 from __future__ import annotations
 

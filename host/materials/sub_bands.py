@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.images import SubBand
@@ -18,6 +19,7 @@ from polysight.host.polarimetry import PlaneReference
 from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError
 
+Image = npt.NDArray[np.complexfloating]
 AMPLITUDE_ERROR = 0.1
 """Relative standard deviation of |H| of a patch: its size, its edges and its tilt are in it, and in no ratio."""
 
@@ -79,30 +81,47 @@ def band_rows(
     out: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
     for k, (band, made) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
-        metal = replace(found.metal, mask=found.metal.mask & made.valid)  # elsewhere the images are 0, and not metal
-        if metal.mask.any():
-            h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (made.h, made.v))
-            relative = to_metal(h, v, metal, leakage, reference)
-            h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
-            error = reference_error(h, v, metal, reference)
-        else:
-            h = v = np.full(made.valid.shape, complex(np.nan, np.nan))
-            error = float("nan")
+        h, v, error = _relative_to_metal(found, made, leakage, smooth_px, reference)
         for r in found.patches:
             at = r.patch.interior & made.valid
-            ratio = median_ratio(h[at], v[at])
-            std = math.hypot(inverse_spread(h[at], v[at]), error / abs(ratio)) if ratio else float("nan")
-            known = math.isfinite(abs(ratio)) and math.isfinite(std)
             out[r.patch.label].append(
-                {
-                    "first_hz": band.first_hz,
-                    "last_hz": band.last_hz,
-                    "ratio": {"real": ratio.real, "imag": ratio.imag} if known else None,
-                    "inverse_ratio_std": std if known else None,
-                    "amplitude_h": float(np.nanmedian(np.abs(h[at]))) if known else None,
-                }
+                {"first_hz": band.first_hz, "last_hz": band.last_hz, **_seen(h[at], v[at], error)}
             )
     return out
+
+
+def _relative_to_metal(
+    found: MaterialsResult,
+    made: ChannelImages,
+    leakage: tuple[complex, complex],
+    smooth_px: float,
+    reference: PlaneReference | None,
+) -> tuple[Image, Image, float]:
+    """H and V of a sub-band, [ny, nx], relative to metal, and the reference's relative standard error.
+
+    Not numbers where the sub-band shows no metal.
+    """
+    metal = replace(found.metal, mask=found.metal.mask & made.valid)  # elsewhere the images are 0, and not metal
+    if not metal.mask.any():
+        nothing = np.full(made.valid.shape, complex(np.nan, np.nan))
+        return nothing, nothing, float("nan")
+    h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (made.h, made.v))
+    relative = to_metal(h, v, metal, leakage, reference)
+    h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
+    return h, v, reference_error(h, v, metal, reference)
+
+
+def _seen(h: Image, v: Image, error: float) -> dict[str, Any]:
+    """Ratio of a patch's pixels [n] in a sub-band, its standard deviation, and |H|; null where they do not tell."""
+    ratio = median_ratio(h, v)
+    std = math.hypot(inverse_spread(h, v), error / abs(ratio)) if ratio else float("nan")
+    if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
+        return {"ratio": None, "inverse_ratio_std": None, "amplitude_h": None}
+    return {
+        "ratio": {"real": ratio.real, "imag": ratio.imag},
+        "inverse_ratio_std": std,
+        "amplitude_h": float(np.nanmedian(np.abs(h))),
+    }
 
 
 def bands_of_row(

@@ -1,11 +1,13 @@
-"""Classifiers judged side by side on data they have not seen.
+"""Reference libraries made from scans, their classifiers fitted, and models judged on data they have not seen.
 
-Whole groups are left out (scans, or physical samples): pixels of one patch share their speckle, their placement and
-their metal reference, so that a split by pixel measures how well a patch knows itself. That figure is given too,
-because the paper seems to use it; it is optimistic and called so.
+`make_library` collects the patches of known material from processed scans; `fit_library` chooses the model and fits it,
+for each incidence angle and for all together.
 
-A material can be judged only where another scan taught it. One that a single scan holds is not judged: it stays among
-the materials that the others may be confused with, counts neither as right nor as wrong, and is named.
+To judge a model (`score`), whole groups are left out (scans, or physical samples): pixels of one patch share their
+speckle, their placement and their metal reference, so that a split by pixel measures how well a patch knows itself.
+That figure is given too, because the paper seems to use it; it is optimistic and called so. A material can be judged
+only where another scan taught it. One that a single scan holds is not judged: it stays among the materials that the
+others may be confused with, counts neither as right nor as wrong, and is named.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ from polysight.shared.errors import DataError
 
 FOLDS = 8
 OPTIMISTIC = "by pixel (optimistic)"
+PIXELS = 16
+"""Pixels of a patch that models are judged on."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +201,6 @@ def strangers(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str
                 missed += list(found.distance[np.searchsorted(found.patches, mine)] > 1)
         out[str(name)] = float(np.mean(missed))
     return out
-
-
-PIXELS = 16
-"""Pixels of a patch that models are judged on."""
 
 
 def fit_library(library: Library) -> Library:

@@ -1,4 +1,8 @@
-"""Committed rows on their way into the looker's own images: the instrument's pipeline, in a thread that may be slow."""
+"""What the live view shows of committed rows: images and range profiles, made by the instrument's own pipeline.
+
+`RowViewer` takes rows in a thread that may be slow; what it shows is replaced as a whole (`Shown`). `draw` makes
+amplitude and phase of H, V and P as PNG.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +35,11 @@ AMPLITUDE, PHASE = "cividis", "twilight"
 _RANGE_DB = 35.0
 _RATIO_PERCENTILES = (5.0, 95.0)
 _FAINT_DB, _CLEAR_DB = -26.0, -18.0  # below the brightest: what is fainter holds no phase, and fades out
+_FFT = 2048  # points of a range profile
+_PICTURES_S = 0.5  # at most so often, while many rows are caught up with
+_LOOK_S = 0.1
+_PROFILE_FLOOR_DB = -70.0
+_BEFORE_M, _BEYOND_M = 0.25, 0.35  # shown on either side of direct path and scene
 
 
 @dataclass(frozen=True)
@@ -102,13 +111,6 @@ def colour_bar(colours: str) -> bytes:
     file = io.BytesIO()
     imsave(file, matplotlib.colormaps[colours](np.linspace(0, 1, 256))[None], format="png")
     return file.getvalue()
-
-
-_FFT = 2048
-_PICTURES_S = 0.5  # at most so often, while many rows are caught up with
-_LOOK_S = 0.1
-_PROFILE_FLOOR_DB = -70.0
-_BEFORE_M, _BEYOND_M = 0.25, 0.35  # shown on either side of direct path and scene
 
 
 @dataclass(frozen=True)

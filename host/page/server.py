@@ -2,7 +2,7 @@
 
 State is changed by POST only, with the token in a header: no link, form or image of another page can send that. Pages
 of other sites cannot read anything here either: no cross-origin header is ever sent, and bound to loopback the server
-answers to loopback's names only.
+answers to loopback's names only. `preview` runs it at low priority until Ctrl-C.
 """
 
 from __future__ import annotations
@@ -45,6 +45,9 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+NICE = 10  # of the server: everything else goes first
+_END_S = 1  # to let go of the pages
+_CONNECTIONS = 64
 
 
 def make_app(watch: Watch, token: str, loopback: bool) -> Starlette:
@@ -130,11 +133,6 @@ async def _stream(watch: Watch, ending: Callable[[], bool]) -> AsyncIterator[byt
             yield b"event: alive\ndata: 0\n\n"
         await asyncio.sleep(_LOOK_S)
         silent_s += _LOOK_S
-
-
-NICE = 10
-_END_S = 1
-_CONNECTIONS = 64
 
 
 def preview(folder: Path, host: str, port: int, control: bool) -> int:

@@ -1,7 +1,7 @@
 """What a scan's own files say about it: rows, takes, counts of each board, times, and what went wrong.
 
 Gathered fact by fact and event by event, without files or clocks, so that the same files tell the same story to whoever
-begins to look later.
+begins to look later. What went wrong becomes a `Notice`: a sentence with likely cause and remedy (`CAUSES`).
 """
 
 from __future__ import annotations
@@ -65,6 +65,8 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     ),
 }
 """Likely cause of a fault and what to do. Those of the Pi are in shared/faults.py."""
+RowMark = Literal["committed", "kept", "rejected"]
+_RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,6 @@ def of_kept(row: int, reasons: Sequence[str], faults: Sequence[Fact], utc: str) 
     """A row that is kept though something of it is missing."""
     why, do = _cause(faults)
     return Notice("warn", f"Row {row} is kept with gaps, which are masked", why, do, "; ".join(reasons), row, utc)
-
-
-RowMark = Literal["committed", "kept", "rejected"]
-_RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
 @dataclass

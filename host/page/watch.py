@@ -1,7 +1,8 @@
 """Keeps looking at one scan, and keeps the newest snapshot of it: what every page gets, whenever it comes.
 
-A snapshot is made once and kept as bytes, so that pages cost nothing but sending, however many there are and however
-slow they are, and all see the same.
+The scan's manifest and event log are followed as they grow (`ManifestTail`, `EventTail`). A snapshot is made once and
+kept as bytes, so that pages cost nothing but sending, however many there are and however slow they are, and all see the
+same.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ from polysight.shared.errors import PolysightError, ProtocolError
 from polysight.shared.messages import AnyEvent, unpack_kept
 
 _HEAD = 256
+_TURN_S = 0.2
+_LAPSE_S = 15.0  # the scan program touches its file once a second
+_GRACE_S = 6.0  # from a manifest's first line to the first sign of life
+_PI_LIMIT_S = 6.0
+_UNATTENDED_ROWS = 3.0  # a scan without signs of life lives while rows come, and for so many rows' time
 
 
 class GrowingFile:
@@ -108,13 +114,6 @@ class EventTail:
         except (msgpack.OutOfData, msgpack.UnpackException, ValueError, ProtocolError):
             self.file.take(end)
         return events
-
-
-_TURN_S = 0.2
-_LAPSE_S = 15.0  # the scan program touches its file once a second
-_GRACE_S = 6.0  # from a manifest's first line to the first sign of life
-_PI_LIMIT_S = 6.0
-_UNATTENDED_ROWS = 3.0  # a scan without signs of life lives while rows come, and for so many rows' time
 
 
 class Versioned(NamedTuple):

@@ -1,4 +1,8 @@
-"""What a scan with this rig file will take and give."""
+"""What a scan with this rig file will take and give, and what is wrong with it.
+
+`forecast` computes time, data, point response, alias-free field, noise and the cost of motion. `warnings_of` turns them
+into sentences, and says which of them stage, Pi or radars would refuse.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +28,8 @@ from polysight.shared.errors import ConfigError
 from polysight.shared.raster import burst_duration_s, check_burst_fits, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
+Real = NDArray[np.float64]
+
 MAX_STEPS_PER_S = 20_000
 """Of the stage's firmware (docs/spec/stage-line.md, timing)."""
 
@@ -34,6 +40,8 @@ PUBLISHED_PHASE_RAD = 0.022
 _TOLERABLE_LOSS_DB = 0.5
 _WIRE_BYTES = 1470 + 42 + 24  # a full packet on Ethernet: headers, preamble, check sum, gap
 _ETHERNET_BYTES_PER_US = 125.0
+SIMULATED_DIRECT_SNR_DB = 5.5
+_FAST_TIME_WINDOW = "hann"  # of polysight.host.imaging.ImageBuilder
 
 
 class Caution(NamedTuple):
@@ -181,11 +189,6 @@ def _noise(noise: NoiseFacts) -> Iterator[Caution]:
 def _library(rig: Instrument) -> Iterator[Caution]:
     if text := Options().unnamed(rig):
         yield Caution("library", text.replace("was named", "will be named", 1))
-
-
-Real = NDArray[np.float64]
-SIMULATED_DIRECT_SNR_DB = 5.5
-_FAST_TIME_WINDOW = "hann"  # of polysight.host.imaging.ImageBuilder
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,8 @@
-"""The best plans within a time: speeds, steps and bursts tried, the aperture kept."""
+"""Plans that differ from the rig file, and the best of them within a time.
+
+`Changes` is what a plan has otherwise than the rig file; `rig_lines` writes the differences as lines of a rig file.
+`propose` tries speeds, steps and bursts, and keeps the aperture.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +29,14 @@ from polysight.host.radar.program import TRIGGER_MARGIN_US, chirp_us
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, to_builtins
+
+ON_THE_PI = ("speed_mm_s", "accel_mm_s2")
+"""Of [stage]: the Pi drives with its own rig file's acceleration, and refuses speeds above that file's."""
+_MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
+_MARGIN = 0.95  # of the time between two points that a burst may fill
+_MOST_TRAVEL_WAVELENGTHS = 0.5
+MAX_FRAMES = 65535
+"""Of a row, that a radar counts (host/radar/constraints.py)."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +87,6 @@ class Changes:
         return decode(table, Instrument, f"{rig.name}, changed")
 
 
-ON_THE_PI = ("speed_mm_s", "accel_mm_s2")
-"""Of [stage]: the Pi drives with its own rig file's acceleration, and refuses speeds above that file's."""
-
-
 def rig_lines(plan: Instrument, begun_with: Instrument) -> str:
     """The lines that make a plan of the rig file it began with: every number that differs; "" when none does."""
     new, old = to_builtins(plan), to_builtins(begun_with)
@@ -92,13 +100,6 @@ def rig_lines(plan: Instrument, begun_with: Instrument) -> str:
         if lines:
             parts.append("\n".join([f"[{section}]", *lines, ""]))
     return "\n".join(parts)
-
-
-_MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
-_MARGIN = 0.95  # of the time between two points that a burst may fill
-_MOST_TRAVEL_WAVELENGTHS = 0.5
-MAX_FRAMES = 65535
-"""Of a row, that a radar counts (host/radar/constraints.py)."""
 
 
 def shortest_period_us(rig: Instrument) -> float:

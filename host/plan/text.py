@@ -1,4 +1,7 @@
-"""A forecast in words, and as plain numbers."""
+"""`polysight plan`: a forecast in words and as plain numbers, with what an earlier scan tells of noise and overhead.
+
+`plan` prints the forecast or the proposals. `noise_of` and `row_overhead_of` measure what a recorded scan had.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,8 @@ from polysight.shared.errors import DataError
 from polysight.shared.messages import Capture
 
 _WIDTH = 118
+_ROWS = 5  # that the noise is taken from
+_SIMULATED = "the simulated rig's (no hardware has been measured; --like SCAN or --snr-db give another)"
 
 
 def duration(seconds: float) -> str:
@@ -147,9 +152,6 @@ def numbers(f: Forecast) -> dict[str, Any]:
     }
 
 
-_ROWS = 5  # that the noise is taken from
-
-
 def noise_of(source: RawSource) -> Noise:
     """Direct path over noise of a scan's weaker receiver, from a few of its rows.
 
@@ -202,9 +204,6 @@ def row_overhead_of(folder: Path) -> float | None:
         if next_row == row + 1
     ]
     return max(0.0, float(np.median(gaps)) - known) if gaps else None
-
-
-_SIMULATED = "the simulated rig's (no hardware has been measured; --like SCAN or --snr-db give another)"
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
+_AIR = np.asarray(1.0 + 0j)
 
 
 def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
@@ -117,6 +118,32 @@ def _entries(value: Sequence[npt.ArrayLike] | npt.ArrayLike) -> list[Any]:
     return [array] if array.ndim == 0 else list(array)
 
 
+def _stack(
+    eps: Sequence[npt.ArrayLike] | npt.ArrayLike, thickness_m: Sequence[npt.ArrayLike] | npt.ArrayLike
+) -> tuple[list[Complex], list[Real]]:
+    """Permittivities of air and of all media, and the thicknesses of those between two half spaces, metres.
+
+    Raises PolysightError as :func:`multilayer`.
+    """
+    media: list[Complex] = [np.asarray(e, np.complex128) for e in _entries(eps)]
+    layers = [np.asarray(d, np.float64) for d in _entries(thickness_m)]
+    if not media or len(layers) not in (len(media) - 1, len(media)):
+        raise PolysightError(
+            f"multilayer: {len(media)} permittivities with {len(layers)} thicknesses",
+            "each medium needs a thickness; only that of the last one may be left out (half space)",
+        )
+    if len(layers) == len(media):
+        if np.all(np.isinf(layers[-1])):
+            layers.pop()
+        else:
+            media.append(_AIR)
+    if any(np.any(~np.isfinite(d)) or np.any(d < 0) for d in layers):
+        raise PolysightError(
+            "multilayer: a thickness is negative or not finite", "only the last medium may be infinitely thick"
+        )
+    return [_AIR, *media], layers
+
+
 def multilayer(
     eps: Sequence[npt.ArrayLike] | npt.ArrayLike,
     thickness_m: Sequence[npt.ArrayLike] | npt.ArrayLike,
@@ -154,26 +181,10 @@ def multilayer(
         when the numbers of permittivities and thicknesses do not fit, or a thickness is negative or infinite before
         the last medium.
     """
-    media = [np.asarray(e, np.complex128) for e in _entries(eps)]
-    layers = [np.asarray(d, np.float64) for d in _entries(thickness_m)]
-    if not media or len(layers) not in (len(media) - 1, len(media)):
-        raise PolysightError(
-            f"multilayer: {len(media)} permittivities with {len(layers)} thicknesses",
-            "each medium needs a thickness; only that of the last one may be left out (half space)",
-        )
-    if len(layers) == len(media):
-        if np.all(np.isinf(layers[-1])):
-            layers.pop()
-        else:
-            media.append(np.asarray(1.0 + 0j))
-    if any(np.any(~np.isfinite(d)) or np.any(d < 0) for d in layers):
-        raise PolysightError(
-            "multilayer: a thickness is negative or not finite", "only the last medium may be infinitely thick"
-        )
+    media, layers = _stack(eps, thickness_m)
     theta = np.asarray(theta_rad, np.float64)
     s = np.sin(theta)
     k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
-    media.insert(0, np.asarray(1.0 + 0j))
     q = [np.cos(theta).astype(np.complex128), *(_normal_wavenumber(e, s) for e in media[1:])]
     y = [qi / ei for qi, ei in zip(q, media, strict=True)]
     r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])

@@ -196,7 +196,8 @@ def leakage_from_images(
     Parameters
     ----------
     plate
-        H and V of the whole plate, complex [ny, nx] (smoothed: :class:`polysight.host.polarimetry.PlaneReference` h and v).
+        H and V of the whole plate, complex [ny, nx] (smoothed: h and v of
+        :class:`polysight.host.polarimetry.PlaneReference`).
     strips
         (psi in radians from the vertical, H, V) of each orientation; one is enough for the axial ratio alone.
     mask

@@ -1,4 +1,8 @@
-"""Products of a processed scan, read back: the one place that knows how a folder of them is laid out and found."""
+"""The files of a processed scan, written and read back: the one place that knows their names and content.
+
+image.npz, materials.json, quality.json and scan.json are written here, each whole or not at all. `SavedProducts` reads
+a folder of them; `find_products` finds the folder.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,11 @@ from polysight.host.store.source import Scan
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import decode, to_builtins
+
+SCAN = "scan.json"
+IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
+FINISHED = ".finished.json"  # says what the products were made with, when several scans are processed
+_PRODUCTS = "products"  # of a scan folder
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -103,9 +112,6 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-SCAN = "scan.json"
-
-
 def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
     """Gain and phase of each RX against its board's first one, by board: from the direct path, divided out."""
     out = {}
@@ -129,11 +135,6 @@ def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelIm
     }
     write_json(out / SCAN, facts)
     return facts
-
-
-IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
-FINISHED = ".finished.json"  # says what the products were made with, when several scans are processed
-_PRODUCTS = "products"  # of a scan folder
 
 
 @dataclass(frozen=True)

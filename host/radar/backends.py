@@ -1,8 +1,11 @@
-"""Radars re-armed for each row over TCP, by one server a board that takes the line `Retrigger\n` and never answers.
+"""The simple radar backends, and `radar_control`, which makes the backend that a rig file names.
 
+`LineServers` re-arms radars for each row over TCP: one server a board takes the line `Retrigger` and never answers.
 That is how the published rig does it: a MATLAB server beside mmWave Studio configures a radar for the frames of one
 row, and starts it again at each line. What can be known here is that the server's machine took the line (its kernel
 acknowledged it). Whether the server read it, and the radar obeyed, shows by the data of the row.
+
+`Endless` is for radars that were started once and need nothing for a row. `native.py` holds the third backend.
 """
 
 from __future__ import annotations

@@ -92,6 +92,7 @@ REFUSALS = {  # API error codes, ICD 338-349, of the commands sent here
     1013: "data rate and clock edges do not go together",
     1023: "words per chirp outside 64..8192",
 }
+_Read = tuple[str, bool, Mapping[str, object]]
 
 
 @dataclass(frozen=True)
@@ -132,9 +133,6 @@ def decode_event(block: SubBlock) -> Event:
     except (struct.error, IndexError):
         return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}")
     return Event(block.id, name, detail, fatal, values)
-
-
-_Read = tuple[str, bool, Mapping[str, object]]
 
 
 def _plain(data: bytes) -> _Read:

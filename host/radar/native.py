@@ -18,12 +18,6 @@ from polysight.host.radar.usb import SCHEME, open_tcp, open_usb
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 
-
-def open_board(serial: str) -> WordLink:
-    """A board's word link by its USB serial number, or by `tcp://address:port`. Raises ConfigError, DeviceError."""
-    return open_tcp(serial) if serial.startswith(SCHEME) else open_usb(serial)
-
-
 _LOOK_S = 0.005
 _REOPEN_S = 5.0  # USB takes a moment to find a chip again
 _REOPEN_EVERY_S = 0.25
@@ -33,6 +27,11 @@ _TOLD = {
     State.DONE: RadarState.DONE,
     State.FAULT: RadarState.FAULT,
 }
+
+
+def open_board(serial: str) -> WordLink:
+    """A board's word link by its USB serial number, or by `tcp://address:port`. Raises ConfigError, DeviceError."""
+    return open_tcp(serial) if serial.startswith(SCHEME) else open_usb(serial)
 
 
 class _NoLink:

@@ -1,4 +1,4 @@
-"""What a board is told from power-up to its frames, from the rig file.
+"""What a board is told from power-up to its frames, and the parts in which a firmware image is downloaded.
 
 Order: ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. Not run on hardware yet.
 """
@@ -15,6 +15,9 @@ from polysight.shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instru
 
 TRIGGER_MARGIN_US = 200.0
 """From the end of a frame's period to the next pulse: 150 us at least, 300 us at most recommended (ICD 93)."""
+TO_RAM = 0  # place of a firmware image: lost at power-off
+TO_FLASH = 4  # the first of four places in the board's serial flash
+ERASE_TIMEOUT_S = 10.0  # the first part is acknowledged when the flash is erased
 
 
 @dataclass(frozen=True)
@@ -97,11 +100,6 @@ def program(rig: Instrument, board: Board) -> Program:
     for command in (*made.basic, *made.waveform):
         command.block()  # refuses here what fits no field
     return made
-
-
-TO_RAM = 0  # lost at power-off
-TO_FLASH = 4  # the first of four places in the board's serial flash
-ERASE_TIMEOUT_S = 10.0  # the first part is acknowledged when the flash is erased
 
 
 def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:

@@ -1,5 +1,7 @@
-"""Opens the four channels of a DCA1000's FT4232H by its serial number, with pyftdi (the host's extra `radar`).
+"""Word links to a board: the DCA1000's FT4232H over USB, or its four channels over TCP.
 
+`UsbWords` turns words, interrupt, reset and sense lines into MPSSE commands on the chip's four channels. `open_usb`
+opens them by serial number with pyftdi (the extra `radar`); `open_tcp` reaches channels that another program serves.
 Not run on hardware yet.
 """
 
@@ -13,6 +15,18 @@ from typing import Any, Protocol
 
 from polysight.shared.errors import ConfigError, DeviceError
 
+# The FT4232H over USB.
+VENDOR, PRODUCT = 0x0451, 0xFD03
+_READ_S = 0.5
+_LATENCY_MS = 1
+_CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists what is there"
+
+# A board whose channels are served over TCP.
+SCHEME = "tcp://"
+_HEAD = struct.Struct("<ccH")
+_TIMEOUT_S = 30.0
+
+# Pins and MPSSE commands.
 SPI_DIRECTION = 0b0100_1011  # clock, data out, chip select, PMIC reset are outputs
 SELECTED_WRITE, SELECTED_READ, IDLE = 0xC0, 0xC2, 0xC8
 INTERRUPT_DIRECTION = 0b0101_1011  # bit 5, the interrupt, is an input
@@ -113,12 +127,6 @@ def _exactly(port: Port, size: int) -> bytes:
     return data
 
 
-VENDOR, PRODUCT = 0x0451, 0xFD03
-_READ_S = 0.5
-_LATENCY_MS = 1
-_CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists what is there"
-
-
 class FtdiPort:
     """One channel, in MPSSE or bit-bang mode. Errors of the USB library become DeviceError."""
 
@@ -211,11 +219,6 @@ def _library() -> tuple[Any, tuple[type[Exception], ...]]:
             "pip install 'polysight[radar]' (in this repository: .venv/bin/pip install -e '.[radar]')",
         ) from None
     return Ftdi, (OSError, ValueError, UsbToolsError)  # FtdiError and USBError are OSErrors
-
-
-SCHEME = "tcp://"
-_HEAD = struct.Struct("<ccH")
-_TIMEOUT_S = 30.0
 
 
 class _TcpPort:

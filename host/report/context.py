@@ -1,4 +1,7 @@
-"""What a report is made of: plain arrays and dicts, so that the report knows nothing of how they came about."""
+"""What a report is made of, as plain arrays and dicts: the report knows nothing of how they came about.
+
+`context_of` fills it from what was found in a scan.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +111,7 @@ def context_of(
     provenance: dict[str, Any] | None = None,
     notes: Sequence[str] = (),
 ) -> ReportContext:
-    """Everything a report shows of a :class:`polysight.host.materials.MaterialsResult`; the rest is passed on as it is."""
+    """Everything a report shows of a :class:`polysight.host.materials.MaterialsResult`; the rest is passed on."""
     return ReportContext(
         title=title,
         simulated=simulated,

@@ -1,4 +1,8 @@
-"""HDF5: arrays with their axes as dimension scales, units on everything, the rest as attributes."""
+"""Saved products as files for other programs: HDF5, MATLAB, PNG and CSV (`polysight export`).
+
+HDF5: arrays with their axes as dimension scales, units on everything, the rest as attributes. MATLAB: the same arrays,
+structs for the rest. The table of materials has the same columns in all of them (`material_columns`).
+"""
 
 from __future__ import annotations
 
@@ -25,6 +29,14 @@ _COLUMNS = (
     "permittivity_loss", "permittivity_loss_standard_error", "p_real", "p_imag", "p_abs_db", "p_phase_deg",
     "inverse_p_standard_error", "true_name", "true_permittivity_real", "true_permittivity_loss",
 )  # fmt: skip
+CONVENTION = (
+    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
+    " column 0 the smallest x; rig frame; permittivity is real - j loss"
+)
+_UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
+_LONGEST_NAME = 63  # of a MATLAB struct's field
+FORMATS = ("hdf5", "mat", "png", "csv")
+_FOLDER = "export"
 
 
 def material_columns(products: SavedProducts) -> dict[str, list[Any]]:
@@ -84,13 +96,6 @@ def write_csv(path: Path, products: SavedProducts) -> None:
     write_atomically(path, text.getvalue().encode("utf-8"))
 
 
-CONVENTION = (
-    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
-    " column 0 the smallest x; rig frame; permittivity is real - j loss"
-)
-_UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
-
-
 def _h5py() -> Any:
     try:
         return import_module("h5py")
@@ -106,8 +111,8 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
     """Write a file of these products.
 
     /h, /v, /p complex64 [y, x], /valid bool [y, x]; /x, /y float64 in metres, the dimension scales of all four; group
-    /materials with a column for each of :func:`polysight.host.report.export.material_columns`; attributes scan_id, simulated,
-    convention, and as JSON instrument, versions, quality, materials.
+    /materials with a column for each of :func:`material_columns`; attributes scan_id, simulated, convention, and as
+    JSON instrument, versions, quality, materials.
 
     Raises
     ------
@@ -160,9 +165,6 @@ def _write_materials(h5py: Any, group: Any, columns: dict[str, list[Any]]) -> No
         unit = _UNITS.get(name.rpartition("_")[2])
         if unit or name.startswith(("permittivity", "true_permittivity", "p_", "inverse", "confidence")):
             group[name].attrs["units"] = unit or "1"
-
-
-_LONGEST_NAME = 63
 
 
 def write_mat(path: Path, products: SavedProducts) -> None:
@@ -238,10 +240,6 @@ def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
         paths.append(folder / f"{name}.png")
         write_atomically(paths[-1], data)
     return paths
-
-
-FORMATS = ("hdf5", "mat", "png", "csv")
-_FOLDER = "export"
 
 
 def export(folder: Path, formats: list[str], out: Path | None) -> int:

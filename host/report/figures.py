@@ -1,4 +1,4 @@
-"""Figures of a report: channel images and material maps as PNG.
+"""Figures of a report as PNG: channel images, material maps, permittivities, the overview, and a focus sweep.
 
 Amplitude in a perceptually uniform, colour-blind safe map (cividis), phase in a cyclic one (twilight), materials in the
 colour-blind safe palette of Paul Tol ("muted", then "light"). Axes are millimetres from the image centre. Matplotlib's
@@ -22,14 +22,13 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
 from polysight.host.report.context import ReportContext
-from polysight.host.report.tables import coverage_figure, masked_positions
+from polysight.host.report.tables import INK, MUTED, STAMP, coverage_figure, masked_positions
 
 PALETTE = (
     "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",
     "#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#99DDFF", "#44BB99", "#BBCC33", "#AAAA00",
 )  # fmt: skip
 UNKNOWN_COLOUR = "#BBBBBB"
-INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
 FIGURES: dict[str, str] = {
     "amplitude_h": "Amplitude H (s-polarised)",
     "amplitude_v": "Amplitude V (p-polarised)",
@@ -38,6 +37,7 @@ FIGURES: dict[str, str] = {
     "phase_v": "Phase V",
     "phase_p": "Phase of P = H / V",
 }
+_RANGE_DB = 30.0  # of the images of a focus sweep
 
 
 def colours_of(ctx: ReportContext) -> dict[str, str]:
@@ -337,9 +337,6 @@ def figures(ctx: ReportContext) -> dict[str, bytes]:
     if ctx.truth:
         out["truth"] = map_figure(ctx, draw_truth, "Truth")
     return out
-
-
-_RANGE_DB = 30.0
 
 
 def focus_figure(

@@ -1,4 +1,8 @@
-"""Numbers of a report: the headline figures and the quality tables, from the content of quality.json."""
+"""Numbers of a report, from the content of quality.json: headline figures, quality tables, and the map of positions.
+
+Tables are plain dicts (caption, head, rows) for the page's template. The map shows which stage positions of each board
+are masked.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,21 @@ from polysight.host.report.context import ReportContext
 from polysight.shared.raster import RasterPlan
 
 _COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: told apart without colour
-_INK, _MUTED, _STAMP = "#1b2330", "#5b6675", "#b3261e"
+INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
+"""Colours of a figure's text: titles, axes, and the word SIMULATED."""
+_ROWS: tuple[tuple[str, str], ...] = (
+    ("masked_positions", "Positions masked"),
+    ("rows_without_data", "Rows without any data"),
+    ("loss_db", "Loss of a point's sum by masked positions (dB)"),
+    ("frequencies", "Frequency samples after the range gate"),
+    ("point_width_mm", "Point response at half power, x × y (mm)"),
+    ("point_limit_mm", "Geometry's limit without taper, x × y (mm)"),
+    ("point_paper_mm", "The paper's r λ / L, x × y (mm)"),
+    ("point_sidelobe_db", "Strongest sidelobe, x, y (dB)"),
+)
+Table = dict[str, Any]
+_NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
+UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
 
 def masked_positions(ctx: ReportContext) -> dict[str, npt.NDArray[np.bool_]]:
@@ -59,38 +77,26 @@ def coverage_figure(ctx: ReportContext, masks: dict[str, npt.NDArray[np.bool_]])
             mask, origin="lower", extent=extent, cmap=ListedColormap(_COLOURS), vmin=0, vmax=1,
             interpolation="nearest", aspect="equal",
         )  # fmt: skip
-        ax.set_title(f"{name}: {mask.mean():.2%} masked", loc="left", fontsize=10, color=_INK, fontweight="bold")
-        ax.set_xlabel("stage offset x (mm)", fontsize=9, color=_MUTED)
-        ax.set_ylabel("stage offset y (mm)", fontsize=9, color=_MUTED)
-        ax.tick_params(labelsize=8, colors=_MUTED, length=3)
+        ax.set_title(f"{name}: {mask.mean():.2%} masked", loc="left", fontsize=10, color=INK, fontweight="bold")
+        ax.set_xlabel("stage offset x (mm)", fontsize=9, color=MUTED)
+        ax.set_ylabel("stage offset y (mm)", fontsize=9, color=MUTED)
+        ax.tick_params(labelsize=8, colors=MUTED, length=3)
         if ctx.simulated:
             ax.text(
-                1.0, 1.02, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color=_STAMP,
+                1.0, 1.02, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color=STAMP,
                 fontweight="bold",
             )  # fmt: skip
     return fig
 
 
-_ROWS: tuple[tuple[str, str], ...] = (
-    ("masked_positions", "Positions masked"),
-    ("rows_without_data", "Rows without any data"),
-    ("loss_db", "Loss of a point's sum by masked positions (dB)"),
-    ("frequencies", "Frequency samples after the range gate"),
-    ("point_width_mm", "Point response at half power, x × y (mm)"),
-    ("point_limit_mm", "Geometry's limit without taper, x × y (mm)"),
-    ("point_paper_mm", "The paper's r λ / L, x × y (mm)"),
-    ("point_sidelobe_db", "Strongest sidelobe, x, y (dB)"),
-)
-
-
-def imaging_table(imaging: Any) -> dict[str, Any] | None:
+def imaging_table(imaging: Any) -> Table | None:
     """Table of quality.json's `imaging`, a column for each board; None without it."""
     boards = {k: v for k, v in imaging.items() if isinstance(v, dict)} if isinstance(imaging, dict) else {}
     if not boards:
         return None
     rows = [
-        {"cells": [text, *(_number(board.get(key), _between(key)) for board in boards.values())], "share": None}
-        for key, text in _ROWS
+        _cells(heading, *(_number(board.get(key), _between(key)) for board in boards.values()))
+        for key, heading in _ROWS
         if any(key in board for board in boards.values())
     ]
     caption = "Imaging. The point response is computed for the middle of the image, with taper and mask as they are."
@@ -111,10 +117,6 @@ def _number(value: Any, between: str = " × ") -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-Table = dict[str, Any]
-_NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
-
-
 def text(value: Any) -> str:
     """A value as a person reads it: thousands grouped, few digits, yes and no, lists with commas."""
     if value is None:
@@ -133,9 +135,6 @@ def text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(text(v) for v in value) or "none"
     return str(value)
-
-
-UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
 
 def pretty(key: str) -> str:

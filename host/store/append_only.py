@@ -1,4 +1,7 @@
-"""A file that only grows, and whose end is known: what the manifest and the event log are made of."""
+"""A file that only grows, and whose end is known: what the manifest and the event log are made of.
+
+Also `sync_folder`, which makes names in a folder durable, and `crc32`, which is zlib-ng's where that is installed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,13 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from polysight.shared.errors import DeviceError
+
+try:
+    from zlib_ng.zlib_ng import crc32
+except ImportError:
+    from zlib import crc32
+
+__all__ = ["AppendFile", "crc32", "sync_folder"]
 
 
 class AppendFile:
@@ -111,11 +121,3 @@ def sync_folder(path: Path) -> None:
             "the disk is full or fails",
             f"free space below {path}, then go on",
         ) from None
-
-
-try:
-    from zlib_ng.zlib_ng import crc32
-except ImportError:
-    from zlib import crc32
-
-__all__ = ["crc32"]

@@ -1,4 +1,9 @@
-"""The scan folder: raw rows and the manifest that says which of them count (docs/spec/scan-folder.md)."""
+"""The scan folder: raw rows and the manifest that says which of them count (docs/spec/scan-folder.md).
+
+`ScanFolder` is a scan on disk, read; its `writer` opens it for appending. A scan is resumed with the rig file it was
+begun with. Only the connection may differ: `connection_of` and `reconnected` take addresses and limits from another rig
+file, and `check_same_scan` refuses one that differs in anything else.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +37,10 @@ ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
 
 SERIAL = ("port", "baud")
 """Of the stage: the Pi has its own. Calibration is not compared either: a scan keeps copies of its files."""
+FORMAT = 1
+MANIFEST = "manifest.jsonl"
+EVENTS = "events.msgpack"
+PART = ".part"  # suffix of a row that is being received
 
 
 def connection_of(rig: Instrument) -> dict[str, Any]:
@@ -89,12 +98,6 @@ def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
 
 def _told(value: Any) -> str:
     return "not given" if value is None else repr(value)
-
-
-FORMAT = 1
-MANIFEST = "manifest.jsonl"
-EVENTS = "events.msgpack"
-PART = ".part"  # suffix of a row that is being received
 
 
 class BoardRow(msgspec.Struct, frozen=True):

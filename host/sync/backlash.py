@@ -74,14 +74,8 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     window = np.pad(np.hanning(plan.columns + 2)[1:-1], (0, plan.columns))
 
     def spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
-        """Along x from the smallest, brought to the plan's positions; `shift_mm` is how far odd rows lie off.
-
-        The row goes there and back, so that no jump between its ends rings through it.
-        """
         direction = plan.row(r).direction
-        off = direction * travel + (shift_mm if r % 2 else 0.0)
-        there = rows[r][:, ::direction]
-        return np.fft.fft(np.concatenate([there, there[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * off)
+        return _spectrum(rows[r][:, ::direction], k, direction * travel + (shift_mm if r % 2 else 0.0))
 
     def sums(shift_mm: float) -> NDArray[np.float64]:
         """Slope times difference, slope squared, and power at all and at the highest k, of groups of rows."""
@@ -110,3 +104,11 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
         shift += float(np.clip(s[:, 0].sum() / s[:, 1].sum(), -plan.step_x_mm / 2, plan.step_x_mm / 2))
     std = float(np.sqrt((_GROUPS - 1) / _GROUPS * np.sum((without - without.mean()) ** 2)))
     return Backlash(shift, std) if std < plan.step_x_mm / 4 else None
+
+
+def _spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], off_mm: float) -> NDArray[np.complex128]:
+    """A row along x from the smallest, [rx, 2 position], brought back by `off_mm` to the plan's positions.
+
+    It goes there and back, so that no jump between its ends rings through it. `k` is in radians a millimetre.
+    """
+    return np.fft.fft(np.concatenate([row, row[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * off_mm)

@@ -34,8 +34,8 @@ class BoardSetup:
     ) -> BoardSetup:
         """The setup of a board of a rig.
 
-        `model` is the receiver's filter as `hpf.fit_high_pass` found it; None takes the corners that the chirp profile
-        programs. `compensate_filter=False` leaves the filter in.
+        `model` is the receiver's filter as `high_pass.fit_high_pass` found it; None takes the corners that the chirp
+        profile programs. `compensate_filter=False` leaves the filter in.
         """
         model = (model or hpf.high_pass(rig.chirp)) if compensate_filter else hpf.HighPass()
         equaliser = hpf.Equaliser.of(model, rig.chirp, FOLD) if model.corners_hz else None
@@ -63,7 +63,8 @@ class SyncedRow:
         where fewer than two were good; None: not known.
     turn
         float64 [position]: radians by which direct path and echoes together, weighed by power, turn from one position
-        to the next; burst alignment undoes it within a burst (`imaging.motion`). None: nothing was aligned.
+        to the next; burst alignment undoes it within a burst
+        (`imaging.reduce.undo_burst_motion`). None: nothing was aligned.
     errors
         Error samples of the row after each stage (`residuals.errors`), {stage: float64 [3, n]}.
     """

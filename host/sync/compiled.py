@@ -1,4 +1,4 @@
-"""The passes of `polysight.host.sync.numpy_passes`, compiled: a chirp is taken from the card's words into the cache and used there.
+"""The passes of `numpy_passes.py`, compiled: a chirp is taken from the card's words into the cache and used there.
 
 Each pass reads the words anew, which costs less than any copy of them in memory would, and all of a chirp even where
 only its linear samples are needed: memory is fetched ahead only where it is read in line. For four RX. Compiled at the
@@ -24,7 +24,7 @@ _roots = lru_cache(kernels.roots)
 
 
 def match(words, reference, linear):
-    """See `plain.match`."""
+    """See `numpy_passes.match`."""
     n = linear[1] - linear[0]
     c, s, order = _roots(search_size(n))
     frequency, amplitude, energy, peak = _offsets(words, reference, linear, c, s, order)
@@ -136,7 +136,7 @@ def _highest(power, smooth, width):
 
 
 def against_others(words, frequency, taps, good, linear):
-    """See `plain.against_others`."""
+    """See `numpy_passes.against_others`."""
     edges = block_edges((linear[1] - linear[0]) // FOLD)
     return _against_others(words, frequency, taps, good, linear, edges, block_times(edges) * FOLD)
 
@@ -186,11 +186,7 @@ def _against_others(words, frequency, taps, good, linear, edges, times):
                 j, h = slice(r * (blocks + 2), r * (blocks + 2) + blocks), r % 2 * 2
                 kernels.add_products(re[k, j], im[k, j], all_re[j], all_im[j], product[h], product[h + 1], product[4])
             for h in range(5):
-                for i in range(parts):
-                    total = np.float32(0)
-                    for m in range(edges[i], edges[i + 1]):
-                        total += product[h, m]
-                    part[h, i] = total
+                kernels.add_up(product[h], edges, part[h])
             own[p, k] = part[4].sum()
             for i in range(parts):
                 even[i], odd[i] = complex(part[0, i], part[1, i]), complex(part[2, i], part[3, i])
@@ -210,7 +206,7 @@ def _against_others(words, frequency, taps, good, linear, edges, times):
 
 @compiled
 def average(words, frequency, weights, second_half, linear):
-    """See `plain.average`."""
+    """See `numpy_passes.average`."""
     positions, chirps, samples, _, _ = words.shape
     a, b = linear
     full, blocks, count = -(-samples // FOLD), (b - a) // FOLD, weights.shape[2]

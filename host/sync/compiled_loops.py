@@ -1,4 +1,4 @@
-"""Small compiled loops of `polysight.host.sync.compiled`, over one chirp of four RX at a time, or one burst of sixteen chirps.
+"""Small compiled loops of `compiled.py`, over one chirp of four RX at a time, or one burst of sixteen chirps.
 
 What makes them fast: every loop runs over values that lie next to each other, so it becomes vector instructions. The
 card's integers are sorted into that order before they become numbers, since they are half as wide. Strides are
@@ -25,8 +25,10 @@ def _forget_stale() -> None:
     """Numba sees that the file of a cached function changed, but not the files of what was compiled into it."""
     here = Path(__file__).parent
     with suppress(OSError):  # an installation that cannot be written cannot be edited either
-        newest = max((here / f"{name}.py").stat().st_mtime for name in ("compiled", "kernels", "plain", "tone"))
-        for name in ("compiled", "kernels"):
+        newest = max(
+            (here / f"{name}.py").stat().st_mtime for name in ("compiled", "compiled_loops", "numpy_passes", "tone")
+        )
+        for name in ("compiled", "compiled_loops"):
             for index in (here / "__pycache__").glob(f"{name}.*.nbi"):
                 if index.stat().st_mtime < newest:
                     index.unlink(missing_ok=True)
@@ -276,7 +278,7 @@ def fold(signal, out):
 
 @compiled
 def extend(signal, s):
-    """Continue what lies inside by s values to either side, by the parabola through three; as `hpf.shifted` does."""
+    """Continue what lies inside by s values to either side, by the parabola through three, as `high_pass.shifted`."""
     n = signal.size
     for j in range(s):
         signal[j] = 3 * (signal[s + j] - signal[2 * s + j]) + signal[3 * s + j]
@@ -306,6 +308,16 @@ def add_products(x, y, u, v, re, im, energy):
         re[m] += x[m] * u[m] + y[m] * v[m]
         im[m] += y[m] * u[m] - x[m] * v[m]
         energy[m] += x[m] * x[m] + y[m] * y[m]
+
+
+@compiled
+def add_up(values, edges, part):
+    """Sums of float32 values between neighbouring edges, into part."""
+    for i in range(part.size):
+        total = np.float32(0)
+        for m in range(edges[i], edges[i + 1]):
+            total += values[m]
+        part[i] = total
 
 
 @compiled

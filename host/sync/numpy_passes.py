@@ -1,4 +1,4 @@
-"""The three passes over a burst's raw samples, in NumPy: what `polysight.host.sync.compiled` does, plainly and more slowly.
+"""The three passes over a burst's raw samples, in NumPy: what `compiled.py` does, plainly and more slowly.
 
 Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing is by `exp(-j 2 pi f (n -
 centre))`, with f in cycles a sample and `centre` the middle of the linear samples.
@@ -88,7 +88,7 @@ def against_others(
     frequency
         float64 [position, chirp].
     taps
-        complex64 [position, chirp, tap]: one or three, one averaged sample apart (`hpf.Equaliser`).
+        complex64 [position, chirp, tap]: one or three, one averaged sample apart (`high_pass.Equaliser`).
     good
         bool [position, chirp]: chirps of the sum.
     linear

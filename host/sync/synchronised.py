@@ -102,28 +102,16 @@ def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Boa
     (a, b), sweep = chirp.linear_samples, chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
     direct_m = np.linalg.norm(rx - tx, axis=1)
-    gate_m = _gate_m(rig, board, tx, rx)
-    gate = _gate_echoes(sweep[a:b], gate_m)
-
-    # The sign and the zero of the delays: whichever puts the most power where the object must be.
+    gate = _gate_echoes(sweep[a:b], _gate_m(rig, board, tx, rx))
     absolute = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
-    readings = list(product((False, True), (np.ones_like(absolute), absolute)))
-    power = []
-    for conjugate, turn in readings:
-        part = ((cube.conj() if conjugate else cube) * turn[:, None])[..., a:b]
-        power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
-    best = 0 if power[0] >= _AS_LEFT * max(power) else int(np.argmax(power))
-    conjugate, turn = readings[best]
-    said = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * (best % 2)
+    conjugate, counted_from_tx = _reading(cube, absolute, gate, (a, b))
+    turn = absolute if counted_from_tx else np.ones_like(absolute)
+    said = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * counted_from_tx
     cube = (cube.conj() if conjugate else cube) * turn[:, None]
 
-    # The direct path: its estimate that does not hear the object (generalised least squares).
-    covariance = gate.T @ gate.conj() / len(gate) + _NOISE * np.eye(b - a)
-    weights = scipy.linalg.solve(covariance, np.ones(b - a), assume_a="pos").conj()
-    heard = cube[..., a:b] @ (weights / weights.sum())  # [rx, position]
-    mean = heard.mean(axis=1)
     constant, path = np.zeros(len(rx)), None
-    if float(np.mean(np.abs(mean) ** 2 / np.mean(np.abs(heard) ** 2, axis=1))) > _COHERENT:
+    mean, coherent = _direct_path(cube[..., a:b], gate)
+    if coherent > _COHERENT:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
         phasors = mean / np.abs(mean)
         if abs((phasors * lag[:, (a + b) // 2].conj()).sum()) > abs(phasors.sum()):
@@ -141,14 +129,44 @@ def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Boa
             level = np.sqrt(np.mean(np.abs(cube) ** 2))
             constant = level * direct_m[0] / direct_m
             said.append("the direct path was taken out; the RX are taken to be alike")
-    return CubeForm(
-        bool(conjugate),
-        turn.astype(np.complex64),
-        constant.astype(np.complex64),
-        path,
-        chirp,
-        "; ".join(said) + "; the receiver's filter is left as it is",
-    )
+    how = "; ".join(said) + "; the receiver's filter is left as it is"
+    return CubeForm(conjugate, turn.astype(np.complex64), constant.astype(np.complex64), path, chirp, how)
+
+
+def _reading(
+    cube: NDArray[np.complexfloating],
+    absolute: NDArray[np.complex128],
+    gate: NDArray[np.complex128],
+    linear: tuple[int, int],
+) -> tuple[bool, bool]:
+    """Whether a cube is conjugated, and whether its delays count from the transmitter.
+
+    `absolute` [rx, sample] takes the direct path's delay out, `gate` [path, sample] are echoes from the object. The
+    reading is taken that puts the most power where the object must be; the simplest one in doubt.
+    """
+    a, b = linear
+    readings = list(product((False, True), (False, True)))
+    power = []
+    for conjugate, counted_from_tx in readings:
+        turn = absolute if counted_from_tx else np.ones_like(absolute)
+        part = ((cube.conj() if conjugate else cube) * turn[:, None])[..., a:b]
+        power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
+    return readings[0 if power[0] >= _AS_LEFT * max(power) else int(np.argmax(power))]
+
+
+def _direct_path(
+    part: NDArray[np.complexfloating], gate: NDArray[np.complex128]
+) -> tuple[NDArray[np.complexfloating], float]:
+    """The direct path's mean over positions, [rx], in samples [rx, position, sample]; and its share of power.
+
+    By the estimate that does not hear the object (generalised least squares).
+    """
+    samples = part.shape[-1]
+    covariance = gate.T @ gate.conj() / len(gate) + _NOISE * np.eye(samples)
+    weights = scipy.linalg.solve(covariance, np.ones(samples), assume_a="pos").conj()
+    heard = part @ (weights / weights.sum())  # [rx, position]
+    mean = heard.mean(axis=1)
+    return mean, float(np.mean(np.abs(mean) ** 2 / np.mean(np.abs(heard) ** 2, axis=1)))
 
 
 def _gate_m(rig: Instrument, board: Board, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[float, float]:

@@ -1,11 +1,15 @@
-"""Fig. 18 (solids under one and two angles, liquids, powders, with confusion matrices) and Fig. 20 (channels)."""
+"""Fig. 18 (solids under one and two angles, liquids, powders, with confusion matrices) and Fig. 20 (channels).
+
+Pixels are drawn with the errors of `patches.py`. `pixel_bound` is the share that no classifier can pass.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import cache
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +30,8 @@ CHOICE, RESULT = 17, 20
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
 OTHER_DRAWS = tuple(range(21, 29))
 """Seeds of more draws, for how much chance there is in one."""
+Panel = tuple[Score, npt.NDArray[np.float64], str]
+TRIALS = 4000  # draws behind a bound
 
 
 def _draws(quick: bool) -> int:
@@ -132,42 +138,72 @@ def unknowns(quick: bool) -> Table:
     return Table("Patches called unknown; 1 % of the known ones are meant to be", head, tuple(rows))
 
 
-def fig18(run: Run) -> Item:
-    """Accuracy of the paper's KNN and of the better model under both splits, with confusion matrices."""
-    told, rows, data, pictures = published()["classification"], [], {}, {}
-    for task in TASKS:
-        name, _, two = task.partition(", ")
-        paper = told[name]["two_angles_percent" if two else "all_percent"] / 100
-        best, choice = better_model(task, run.quick)
-        knn, knn_pixel, held, mixed = (
-            judged(task, m, "H+V+P", p, run.quick) for m in (PAPER, best) for p in (False, True)
-        )
-        h_only = judged(task, PAPER, "H", True, run.quick).pixels
-        h_told = None if two else told[name]["h_percent"] / 100
-        rows.append((
-            f"{len(knn.names)} {task}", percent(h_told), percent(h_only), percent(paper), percent(knn_pixel.pixels),
-            percent(knn.pixels), best, percent(mixed.pixels), percent(held.pixels), percent(held.in_scan),
-            percent(held.by_patch),
-        ))  # fmt: skip
-        data[task] = {
-            "published_percent": 100 * paper,
-            "simulated": [asdict(s) for s in (knn_pixel, knn, mixed, held)],
-            "h_only_pixel_split": h_only,
-            "choice_of_model": choice,
-            "errors": asdict(calibrated_errors(name, _draws(run.quick))),
+@dataclass(frozen=True)
+class TaskScores:
+    """Scores of one task of Fig. 18: the paper's KNN and the better model, scans left out and by pixel."""
+
+    task: str
+    knn: Score
+    knn_pixel: Score
+    better: Score
+    better_pixel: Score
+    h: Score  # the KNN on |H| alone, scans left out
+    h_pixel: Score
+
+    @staticmethod
+    def of(task: str, quick: bool) -> TaskScores:
+        """Judge both models on a task."""
+        best = better_model(task, quick)[0]
+        knn, knn_pixel = (judged(task, PAPER, "H+V+P", by_pixel, quick) for by_pixel in (False, True))
+        better, better_pixel = (judged(task, best, "H+V+P", by_pixel, quick) for by_pixel in (False, True))
+        h, h_pixel = (judged(task, PAPER, "H", by_pixel, quick) for by_pixel in (False, True))
+        return TaskScores(task, knn, knn_pixel, better, better_pixel, h, h_pixel)
+
+    def row(self) -> tuple[str, ...]:
+        """A line of the table, published shares beside simulated ones."""
+        name, _, two = self.task.partition(", ")
+        told = published()["classification"][name]
+        return (
+            f"{len(self.knn.names)} {self.task}", percent(None if two else told["h_percent"] / 100),
+            percent(self.h_pixel.pixels), percent(_published_percent(self.task) / 100), percent(self.knn_pixel.pixels),
+            percent(self.knn.pixels), self.better.model, percent(self.better_pixel.pixels),
+            percent(self.better.pixels), percent(self.better.in_scan), percent(self.better.by_patch),
+        )  # fmt: skip
+
+    def plain(self, quick: bool) -> dict[str, Any]:
+        """The same for the JSON file."""
+        return {
+            "published_percent": _published_percent(self.task),
+            "simulated": [asdict(s) for s in (self.knn_pixel, self.knn, self.better_pixel, self.better)],
+            "h_only_pixel_split": self.h_pixel.pixels,
+            "choice_of_model": better_model(self.task, quick)[1],
+            "errors": asdict(calibrated_errors(self.task.partition(", ")[0], _draws(quick))),
         }
-        h = judged(task, PAPER, "H", False, run.quick)
+
+    def picture(self) -> Picture:
+        """Confusion matrices of H alone, of the better model by pixel, and by patch."""
+        task, h, better = self.task, self.h, self.better
         panels = (
             (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
-            (held, held.confusion, f"H, V and P, pixels alone: {percent(held.pixels)}\n{best}"),
-            (held, held.patch_confusion, f"H, V and P, by patch: {percent(held.by_patch)}\n{best}"),
+            (better, better.confusion, f"H, V and P, pixels alone: {percent(better.pixels)}\n{better.model}"),
+            (better, better.patch_confusion, f"H, V and P, by patch: {percent(better.by_patch)}\n{better.model}"),
         )
         angle = " and ".join(f"{a:.0f}°" for a in _angles(task))
-        pictures[task.replace(", ", "-").replace(" ", "-")] = Picture(
-            confusion_figure(groups()[name].materials, panels),
+        return Picture(
+            confusion_figure(groups()[task.partition(", ")[0]].materials, panels),
             f"{task[0].upper()}{task[1:]} at {angle}, whole scans left out. Rows are the truth and add up to 100 %; the"
             " numbers are those of Table 2.",
         )
+
+
+def _published_percent(task: str) -> float:
+    name, _, two = task.partition(", ")
+    return published()["classification"][name]["two_angles_percent" if two else "all_percent"]
+
+
+def fig18(run: Run) -> Item:
+    """Accuracy of the paper's KNN and of the better model under both splits, with confusion matrices."""
+    scores = [TaskScores.of(task, run.quick) for task in TASKS]
     head = (
         "Task", "H, published", "H, simulated", "H+V+P, published", "KNN, by pixel (optimistic)", "KNN, scans left out",
         "better model", "better, by pixel (optimistic)", "better, scans left out: pixel alone",
@@ -190,13 +226,13 @@ def fig18(run: Run) -> Item:
             "Nine liquids where the paper counts eight: Table 2 lists nine, and which one it left out is not said.",
         ),
         (
-            Table("Share of pixels named right, mean over materials", head, tuple(rows)),
+            Table("Share of pixels named right, mean over materials", head, tuple(s.row() for s in scores)),
             chance(run.quick),
             unknowns(run.quick),
             sensitivity(),
         ),
-        pictures,
-        data,
+        {s.task.replace(", ", "-").replace(" ", "-"): s.picture() for s in scores},
+        {s.task: s.plain(run.quick) for s in scores},
     )
 
 
@@ -250,9 +286,6 @@ def fig20(run: Run) -> Item:
     )
 
 
-Panel = tuple[Score, npt.NDArray[np.float64], str]
-
-
 def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) -> Figure:
     """One panel for each score and matrix, with its title."""
     n = len(materials)
@@ -298,9 +331,6 @@ def _confused(panels: Sequence[Panel], shown: int = 5) -> str:
                 lines.append(f"   {found.names[i]} named {found.names[j]}: {100 * apart[i, j]:.0f} %")
         lines += [""] if apart.any() else ["   none", ""]
     return "\n".join(lines)
-
-
-TRIALS = 4000
 
 
 @cache

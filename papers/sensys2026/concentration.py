@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from polysight.host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
+from polysight.host.materials import Library
+from polysight.host.materials.concentration import (
+    ConcentrationResult,
+    concentrations,
+    fit_concentration,
+    polarisation_angle_rad,
+)
 from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.report.figures import INK, PALETTE
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
@@ -25,42 +33,11 @@ def fig21(run: Run) -> Item:
     result = fit_concentration(library, {WATER: 0.0})
     told = published()["sugar_median_error_percent"]
     value = concentrations(library.names, {WATER: 0.0})
-    x = np.array([np.degrees(np.median(polarisation_angle_rad(e.p))) for e in library.entries])
-    y = np.array([value[e.name] for e in library.entries])
-    error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
-
     fig = new_figure(11.5, 4.2)
     left, centre, right = fig.subplots(1, 3)
-    eps = np.array([
-        np.median(permittivity_from_ratio(e.p.astype(np.complex128), np.radians(e.incidence_deg)).real)
-        for e in library.entries
-    ])  # fmt: skip
-    centre.plot(y, eps, "o", ms=4, color=PALETTE[0], label="patches, simulated")
-    told_eps = [(value[m.name], m.permittivity.real) for m in materials]
-    centre.plot(*zip(*sorted(told_eps), strict=True), "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
-    dress(centre, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
-    centre.legend(fontsize=8, frameon=False)
-    left.plot(x, y, "o", ms=4, color=PALETTE[0], label="patches")
-    at = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
-    low, high = result.line.interval(np.radians(at))
-    left.plot(at, result.line.percent(np.radians(at)), color=INK, lw=1.4, label="line")
-    left.fill_between(at, low, high, color=PALETTE[1], alpha=0.35, lw=0, label="90 % of new patches")
-    dress(left, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)")
-    left.legend(fontsize=8, frameon=False)
-    right.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
-    right.axvline(told, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {told:g} %")
-    right.axvline(result.median_error, color=INK, ls=":", lw=1.2, label=f"simulated median {result.median_error:.3f} %")
-    dress(right, "Error, each concentration left out", "error (% by weight)", "share of patches")
-    right.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
-
-    rows = []
-    for name in sorted(value, key=lambda n: value[n]):
-        of = [r for r in result.left_out if r.name == name]
-        spread = np.median([abs(r.percent - r.true_percent) for r in of])
-        rows.append((
-            name, f"{value[name]:.1f} %", f"{np.mean([r.percent for r in of]):.2f} %",
-            f"{np.mean([r.low for r in of]):.2f} … {np.mean([r.high for r in of]):.2f} %", f"{spread:.2f} %",
-        ))  # fmt: skip
+    _draw_line(left, library, value, result)
+    _draw_permittivity(centre, library, value, {value[m.name]: m.permittivity.real for m in materials})
+    _draw_errors(right, result, told)
     return Item(
         "fig21",
         "Fig. 21: concentration of sugar in water",
@@ -75,7 +52,7 @@ def fig21(run: Run) -> Item:
             Table(
                 "Each concentration as told by the others, mean over eight scans",
                 ("Solution", "true", "simulated", "90 % interval", "median error"),
-                tuple(rows),
+                _rows(value, result),
             ),
         ),
         {
@@ -92,3 +69,53 @@ def fig21(run: Run) -> Item:
             "left_out": [asdict(r) for r in result.left_out],
         },
     )
+
+
+def _draw_line(ax: Axes, library: Library, value: Mapping[str, float], result: ConcentrationResult) -> None:
+    """The calibration line with its interval, and the patches."""
+    x = np.array([np.degrees(np.median(polarisation_angle_rad(e.p))) for e in library.entries])
+    ax.plot(x, [value[e.name] for e in library.entries], "o", ms=4, color=PALETTE[0], label="patches")
+    at = np.linspace(x.min() - 0.1, x.max() + 0.1, 100)
+    low, high = result.line.interval(np.radians(at))
+    ax.plot(at, result.line.percent(np.radians(at)), color=INK, lw=1.4, label="line")
+    ax.fill_between(at, low, high, color=PALETTE[1], alpha=0.35, lw=0, label="90 % of new patches")
+    dress(ax, "Concentration by polarisation angle", "polarisation angle arctan |P| (degrees)", "sugar (% by weight)")
+    ax.legend(fontsize=8, frameon=False)
+
+
+def _draw_permittivity(
+    ax: Axes, library: Library, value: Mapping[str, float], published_eps: Mapping[float, float]
+) -> None:
+    """Real part by Eq. 3 against concentration, beside the published one (by concentration)."""
+    eps = [
+        np.median(permittivity_from_ratio(e.p.astype(np.complex128), np.radians(e.incidence_deg)).real)
+        for e in library.entries
+    ]
+    ax.plot([value[e.name] for e in library.entries], eps, "o", ms=4, color=PALETTE[0], label="patches, simulated")
+    told = zip(*sorted(published_eps.items()), strict=True)
+    ax.plot(*told, "x-", color=PALETTE[6], ms=7, lw=1.0, label="published, Table 2")
+    dress(ax, "Apparent permittivity", "sugar (% by weight)", "real part ε′")
+    ax.legend(fontsize=8, frameon=False)
+
+
+def _draw_errors(ax: Axes, result: ConcentrationResult, told: float) -> None:
+    """Distribution of the errors, each concentration left out, and the published median (`told`, percent)."""
+    error = np.sort([abs(r.percent - r.true_percent) for r in result.left_out])
+    ax.step(np.concatenate([[0], error]), np.arange(error.size + 1) / error.size, where="post", color=PALETTE[0])
+    ax.axvline(told, color=PALETTE[6], ls="--", lw=1.2, label=f"published median {told:g} %")
+    ax.axvline(result.median_error, color=INK, ls=":", lw=1.2, label=f"simulated median {result.median_error:.3f} %")
+    dress(ax, "Error, each concentration left out", "error (% by weight)", "share of patches")
+    ax.legend(fontsize=8, facecolor="white", framealpha=1.0, edgecolor="none", loc="lower right")
+
+
+def _rows(value: Mapping[str, float], result: ConcentrationResult) -> tuple[tuple[str, ...], ...]:
+    """A line for each solution, by concentration."""
+    rows = []
+    for name in sorted(value, key=lambda n: value[n]):
+        of = [r for r in result.left_out if r.name == name]
+        spread = np.median([abs(r.percent - r.true_percent) for r in of])
+        rows.append((
+            name, f"{value[name]:.1f} %", f"{np.mean([r.percent for r in of]):.2f} %",
+            f"{np.mean([r.low for r in of]):.2f} … {np.mean([r.high for r in of]):.2f} %", f"{spread:.2f} %",
+        ))  # fmt: skip
+    return tuple(rows)

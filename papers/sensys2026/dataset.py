@@ -1,6 +1,7 @@
 """The published data set as libraries: its `materials/`, its `labels/`, and images made here from its raw data.
 
-Each source is judged on its own. Materials carry the names of Table 2's rows, where their own names mean one.
+Each source is judged on its own. Materials carry the names of Table 2's rows, where their own names mean one
+(`row_of`). `train_authors` makes one library of the first two for `polysight train`.
 """
 
 from __future__ import annotations
@@ -38,6 +39,15 @@ SAME_ANGLE_DEG = 2.5
 """The paper's angles, 55 and 60 degrees, are further apart; a scan's own differs from them by less."""
 MATERIALS, LABELS, IMAGES = "materials/", "labels/", "images made here"
 _ALIKE = 0.35  # correlation of two images of one scan, at least
+
+# Names of materials.
+_FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
+_ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
+_CONTAINERS = {"glass", "plastic"}
+_ENOUGH = 0.5  # of the words in common
+
+PIXELS = 16
+"""Of a patch, at even intervals: as in a library that is trained here."""
 
 
 @dataclass(frozen=True)
@@ -215,12 +225,6 @@ def _named(
     return dict(sorted(meaning.items())), sources
 
 
-_FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
-_ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
-_CONTAINERS = {"glass", "plastic"}
-_ENOUGH = 0.5
-
-
 def words(name: str) -> frozenset[str]:
     """Words and numbers of a name, lower case; a metal's name is "metal"."""
     text = re.sub(r"\\?\bw/?\s", " with ", name.lower().replace("_", " "))
@@ -276,10 +280,6 @@ def rows_of(
     """Rows of names with their thicknesses; those that mean none are left out."""
     found = {(n, t): (given or {}).get(n) or row_of(n, t) for n, t in set(names)}
     return {key: number for key, number in found.items() if number is not None}
-
-
-PIXELS = 16
-"""Of a patch, at even intervals: as in a library that is trained here."""
 
 
 def train_authors(folder: Path, config: Path, out: Path) -> int:

@@ -1,16 +1,22 @@
-"""`polysight reproduce --authors`: Table 2, Fig. 18, 20 and 21 from the published files, beside the paper's values."""
+"""`polysight reproduce --authors`: Table 2, Fig. 18, 20 and 21 from the published files, beside the paper's values.
+
+The page and the terminal's tables are made here, and Table 2 by three recipes, the authors' among them; the figures are
+in `dataset_figures.py`.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 
-from polysight.host.materials import estimate_permittivity
+from polysight.host.materials import Permittivity, estimate_permittivity
 from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.report.figures import INK, PALETTE
 from polysight.papers.sensys2026.dataset import IMAGES, AuthorsData, read_authors
@@ -21,12 +27,21 @@ from polysight.papers.sensys2026.run import Origin, write_item, write_page
 from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.errors import ConfigError, DataError, PolysightError
 
+Complex = npt.NDArray[np.complexfloating]
+HEAD = (
+    "No.", "Material", "angle", "scans", "pixels", "published ε′", "published ε″", "Eq. 3 ε′", "Eq. 3 ε″",
+    "without leakage ε′", "without leakage ε″", "±", "authors' recipe ε′", "authors' recipe ε″",
+)  # fmt: skip
+"""Of Table 2."""
+
 MAKERS: dict[str, Callable[[Judgements], Item]] = {
     "table2": lambda judge: authors_table2(judge.data),
     "fig18": authors_fig18,
     "fig20": authors_fig20,
     "fig21": lambda judge: authors_fig21(judge.data),
 }
+AXIAL_RATIO, METAL_FACTOR, PERCENTILES = 0.05, 1 / 0.8, (30, 70)
+"""What the authors apply before Eq. 3: leakage, a factor on |P| relative to metal, and the pixels by |P| they keep."""
 
 
 def reproduce_authors(
@@ -60,13 +75,7 @@ def reproduce_authors(
     DataError
         when nothing in the folder can be used.
     """
-    for key in keys:
-        if key not in MAKERS:
-            raise ConfigError(
-                f"item {key!r} cannot be made from the published files",
-                "they hold pixels of materials, nothing else of the paper",
-                f"give some of: {' '.join(MAKERS)}; without --authors the others are made from simulation",
-            )
+    _check_keys(keys)
     data = read_authors(folder, config, images, names)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -91,6 +100,17 @@ def reproduce_authors(
     page = write_page(out, items, pictures, failed, False, origin, MAKERS)
     sys.stdout.write(f"{page}: {len(items)} items from {origin.word} beside the published values\n")
     return 1 if failed else 0
+
+
+def _check_keys(keys: Sequence[str]) -> None:
+    """Refuse what cannot be made from the published files. Raises ConfigError."""
+    for key in keys:
+        if key not in MAKERS:
+            raise ConfigError(
+                f"item {key!r} cannot be made from the published files",
+                "they hold pixels of materials, nothing else of the paper",
+                f"give some of: {' '.join(MAKERS)}; without --authors the others are made from simulation",
+            )
 
 
 def origin_of(data: AuthorsData) -> Origin:
@@ -146,11 +166,6 @@ def _wrapped(text: str, width: int) -> list[str]:
     return out
 
 
-AXIAL_RATIO, METAL_FACTOR, PERCENTILES = 0.05, 1 / 0.8, (30, 70)
-"""What the authors apply before Eq. 3: leakage, a factor on |P| relative to metal, and the pixels by |P| they keep."""
-Complex = npt.NDArray[np.complexfloating]
-
-
 def without_leakage(p: Complex, axial_ratio: float) -> Complex:
     """Ratios P = (t + a) / (1 + a t) without the leakage a of both channels: t (metal stays 1)."""
     return (p - axial_ratio) / (1 - axial_ratio * p)
@@ -179,6 +194,24 @@ def _seen(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float,
     return p[np.isfinite(p) & (p != 0)], angle, len({e.scan for e in entries})
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """A material's permittivity from one source: by Eq. 3 as it is, without leakage, and by the authors' recipe."""
+
+    material: Published
+    angle_deg: float
+    scans: int
+    pixels: int
+    as_is: Permittivity
+    clean: Permittivity
+    recipe: complex
+
+    @property
+    def metal_like(self) -> bool:
+        """Whether there is no permittivity to speak of."""
+        return self.material.number == 1 or self.clean.value is None or self.clean.real_std is None
+
+
 def authors_table2(data: AuthorsData) -> Item:
     """Each source's permittivities by Eq. 3 as it is, without leakage, and by the authors' recipe.
 
@@ -187,69 +220,80 @@ def authors_table2(data: AuthorsData) -> Item:
     DataError
         when no material of the table is in the data.
     """
-    a = float(np.mean([data.base.polarimetry.leakage_h[0], data.base.polarimetry.leakage_v[0]]))
-    tables, rows_data = [], []
-    fig = new_figure(10.5, 4.6)
-    axes = fig.subplots(1, 2)
-    for colour, source in zip((PALETTE[0], PALETTE[6], PALETTE[3]), data.sources, strict=False):
-        rows, found = [], []
-        for m in table2():
-            seen = _seen(data, source, m)
-            if seen is None or not seen[0].size:
-                continue
-            p, angle, scans = seen
-            one = np.ones(p.size, np.complex128)
-            left = 0.0 if source == IMAGES else a
-            as_is, clean = (estimate_permittivity(x, one, np.radians(angle)) for x in (p, without_leakage(p, left)))
-            recipe = authors_recipe(p, angle)
-            metal = m.number == 1 or clean.value is None or clean.real_std is None
-            told = (f"{m.permittivity.real:.4g}", "–" if m.number == 23 else f"{-m.permittivity.imag:.4g}")
-            own = [_cells(e.value) for e in (as_is, clean)]
-            spread = "" if clean.real_std is None or metal else f"± {clean.real_std:.2f}"
-            rows.append((
-                str(m.number), m.name, f"{angle:.0f}°", str(scans), str(p.size), *told, *own[0], *own[1], spread,
-                *(("metal-like", "") if metal else _cells(recipe)),
-            ))  # fmt: skip
-            rows_data.append({
-                "source": source, "number": m.number, "name": m.name, "angle_deg": angle, "scans": scans,
-                "pixels": int(p.size), "published": m.permittivity, "as_is": as_is.value,
-                "without_leakage": clean.value, "std": clean.real_std, "authors_recipe": recipe,
-                "metal_like": metal, "ratio": clean.ratio,
-            })  # fmt: skip
-            if not metal and clean.value is not None:
-                found.append((m.permittivity, clean.value, clean.real_std or 0.0))
-        head = (
-            "No.", "Material", "angle", "scans", "pixels", "published ε′", "published ε″", "Eq. 3 ε′", "Eq. 3 ε″",
-            "without leakage ε′", "without leakage ε″", "±", "authors' recipe ε′", "authors' recipe ε″",
-        )  # fmt: skip
-        tables.append(Table(f"Permittivity from {source}", head, tuple(rows)))
-        bars: dict[str, Any] = {"fmt": "o", "ms": 4, "color": colour, "lw": 1, "label": source}
-        std = [f[2] for f in found]
-        axes[0].errorbar([f[0].real for f in found], [f[1].real for f in found], yerr=std, **bars)
-        axes[1].errorbar([-f[0].imag for f in found], [-f[1].imag for f in found], yerr=std, **bars)
-    if not rows_data:
+    leakage = float(np.mean([data.base.polarimetry.leakage_h[0], data.base.polarimetry.leakage_v[0]]))
+    estimates = {source: _estimates(data, source, 0.0 if source == IMAGES else leakage) for source in data.sources}
+    if not any(estimates.values()):
         raise DataError("no material of Table 2 is in the data", "see what its names were taken for")
-    for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
-        dress(ax, part, f"published {part}", f"{part} without leakage")
-        ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")
-        ax.legend(fontsize=8, frameon=False)
     return Item(
         "table2",
         "Table 2: permittivity of 36 materials",
         (
             "Three ways from the same pixels. “Eq. 3”: the median of V/H relative to metal, as it is in the files."
-            f" “Without leakage”: the rig file's cross-polar amplitude, {a:g}, is taken out first; images made here"
-            f" have it out already. “Authors' recipe”: leakage {AXIAL_RATIO:g}, |P| times {METAL_FACTOR:g}, the pixels"
-            f" between the {PERCENTILES[0]}th and the {PERCENTILES[1]}th percentile of |P|, mean of Eq. 3 over them."
+            f" “Without leakage”: the rig file's cross-polar amplitude, {leakage:g}, is taken out first; images made"
+            f" here have it out already. “Authors' recipe”: leakage {AXIAL_RATIO:g}, |P| times {METAL_FACTOR:g}, the"
+            f" pixels between the {PERCENTILES[0]}th and the {PERCENTILES[1]}th percentile of |P|, mean of Eq. 3 over"
+            " them."
             " ± is the standard error of one patch.",
             "The recipe's factor makes up for something in the published measurements that is not explained; on data"
             " without it, simulated data for one, the recipe is off by it.",
         ),
-        tuple(tables),
-        {"permittivity": Picture(fig, "From the files against published; the dotted line is equality.")},
-        {"materials": rows_data},
+        tuple(Table(f"Permittivity from {source}", HEAD, tuple(map(_row, e))) for source, e in estimates.items()),
+        {"permittivity": Picture(_figure(estimates), "From the files against published; the dotted line is equality.")},
+        {"materials": [_plain(source, e) for source, found in estimates.items() for e in found]},
     )
+
+
+def _estimates(data: AuthorsData, source: str, leakage: float) -> list[Estimate]:
+    """Every material of Table 2 that a source holds; `leakage` is what its ratios still have."""
+    found = []
+    for m in table2():
+        seen = _seen(data, source, m)
+        if seen is None or not seen[0].size:
+            continue
+        p, angle, scans = seen
+        one, theta = np.ones(p.size, np.complex128), np.radians(angle)
+        as_is, clean = (estimate_permittivity(x, one, theta) for x in (p, without_leakage(p, leakage)))
+        found.append(Estimate(m, angle, scans, p.size, as_is, clean, authors_recipe(p, angle)))
+    return found
+
+
+def _row(e: Estimate) -> tuple[str, ...]:
+    m, std = e.material, e.clean.real_std
+    return (
+        str(m.number), m.name, f"{e.angle_deg:.0f}°", str(e.scans), str(e.pixels), f"{m.permittivity.real:.4g}",
+        "–" if m.number == 23 else f"{-m.permittivity.imag:.4g}", *_cells(e.as_is.value), *_cells(e.clean.value),
+        "" if std is None or e.metal_like else f"± {std:.2f}", *_cells(None if e.metal_like else e.recipe),
+    )  # fmt: skip
 
 
 def _cells(value: complex | None) -> tuple[str, str]:
     return ("metal-like", "") if value is None else (f"{value.real:.2f}", f"{-value.imag:.2f}")
+
+
+def _plain(source: str, e: Estimate) -> dict[str, Any]:
+    """The same for the JSON file."""
+    return {
+        "source": source, "number": e.material.number, "name": e.material.name, "angle_deg": e.angle_deg,
+        "scans": e.scans, "pixels": e.pixels, "published": e.material.permittivity, "as_is": e.as_is.value,
+        "without_leakage": e.clean.value, "std": e.clean.real_std, "authors_recipe": e.recipe,
+        "metal_like": e.metal_like, "ratio": e.clean.ratio,
+    }  # fmt: skip
+
+
+def _figure(estimates: Mapping[str, Sequence[Estimate]]) -> Figure:
+    """Real part and loss of each source, without leakage, against the published ones."""
+    fig = new_figure(10.5, 4.6)
+    axes = fig.subplots(1, 2)
+    for colour, (source, found) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), estimates.items(), strict=False):
+        bars: dict[str, Any] = {"fmt": "o", "ms": 4, "color": colour, "lw": 1, "label": source}
+        shown = [e for e in found if not e.metal_like]
+        told = [e.material.permittivity for e in shown]
+        values = [e.clean.value or 0j for e in shown]
+        std = [e.clean.real_std or 0.0 for e in shown]
+        axes[0].errorbar([t.real for t in told], [v.real for v in values], yerr=std, **bars)
+        axes[1].errorbar([-t.imag for t in told], [-v.imag for v in values], yerr=std, **bars)
+    for ax, part in zip(axes, ("real part ε′", "loss ε″"), strict=True):
+        dress(ax, part, f"published {part}", f"{part} without leakage")
+        ax.axline((1, 1), slope=1, color=INK, lw=0.8, ls=":")
+        ax.legend(fontsize=8, frameon=False)
+    return fig

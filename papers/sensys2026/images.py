@@ -1,9 +1,10 @@
-"""Fig. 13 and 19 (images of materials) and Fig. 14 (phase of H, V and P), from scans of the simulated rig."""
+"""Images from scans of the simulated rig: Fig. 4 (front-on and steep), Fig. 13 and 19 (materials), Fig. 14 (phase)."""
 
 from __future__ import annotations
 
 import tempfile
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -38,6 +39,15 @@ FIG13_DISTANCE_MM = 598.0
 PHASE_DEG = 30.0
 """Range of the phase that Fig. 14 shows, to either side."""
 
+# Fig. 4.
+FRONT_ON_MM = 60.0
+"""Distance of each board from the middle in the front-on rig: 1.4 degrees of incidence."""
+FRONT_ON_GRID = {"columns": 81, "rows": 81, "step_x_mm": 4.5, "step_y_mm": 4.5}
+"""Monostatic, a step d makes ghosts at wavelength * distance / 2 d: 216 mm for 4.5 mm, outside the plates."""
+ROWS = (3, 6, 15)
+"""Acrylic, PET and glass in Table 2."""
+FRONT_ON_PLACES_MM = ((-60.0, 0.0), (60.0, 0.0), (0.0, 60.0))
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -52,11 +62,17 @@ def seen(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0)
     """Scan of plates with the permittivities of these rows of Table 2, and a copper plate in the middle."""
     around = [p for p in PLACES_MM if p != (0.0, 0.0)]
     step = len(around) // len(rows)
+    at = [around[i * step] for i in range(len(rows))]
+    return _scan(name, rows, at, run.config, 1300, object_distance_mm=distance_mm)
+
+
+def _scan(
+    name: str, rows: Sequence[int], at: Sequence[tuple[float, float]], config: Path, seed: int, **more: object
+) -> Seen:
+    """A copper plate in the middle and plates with the permittivities of these rows of Table 2 around it, mm."""
     plates = [plate("copper", None, 0.0, 0.0)]
-    for i, n in enumerate(rows):
-        material = table2()[n - 1]
-        plates.append(plate(material.name, material.permittivity, *around[i * step]))
-    with scanned(name, plates, run.config, seed=1300, object_distance_mm=distance_mm) as (source, truth):
+    plates += [plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy) for n, xy in zip(rows, at, strict=True)]
+    with scanned(name, plates, config, seed=seed, **more) as (source, truth):
         found = imaged(source, truth)
     context = context_of(found.result, found.x_m, found.y_m, title=name, simulated=True, plates=truth)
     return Seen(found.result, context)
@@ -235,15 +251,6 @@ def fig14(run: Run) -> Item:
     )
 
 
-FRONT_ON_MM = 60.0
-"""Distance of each board from the middle in the front-on rig: 1.4 degrees of incidence."""
-FRONT_ON_GRID = {"columns": 81, "rows": 81, "step_x_mm": 4.5, "step_y_mm": 4.5}
-"""Monostatic, a step d makes ghosts at wavelength * distance / 2 d: 216 mm for 4.5 mm, outside the plates."""
-ROWS = (3, 6, 15)
-"""Acrylic, PET and glass in Table 2."""
-FRONT_ON_PLACES_MM = ((-60.0, 0.0), (60.0, 0.0), (0.0, 60.0))
-
-
 def front_on(config: Path, folder: Path) -> Path:
     """The rig file with its boards side by side, written into a folder."""
     rig = tomllib.loads(config.read_text(encoding="utf-8"))
@@ -255,23 +262,14 @@ def front_on(config: Path, folder: Path) -> Path:
     return path
 
 
-def _seen(name: str, config: Path, **more: object) -> Seen:
-    plates = [plate("copper", None, 0.0, 0.0)]
-    plates += [
-        plate(table2()[n - 1].name, table2()[n - 1].permittivity, *xy)
-        for n, xy in zip(ROWS, FRONT_ON_PLACES_MM, strict=True)
-    ]
-    with scanned(name, plates, config, seed=400, **more) as (source, truth):
-        found = imaged(source, truth)
-    return Seen(found.result, context_of(found.result, found.x_m, found.y_m, title=name, simulated=True, plates=truth))
-
-
 def fig4(run: Run) -> Item:
     """H, V and P of copper, acrylic, PET and glass with the boards side by side, and with those of the rig file."""
     with tempfile.TemporaryDirectory(prefix="polysight-reproduce-") as temporary:
         near = front_on(run.config, Path(temporary))
-        views = {"front-on": _seen("front-on", near, grid=FRONT_ON_GRID, object_gain=10.0)}
-    views["steep"] = _seen("steep", run.config)
+        views = {
+            "front-on": _scan("front-on", ROWS, FRONT_ON_PLACES_MM, near, 400, grid=FRONT_ON_GRID, object_gain=10.0)
+        }
+    views["steep"] = _scan("steep", ROWS, FRONT_ON_PLACES_MM, run.config, 400)
     fig = new_figure(11.5, 6.8)
     for line, (name, view) in zip(fig.subplots(2, 3), views.items(), strict=True):
         draw_row(fig, line, view, ("amplitude_h", "amplitude_v", "amplitude_p"), name)

@@ -1,4 +1,8 @@
-"""Fig. 3 (reflectance and ratio against angle) and Fig. 16 (contrast of materials at three angles)."""
+"""Permittivity in figures and in Table 2: Fig. 3, 16 and 17.
+
+Fig. 3 is reflectance and ratio against angle, Fig. 16 the contrast of materials at three angles, Fig. 17 the estimates
+with plates at other places. Table 2 goes through Eq. 3 with pixels drawn at its own values.
+"""
 
 from __future__ import annotations
 
@@ -16,11 +20,18 @@ from polysight.papers.sensys2026.patches import calibrated_errors, draw, groups
 from polysight.papers.sensys2026.scenes import imaged, plate, scanned
 from polysight.papers.sensys2026.table2 import Published, published, table2
 
+Complex = npt.NDArray[np.complex128]
+
 COMMON = (1, 3, 6, 12, 13, 15, 21)
 CONTRAST = (1, 13, 16, 12, 18, 6, 3)
 CLUTTERED = ("Cardboard", "PET (1 mm)", "Acrylic (3 mm)")
 WATER = Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "literature value quoted in section 9.2")
 LINES = ("-", "--", "-.", ":")
+# Fig. 17.
+PLACEMENTS = 8
+REACH_MM, APART_MM = 60.0, 60.0
+MATERIALS = {"PET": 6, "ceramic": 12}
+"""Rows of Table 2."""
 
 
 def _rows(numbers: tuple[int, ...]) -> tuple[Published, ...]:
@@ -179,13 +190,6 @@ def table2_item(run: Run) -> Item:
         {"permittivity": Picture(fig, "Recovered against published; the dotted line is equality.")},
         {"materials": data},
     )
-
-
-Complex = npt.NDArray[np.complex128]
-PLACEMENTS = 8
-REACH_MM, APART_MM = 60.0, 60.0
-MATERIALS = {"PET": 6, "ceramic": 12}
-"""Rows of Table 2."""
 
 
 def places(seed: int, count: int = 3) -> list[tuple[float, float]]:

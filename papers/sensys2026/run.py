@@ -1,4 +1,4 @@
-"""`polysight reproduce`: make the items, write the files as they come, then the page."""
+"""`polysight reproduce`: what can be made, and making it: items, their files as they come, then the page."""
 
 from __future__ import annotations
 
@@ -23,6 +23,39 @@ from polysight.papers.sensys2026.item import Item, Run, Table
 from polysight.papers.sensys2026.permittivities import fig3, fig16, fig17, table2_item
 from polysight.papers.sensys2026.synchronisation import fig9, fig12, fig15
 from polysight.shared.errors import ConfigError, PolysightError
+
+TITLES: dict[str, str] = {
+    "fig3": "Fresnel reflection of common materials",
+    "fig4": "0 degrees against steep incidence",
+    "fig9": "spectrogram and high-pass response",
+    "fig12": "images before and after synchronisation",
+    "fig13": "image of seven materials",
+    "fig14": "phase of H, V and P",
+    "fig15": "errors by stage of synchronisation",
+    "fig16": "contrast across incidence angles",
+    "fig17": "location independence",
+    "fig18": "classification of solids, liquids and powders",
+    "fig19": "qualitative images",
+    "fig20": "H, V and P alone and together",
+    "fig21": "concentration of sugar in water",
+    "table2": "permittivity of 36 materials",
+}
+MAKERS: dict[str, Callable[[Run], Item]] = {
+    "fig3": fig3,
+    "fig16": fig16,
+    "table2": table2_item,
+    "fig18": fig18,
+    "fig20": fig20,
+    "fig21": fig21,
+    "fig17": fig17,
+    "fig19": fig19,
+    "fig14": fig14,
+    "fig13": fig13,
+    "fig4": fig4,
+    "fig12": fig12,
+    "fig15": fig15,
+    "fig9": fig9,
+}
 
 
 def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> int:
@@ -159,37 +192,3 @@ def write_page(
     path = out / "reproduce.html"
     write_atomically(path, page.encode("utf-8"))
     return path
-
-
-TITLES: dict[str, str] = {
-    "fig3": "Fresnel reflection of common materials",
-    "fig4": "0 degrees against steep incidence",
-    "fig9": "spectrogram and high-pass response",
-    "fig12": "images before and after synchronisation",
-    "fig13": "image of seven materials",
-    "fig14": "phase of H, V and P",
-    "fig15": "errors by stage of synchronisation",
-    "fig16": "contrast across incidence angles",
-    "fig17": "location independence",
-    "fig18": "classification of solids, liquids and powders",
-    "fig19": "qualitative images",
-    "fig20": "H, V and P alone and together",
-    "fig21": "concentration of sugar in water",
-    "table2": "permittivity of 36 materials",
-}
-MAKERS: dict[str, Callable[[Run], Item]] = {
-    "fig3": fig3,
-    "fig16": fig16,
-    "table2": table2_item,
-    "fig18": fig18,
-    "fig20": fig20,
-    "fig21": fig21,
-    "fig17": fig17,
-    "fig19": fig19,
-    "fig14": fig14,
-    "fig13": fig13,
-    "fig4": fig4,
-    "fig12": fig12,
-    "fig15": fig15,
-    "fig9": fig9,
-}

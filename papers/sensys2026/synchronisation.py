@@ -1,13 +1,19 @@
-"""Fig. 12 (before and after synchronisation) and Fig. 15 (errors by stage), from one scan of the simulated rig."""
+"""Fig. 12 (before and after synchronisation), Fig. 15 (errors by stage), Fig. 9 (spectrogram, high-pass response).
+
+The first two come from one scan of metal plates with the simulated rig, the last from the direct path alone, received
+at ten start frequencies.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 from scipy import signal
 
@@ -16,7 +22,7 @@ from polysight.host.imaging import ImageBuilder
 from polysight.host.report.figures import INK, PALETTE
 from polysight.host.report.sync_report import QUANTITIES, SyncReport
 from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.high_pass import fit_high_pass, high_pass
+from polysight.host.sync.high_pass import HighPass, fit_high_pass, high_pass
 from polysight.host.sync.residuals import STAGES
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
 from polysight.papers.sensys2026.scenes import plate, scanned
@@ -26,6 +32,14 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = npt.NDArray[np.complex64]
 UNITS = ("frequency (Hz)", "phase (rad)", "relative amplitude")
+
+# Fig. 9.
+GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
+OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
+USUAL_HZ = 870e3
+SKIRT_HZ = (60e3, 200e3)
+"""Where the smear of a bent chirp lies, from its tone."""
+_PADDED = 4096  # points of a spectrum
 
 
 @dataclass(frozen=True)
@@ -148,46 +162,12 @@ def fig15(run: Run) -> Item:
     limits = {"frequency_hz": told["frequency_std_hz"], "phase_rad": told["phase_std_rad"]}
     summary: dict[str, Any] = {name: r.summary() for name, r in sync_scan(run).reports.items()}
     fig = new_figure(11.5, 4.4)
-    rows = []
     chirps = " and ".join(f"{c['chirps']} chirps of {b}" for b, c in summary.items())
     for ax, quantity, unit in zip(fig.subplots(1, 3), QUANTITIES, UNITS, strict=True):
-        for i, (board, content) in enumerate(summary.items()):
-            stages = content["stages"]
-            at = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)
-            values = [s[f"{quantity}_std"] for s in stages.values()]
-            ax.plot(at, values, "os"[i], ms=7, color=PALETTE[(0, 6)[i]], label=f"{board}, simulated")
-            bound = [
-                (x, s[f"{quantity}_bound"])
-                for x, s in zip(at, stages.values(), strict=True)
-                if f"{quantity}_bound" in s
-            ]
-            ax.plot(*zip(*bound, strict=True), "_", ms=16, mew=1.6, color=INK, label=None if i else "Cramér-Rao bound")
-        if quantity in limits:
-            ax.axhline(
-                limits[quantity],
-                color=PALETTE[2],
-                ls="--",
-                lw=1.2,
-                label=f"published, all stages: {limits[quantity]:g}",
-            )
-        ax.set_yscale("log")
-        if quantity in limits:
-            ax.yaxis.set_minor_formatter(NullFormatter())
-        else:
-            ax.yaxis.set_major_formatter("{x:g}")
-            ax.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-            ax.yaxis.set_minor_formatter("{x:g}")
-            ax.tick_params(axis="y", which="minor", labelsize=7)
-        ax.margins(y=0.25)
+        _draw_stages(ax, summary, quantity, limits.get(quantity))
         dress(ax, unit, "", f"standard deviation of {unit}")
         ax.set_xticks(range(len(STAGES)), list(STAGES), fontsize=8)
         ax.legend(fontsize=7.5, frameon=False)
-    for board, content in summary.items():
-        for name, s in content["stages"].items():
-            told_here = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
-            own = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
-            cells = (x for pair in zip(own, told_here, strict=True) for x in pair)
-            rows.append((f"{board}, {name}: {STAGES[name]}", *list(cells)[:-1]))
     head = ("Board, stage", *(f"{unit}, {w}" for unit in ("Hz", "rad") for w in ("simulated", "published")))
     head += ("amplitude, simulated",)
     return Item(
@@ -198,24 +178,44 @@ def fig15(run: Run) -> Item:
             f" {chirps}. Its stages are not quite these; its two published numbers stand beside the last one, which is"
             " measured on the echo of the object.",
         ),
-        (
-            Table(
-                "Standard deviation after each stage",
-                head,
-                tuple(rows),
-            ),
-        ),
+        (Table("Standard deviation after each stage", head, _stage_rows(summary, limits)),),
         {"stages": Picture(fig, "Errors after each stage, on a logarithmic axis, with the bounds of one tone.")},
         summary,
     )
 
 
-GRID = {"columns": 6, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
-OFFSETS_HZ = (200e3, 250e3, 350e3, 450e3, 600e3, 870e3, 1.1e6, 1.3e6, 1.5e6, 1.7e6)
-USUAL_HZ = 870e3
-SKIRT_HZ = (60e3, 200e3)
-"""Where the smear of a bent chirp lies, from its tone."""
-_PADDED = 4096
+def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: float | None) -> None:
+    """Standard deviation of a quantity after each stage, with the bounds and the published value, if there is one."""
+    for i, (board, content) in enumerate(summary.items()):
+        stages = content["stages"]
+        at = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)
+        values = [s[f"{quantity}_std"] for s in stages.values()]
+        ax.plot(at, values, "os"[i], ms=7, color=PALETTE[(0, 6)[i]], label=f"{board}, simulated")
+        key = f"{quantity}_bound"
+        bound = [(x, s[key]) for x, s in zip(at, stages.values(), strict=True) if key in s]
+        ax.plot(*zip(*bound, strict=True), "_", ms=16, mew=1.6, color=INK, label=None if i else "Cramér-Rao bound")
+    ax.set_yscale("log")
+    if limit is not None:
+        ax.axhline(limit, color=PALETTE[2], ls="--", lw=1.2, label=f"published, all stages: {limit:g}")
+        ax.yaxis.set_minor_formatter(NullFormatter())
+    else:
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+        ax.yaxis.set_minor_formatter("{x:g}")
+        ax.tick_params(axis="y", which="minor", labelsize=7)
+    ax.margins(y=0.25)
+
+
+def _stage_rows(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
+    """A line for each board and stage; published values stand beside the last stage."""
+    rows = []
+    for board, content in summary.items():
+        for name, s in content["stages"].items():
+            told = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
+            own = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
+            cells = [x for pair in zip(own, told, strict=True) for x in pair]
+            rows.append((f"{board}, {name}: {STAGES[name]}", *cells[:-1]))
+    return tuple(rows)
 
 
 def tones(chirps: npt.NDArray[np.complex64], chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray]:
@@ -245,10 +245,9 @@ def skirt_db(
     return (np.arange(_PADDED) / _PADDED - 0.5) * rate_hz, 10 * np.log10(laid)
 
 
-def fig9(run: Run) -> Item:
-    """The direct path alone, received at ten start frequencies of the receiver."""
-    swept, chirp = [], load_instrument(run.config).chirp
-    shown = np.zeros((1, 1, chirp.samples), np.complex64)
+def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
+    """IF (Hz) and amplitude of the direct path over all start frequencies, and the chirps of the usual one."""
+    swept, shown = [], np.zeros((1, 1, chirp.samples), np.complex64)
     for offset in OFFSETS_HZ:
         disturbances = {"if_offset_hz": offset}
         with scanned("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
@@ -259,45 +258,65 @@ def fig9(run: Run) -> Item:
             shown = chirps[:, valid]
     if_hz, amplitude = (np.concatenate(part) for part in zip(*swept, strict=True))
     heard = (if_hz > 0.05 * chirp.sample_rate_hz) & (if_hz < 0.9 * chirp.sample_rate_hz)
-    if_hz, amplitude = if_hz[heard], amplitude[heard]
-    fitted, programmed = fit_high_pass(if_hz, amplitude), high_pass(chirp)
+    return if_hz[heard], amplitude[heard], shown
 
-    fig = new_figure(11.5, 4.2)
-    left, centre, right = fig.subplots(1, 3)
+
+def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
+    """Spectrogram of one chirp [sample], and where the used part ends."""
     f, t, power = signal.spectrogram(
-        shown[0, 0], chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
+        one, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
     )
     f, power = np.fft.fftshift(f % chirp.sample_rate_hz), np.fft.fftshift(power, axes=0)
     order = np.argsort(f)
     level = 10 * np.log10(power[order] / power.max())
-    picture = left.pcolormesh(t * 1e6, f[order] / 1e6, level, cmap="cividis", vmin=-35, vmax=0, rasterized=True)
-    edge_us = chirp.linear_samples[1] / chirp.sample_rate_hz * 1e6
-    left.axvline(edge_us, color="w", ls="--", lw=1)
-    dress(left, "Spectrogram of one chirp", "time in the ADC window (µs)", "IF (MHz)")
-    left.grid(visible=False)
-    fig.colorbar(picture, ax=left, fraction=0.046, pad=0.02).set_label("dB", fontsize=8)
+    picture = ax.pcolormesh(t * 1e6, f[order] / 1e6, level, cmap="cividis", vmin=-35, vmax=0, rasterized=True)
+    ax.axvline(chirp.linear_samples[1] / chirp.sample_rate_hz * 1e6, color="w", ls="--", lw=1)
+    dress(ax, "Spectrogram of one chirp", "time in the ADC window (µs)", "IF (MHz)")
+    ax.grid(visible=False)
+    ax.figure.colorbar(picture, ax=ax, fraction=0.046, pad=0.02).set_label("dB", fontsize=8)
 
+
+def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
+    """Spectra about the tone of whole chirps and of their used part; the mean level of their skirts, dB."""
     smear = {}
     parts = {"whole chirp": ((0, chirp.samples), PALETTE[6]), "used part": (chirp.linear_samples, INK)}
     for part, ((first, last), colour) in parts.items():
-        apart, level = skirt_db(shown[..., first:last], chirp.sample_rate_hz)
+        apart, level = skirt_db(chirps[..., first:last], chirp.sample_rate_hz)
         near = (np.abs(apart) > SKIRT_HZ[0]) & (np.abs(apart) < SKIRT_HZ[1])
         smear[part] = float(10 * np.log10(np.mean(10 ** (level[near] / 10))))
-        centre.plot(apart / 1e6, level, color=colour, lw=1.2, label=part)
-    dress(centre, "Spectrum about the tone", "IF from the tone (MHz)", "dB, 0 = peak")
-    centre.set_xlim(-0.6, 0.6)
-    centre.legend(fontsize=8, frameon=False, loc="upper right")
+        ax.plot(apart / 1e6, level, color=colour, lw=1.2, label=part)
+    dress(ax, "Spectrum about the tone", "IF from the tone (MHz)", "dB, 0 = peak")
+    ax.set_xlim(-0.6, 0.6)
+    ax.legend(fontsize=8, frameon=False, loc="upper right")
+    return smear
 
+
+def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: HighPass, programmed: HighPass) -> None:
+    """Amplitude against IF, the fitted filter's gain taken out, and both filters."""
     at = np.linspace(if_hz.min(), if_hz.max(), 300)
-    gain = np.exp(np.mean(np.log(amplitude / np.abs(fitted.response(if_hz)))))
-    right.plot(if_hz / 1e6, 20 * np.log10(amplitude / gain), ".", ms=3, color=PALETTE[1], label="sweep, simulated")
+    ax.plot(if_hz / 1e6, 20 * np.log10(amplitude), ".", ms=3, color=PALETTE[1], label="sweep, simulated")
     for model, colour, style, name in ((fitted, INK, "-", "fitted"), (programmed, PALETTE[6], "--", "programmed")):
         corners = ", ".join(f"{c / 1e3:.0f}" for c in model.corners_hz)
         response = 20 * np.log10(np.abs(model.response(at)))
-        right.plot(at / 1e6, response, color=colour, ls=style, lw=1.5, label=f"{name}: {corners} kHz")
-    dress(right, "High-pass filter", "IF (MHz)", "gain (dB)")
-    right.legend(fontsize=8, frameon=False, loc="lower right")
+        ax.plot(at / 1e6, response, color=colour, ls=style, lw=1.5, label=f"{name}: {corners} kHz")
+    dress(ax, "High-pass filter", "IF (MHz)", "gain (dB)")
+    ax.legend(fontsize=8, frameon=False, loc="lower right")
 
+
+def fig9(run: Run) -> Item:
+    """The direct path alone, received at ten start frequencies of the receiver."""
+    chirp = load_instrument(run.config).chirp
+    if_hz, amplitude, shown = _sweep(run, chirp)
+    fitted, programmed = fit_high_pass(if_hz, amplitude), high_pass(chirp)
+    amplitude = amplitude / np.exp(np.mean(np.log(amplitude / np.abs(fitted.response(if_hz)))))
+
+    fig = new_figure(11.5, 4.2)
+    left, centre, right = fig.subplots(1, 3)
+    _draw_spectrogram(left, shown[0, 0], chirp)
+    smear = _draw_skirts(centre, shown, chirp)
+    _draw_filter(right, if_hz, amplitude, fitted, programmed)
+
+    at = np.linspace(if_hz.min(), if_hz.max(), 300)
     response = np.abs(fitted.response(at)) / np.abs(programmed.response(at))
     worst = float(np.abs(20 * np.log10(response / np.exp(np.mean(np.log(response))))).max())
     rows = tuple(
@@ -321,7 +340,7 @@ def fig9(run: Run) -> Item:
         {"receiver": Picture(fig, "Spectrogram of one chirp; mean spectrum; amplitude against IF with the filter.")},
         {
             "if_hz": if_hz,
-            "amplitude": amplitude / gain,
+            "amplitude": amplitude,
             "fitted_corners_hz": fitted.corners_hz,
             "programmed_corners_hz": programmed.corners_hz,
             "largest_difference_db": worst,

@@ -1,4 +1,4 @@
-"""The paper's Table 2 as data: 36 materials with their published permittivities."""
+"""The paper's Table 2 as data (36 materials with their published permittivities), and its other published values."""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from polysight.host.capture.dca1000 import encode_packet
-from polysight.host.capture.placement import Counters, Losses, Placed, Placement
+from polysight.host.capture.dca1000 import Counters, encode_packet
+from polysight.host.capture.placement import Losses, Placed, Placement
 
 FULL = 1456
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault

@@ -174,7 +174,8 @@ def test_survives_ctrl_c_and_ends_with_its_host(board):
 
 def test_ends_when_its_host_is_killed(board, tmp_path):
     code = (
-        "import time\nfrom polysight.shared.config import Board\nfrom polysight.host.capture.receiver import ReceiverProcess\n"
+        "import time\nfrom polysight.shared.config import Board\n"
+        "from polysight.host.capture.receiver import ReceiverProcess\n"
         f"r = ReceiverProcess(Board('RH', 'receive_h', '{board.card_address}', '{board.host_address}', 1, "
         f"{board.data_port}, ()), 1 << 20)\n"
         f"from pathlib import Path\nr.begin_row(0, 1, 4096, 4096, Path({str(tmp_path / 'a.part')!r}))\n"

@@ -183,8 +183,9 @@ class Rig(Bench):
         folder = self.folder
         (folder / "scene.toml").write_text(self._scene)
         self.simulators = self.start(
-            "python", "-m", "polysight.simulators.rig", "--config", REPO / "instrument.toml", "--scene", folder / "scene.toml",
-            "--dir", folder / "rig", "--time-scale", str(self._time_scale), env=self._env,
+            "python", "-m", "polysight.simulators.rig", "--config", REPO / "instrument.toml",
+            "--scene", folder / "scene.toml", "--dir", folder / "rig",
+            "--time-scale", str(self._time_scale), env=self._env,
         )  # fmt: skip
         base = Path(self.simulators.wait_ready())
         table = to_builtins(load_instrument(base))

@@ -206,7 +206,8 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, payload, tmp_path):
     (tmp_path / "rig.toml").write_text(tomli_w.dumps(to_builtins(rig.instrument)))
     code = (
         "import sys\nfrom pathlib import Path\nfrom polysight.shared.config import load_instrument\n"
-        "from polysight.host.acquisition.scan import run_scan\nrun_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
+        "from polysight.host.acquisition.scan import run_scan\n"
+        "run_scan(load_instrument(Path(sys.argv[1])), Path(sys.argv[2]))"
     )
     rig.pi.hang_at = {2}
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "rig.toml"), str(tmp_path / "s")]) as host:

@@ -203,7 +203,8 @@ def test_dies_with_its_parent(tmp_path: Path):
     wires = Wires(tmp_path / "wires")
     program = (
         "import subprocess, sys, time\n"
-        "p = subprocess.Popen([sys.executable, '-m', 'polysight.simulators.stage', *sys.argv[1:]], stdout=subprocess.PIPE)\n"
+        "command = [sys.executable, '-m', 'polysight.simulators.stage', *sys.argv[1:]]\n"
+        "p = subprocess.Popen(command, stdout=subprocess.PIPE)\n"
         "p.stdout.readline()\nprint(p.pid, flush=True)\ntime.sleep(600)\n"
     )
     arguments = ["--config", str(ROOT / "instrument.toml"), "--wires", str(tmp_path / "wires"), "--link"]

@@ -42,7 +42,7 @@ def test_a_changed_kernel_is_compiled_anew_also_where_it_was_inlined(tmp_path):
     again, hits = call(tmp_path)
     assert (again, hits) == (first, 1)
 
-    kernels = tmp_path / "polysight" / "host" / "sync" / "kernels.py"
+    kernels = tmp_path / "polysight" / "host" / "sync" / "compiled_loops.py"
     source = kernels.read_text(encoding="utf-8")
     changed = source.replace("return 1 - 2 * s * s, 2 * s * c", "return 3 * (1 - 2 * s * s), 3 * (2 * s * c)")
     assert changed != source

@@ -9,9 +9,8 @@ from polysight.host.acquisition.capture_rig import CaptureRig
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.capture.dca1000 import Code
 from polysight.host.store.validate import validate
-
-from .conftest import FULL, FakeRig
-from .late_card import LateCard
+from tests.support.acquisition.fake_cards import FULL, LateCard
+from tests.support.acquisition.fake_rig import FakeRig
 
 CONFIGURE = int(Code.CONFIGURE_FPGA)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,14 +9,12 @@ from polysight.host.acquisition.missed_pulses import place_frames
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.source import RowData
-from polysight.shared.config import load_instrument
 from polysight.simulators.scene import load_scene
 from polysight.simulators.simulate import simulate
-from tests.small_scene import small_scene
+from tests.support.acquisition.arrival_model import PAYLOAD, Load, pulse_times, receive
+from tests.support.rigs import published_rig
+from tests.support.scenes import small_scene
 
-from .arrival_model import PAYLOAD, Load, pulse_times, receive
-
-REPO = Path(__file__).resolve().parents[2]
 SCENE = small_scene(24, 10, step_mm=(5.0, 10.0), pulses=6, pixels=24, pixel_mm=5.0)
 
 
@@ -73,9 +69,7 @@ def difference(a, b) -> float:
 def clean(tmp_path_factory) -> ScanFolder:
     folder = tmp_path_factory.mktemp("clean")
     (folder / "scene.toml").write_text(SCENE)
-    return ScanFolder.load(
-        simulate(load_instrument(REPO / "instrument.toml"), load_scene(folder / "scene.toml"), folder / "scan")
-    )
+    return ScanFolder.load(simulate(published_rig(), load_scene(folder / "scene.toml"), folder / "scan"))
 
 
 def test_image_with_missed_pulses_is_the_clean_one(clean):

@@ -17,7 +17,7 @@ POINTS, PULSES = 8, 6
 @pytest.fixture
 def paced(make_instrument):
     """Rows of 8 points and 6 pulses, their frames sent at the times of their pulses."""
-    from .conftest import FakeRig
+    from tests.support.acquisition.fake_rig import FakeRig
 
     made = make_instrument(row_retakes=1)
     grid = msgspec.structs.replace(made.grid, columns=POINTS, rows=2)

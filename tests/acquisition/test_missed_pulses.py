@@ -18,8 +18,7 @@ from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames,
 from polysight.host.acquisition.slipped_row import describe, write_in_place
 from polysight.host.capture.receiver import ReceiverProcess
 from polysight.host.capture.segment import read_index, write_index
-
-from .arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
+from tests.support.acquisition.arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
 
 FRAME = 4096
 BURSTS, PULSES = 12, 16

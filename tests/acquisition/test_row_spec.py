@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +13,9 @@ from polysight.host.radar.interface import RadarControl, RadarState
 from polysight.shared import messages
 from polysight.shared.config import Radar
 from polysight.shared.errors import ScanError
+from tests.support.paths import REPO
 
-SPEC = (Path(__file__).resolve().parents[2] / "docs/spec/row.md").read_text(encoding="utf-8")
+SPEC = (REPO / "docs/spec/row.md").read_text(encoding="utf-8")
 
 
 def table(heading: str) -> list[list[str]]:

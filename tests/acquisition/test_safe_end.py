@@ -30,8 +30,7 @@ from polysight.shared import messages as m
 from polysight.shared.errors import DeviceError, PolysightError, ScanError, os_error
 from polysight.shared.faults import explain
 from polysight.shared.tables import to_builtins
-
-from .processes_of_scan import receiver_of
+from tests.support.acquisition.receivers import receiver_of
 
 
 def commands(pi) -> list[type]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import struct
-from pathlib import Path
 
 import pytest
 
@@ -15,8 +14,9 @@ from polysight.host.capture.dca1000 import Status
 from polysight.host.page.story import CAUSES, of_rejection
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.shared.faults import PiFault, explain
+from tests.support.paths import REPO
 
-SPEC = Path(__file__).resolve().parents[2] / "docs/spec/scan-folder.md"
+SPEC = REPO / "docs/spec/scan-folder.md"
 HELD = "held on the way: some positions were passed below full speed"
 
 

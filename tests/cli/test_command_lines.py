@@ -14,7 +14,6 @@ from polysight.host.cli_options import joined
 from polysight.host.process.request import LIBRARY
 from polysight.host.report import write_json
 
-REPO = Path(__file__).resolve().parents[2]
 E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}
 SEGMENTS = [
     {"label": 1, "name": "copper", "confidence": None, "metal_like": True, "permittivity": None},

@@ -1,7 +1,5 @@
 """Sub-bands of the sweep: they cover it, overlap by half, and a mirror is as flat in each as in the whole."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,10 +7,10 @@ from hypothesis import strategies as st
 
 from polysight.host.imaging.images import LEAST_SAMPLES, sub_bands
 from polysight.host.materials.layers import Spectrum
-from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError
+from tests.support.rigs import published_rig
 
-CHIRP = load_instrument(Path(__file__).parents[2] / "instrument.toml").chirp
+CHIRP = published_rig().chirp
 
 
 @given(st.integers(1, 15))

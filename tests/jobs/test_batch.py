@@ -3,7 +3,6 @@
 import json
 import sys
 from argparse import Namespace
-from pathlib import Path
 
 import pytest
 
@@ -13,6 +12,7 @@ from polysight.host.jobs import batch as many
 from polysight.host.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
 from polysight.host.products.files import FINISHED
 from polysight.shared.errors import ConfigError
+from tests.support.rigs import published_rig
 
 WORKER = """
 import json, os, pickle, sys, time
@@ -205,11 +205,10 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 @pytest.mark.timeout(900)
 def test_real_scans_end_to_end(tmp_path, capsys):
     """A simulated scan and a damaged one by the real program; then the mark holds."""
-    from polysight.shared.config import load_instrument
     from polysight.simulators.scene import decode_scene
     from polysight.simulators.simulate import simulate
 
-    rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+    rig = published_rig()
     scene = {
         "name": "plate",
         "grid": {"columns": 13, "rows": 15, "step_x_mm": 16.0, "step_y_mm": 8.0},

@@ -1,7 +1,6 @@
 """Sub-bands of patches: only what an image shows counts, and what all bands share does not average out with them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +10,11 @@ from polysight.host.imaging.images import SubBand
 from polysight.host.materials.layers import Bands, Layer, fit_layer
 from polysight.host.materials.sub_bands import band_rows, bands_of_row
 from polysight.host.polarimetry import fresnel, ratio_from_permittivity
-from polysight.shared.config import load_instrument
+from tests.support.rigs import published_rig
 
 THETA = np.radians(55.0)
 BAND = SubBand((0, 96), 76.3e9, 78.0e9)
-CHIRP = load_instrument(Path(__file__).parents[2] / "instrument.toml").chirp
+CHIRP = published_rig().chirp
 THICK = 4.0 - 0.4j
 INVERSE_STD = 0.01
 

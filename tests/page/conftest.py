@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "store"))
-sys.path.insert(0, str(Path(__file__).parent))
-
-from chromium import Browser, find_chromium
-from looking import GrowingScan
-from small_scan import Samples, SmallScan
-
 from polysight.host.page.watch import Watch
+from tests.support.page.chromium import Browser, find_chromium
+from tests.support.page.live_view import GrowingScan
+from tests.support.store.small_scan import Samples, SmallScan
 
 
 @pytest.fixture(scope="session")

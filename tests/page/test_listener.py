@@ -8,21 +8,21 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import msgspec
 import pytest
 import zmq
-from looking import wait_for
 from zmq.utils.monitor import recv_monitor_message
 
 from polysight.host.page.listener import PiListener
 from polysight.shared import messages as m
-from polysight.shared.config import load_instrument
 from polysight.shared.raster import plan_raster
 from polysight.shared.sockets import EVENT_TOPIC, publisher
+from tests.support.paths import REPO
+from tests.support.processes import wait_for
+from tests.support.rigs import published_rig
 
-RIG = load_instrument(Path(__file__).resolve().parents[2] / "instrument.toml")
+RIG = published_rig()
 OF = {"scan_id": "mine", "t_mono_ns": 1}
 
 
@@ -127,7 +127,7 @@ def test_the_pi_forgets_a_view_that_hangs(tmp_path):
     events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
     monitor = events.get_monitor_socket()
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)
-    looker = subprocess.Popen([sys.executable, "-c", LOOKER, address], cwd=Path(__file__).parents[2])
+    looker = subprocess.Popen([sys.executable, "-c", LOOKER, address], cwd=REPO)
 
     def happened(kind: zmq.Event) -> bool:
         events.send_multipart([EVENT_TOPIC, b"x"])

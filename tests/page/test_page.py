@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import pytest
-from chromium import DESK, PHONE, Browser
-from looking import LIMIT_S, GrowingScan, served, wait_for
 
 from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest
-from polysight.shared.config import load_instrument
 from polysight.simulators.loopback import on_free_subnet
+from tests.support.page.chromium import DESK, PHONE, Browser
+from tests.support.page.live_view import GrowingScan, served
+from tests.support.paths import REPO
+from tests.support.processes import LIMIT_S, wait_for
+from tests.support.rigs import published_rig
 
-REPO = Path(__file__).resolve().parents[2]
 TOKEN = "0123456789"
 PICTURES = "[...document.querySelectorAll('.view img')]"
 pytestmark = pytest.mark.xdist_group("browser")
@@ -109,7 +109,7 @@ def test_a_wrong_token_is_said(browser, growing, watching):
 
 def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, watching):
     """At an address of its own: a port of 127.0.0.1 that was free for a while may be somebody else's by then."""
-    rig = on_free_subnet(load_instrument(REPO / "instrument.toml"))
+    rig = on_free_subnet(published_rig())
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
     watch = watching(finished)
     with served(watch, host=host, port=int(port)) as view:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,11 +12,10 @@ from matplotlib.image import imread
 from polysight.host.imaging import ChannelImages
 from polysight.host.page.images import PHASE, colour_bar, draw, range_profile_db
 from polysight.host.sync.chain import SyncedRow
-from polysight.shared.config import load_instrument
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from tests.support.rigs import published_rig
 
 NY, NX = 8, 11
-REPO = Path(__file__).resolve().parents[2]
 
 
 def pixels(png: bytes) -> np.ndarray:
@@ -72,7 +70,7 @@ def test_phase_of_p_is_the_difference(images):
 
 @pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
 def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
-    chirp = load_instrument(REPO / "instrument.toml").chirp
+    chirp = published_rig().chirp
     f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     echo = 1 + 0.3 * np.exp(2j * np.pi * f * path_m / SPEED_OF_LIGHT_M_S)
     samples = np.tile(echo.astype(np.complex64), (4, 5, 1))

@@ -7,14 +7,15 @@ import http.client
 import json
 import re
 import socket
-from pathlib import Path
 
 import pytest
-from looking import LIMIT_S, served, wait_for
 
 from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
 from polysight.host.cli import build_parser
 from polysight.host.page.server import STATIC, TOKEN_HEADER, is_loopback
+from tests.support.page.live_view import served
+from tests.support.paths import REPO
+from tests.support.processes import LIMIT_S, wait_for
 
 TOKEN = "the-right-token"
 
@@ -202,5 +203,5 @@ def test_pictures_are_served_as_they_are_shown(finished, watching):
 
 
 def test_the_how_to_names_every_wish():
-    page = (Path(__file__).resolve().parents[2] / "docs/how-to/live-view.md").read_text(encoding="utf-8")
+    page = (REPO / "docs/how-to/live-view.md").read_text(encoding="utf-8")
     assert all(f"control/{wish}" in page for wish in Wish)

@@ -5,7 +5,6 @@ import os
 import pickle
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from polysight.papers.sensys2026.item import Table
 from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.errors import DataError
 from polysight.simulators.authors_forms import Errors, Material, write_labels, write_material
+from tests.support.paths import RIG_FILE
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
 ERRORS = Errors(0.004, 0.01, leakage=0.05)
@@ -109,7 +109,7 @@ def test_the_page_says_that_the_files_were_simulated_and_what_was_left_out(out, 
 
 
 def _rig():
-    return Path(__file__).parents[2] / "instrument.toml"
+    return RIG_FILE
 
 
 def test_what_a_name_means_can_be_said(dataset, tmp_path):

@@ -1,7 +1,5 @@
 """Scenes, rig files and estimators behind the figures that come from images."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,8 +12,8 @@ from polysight.papers.sensys2026.scenes import plate, scanned
 from polysight.papers.sensys2026.synchronisation import tones
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ScanError
-
-RIG = Path(__file__).parents[2] / "instrument.toml"
+from tests.support.paths import RIG_FILE
+from tests.support.rigs import published_rig
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -36,7 +34,7 @@ def test_nine_places_are_nine():
 
 
 def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
-    steep, near = load_instrument(RIG), load_instrument(front_on(RIG, tmp_path))
+    steep, near = published_rig(), load_instrument(front_on(RIG_FILE, tmp_path))
     assert np.degrees(specular_incidence_rad(steep)) == pytest.approx(55, abs=0.2)
     assert np.degrees(specular_incidence_rad(near)) < 2
     assert near.chirp == steep.chirp
@@ -45,7 +43,7 @@ def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
 def test_the_plane_of_fig13_is_seen_under_50_degrees():
     import msgspec
 
-    rig = load_instrument(RIG)
+    rig = published_rig()
     rig = msgspec.structs.replace(
         rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=FIG13_DISTANCE_MM)
     )
@@ -54,7 +52,7 @@ def test_the_plane_of_fig13_is_seen_under_50_degrees():
 
 @pytest.mark.parametrize("if_hz", [210e3, 870e3, 1.81e6])
 def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
-    chirp = load_instrument(RIG).chirp
+    chirp = published_rig().chirp
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
     gains = np.array([1.0, 1j, -0.5, 0.25])[:, None, None]
     found, amplitude = tones((gains * 40 * np.exp(2j * np.pi * if_hz * t)).astype(np.complex64), chirp)
@@ -64,7 +62,7 @@ def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
 
 def test_a_simulated_scan_is_there_and_gone_again():
     grid = {"columns": 3, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
-    with scanned("small", [plate("copper", None, 0, 0)], RIG, seed=1, grid=grid) as (source, truth):
+    with scanned("small", [plate("copper", None, 0, 0)], RIG_FILE, seed=1, grid=grid) as (source, truth):
         assert source.simulated
         assert [p.metal for p in truth] == [True]
         folder = source.path
@@ -75,13 +73,13 @@ def test_a_simulated_scan_is_there_and_gone_again():
 def test_a_scene_that_cannot_be_simulated_is_named():
     with (
         pytest.raises(ScanError, match="'broken'"),
-        scanned("broken", [plate("x", 0.5 + 0j, 0, 0)], RIG, seed=1),
+        scanned("broken", [plate("x", 0.5 + 0j, 0, 0)], RIG_FILE, seed=1),
     ):
         pass
 
 
 def test_the_filter_s_corners_come_back_from_the_sweep():
-    item = catalogue.MAKERS["fig9"](Run(config=RIG))
+    item = catalogue.MAKERS["fig9"](Run(config=RIG_FILE))
     assert item.data["largest_difference_db"] < 0.2
     assert item.data["fitted_corners_hz"] == pytest.approx(item.data["programmed_corners_hz"], rel=0.15)
 

@@ -1,59 +1,54 @@
-"""Small simulated scans, and what the whole flow makes of them."""
+"""Small simulated scans, made once and shared by the laws that look at them."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from polysight.host.cli import main
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.scene import decode_scene
+from polysight.host.imaging import ChannelImages
+from polysight.host.materials import TruthPlate, read_truth
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.shared.config import Instrument
+from polysight.simulators.scene import Scene, decode_scene, load_scene
 from polysight.simulators.simulate import simulate
-
-REPO = Path(__file__).resolve().parents[2]
-COPPER = {"name": "copper", "centre_mm": [-40.0, 10.0], "size_mm": [50.0, 50.0], "metal": True}
-PET = {"name": "PET", "centre_mm": [40.0, -10.0], "size_mm": [50.0, 50.0], "permittivity": [3.78, 0.7]}
-EVERYWHERE = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [500.0, 400.0], "metal": True}
+from tests.support.paths import EXAMPLES
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, PET, scene_of
 
 
-def rig_of(**tables: dict[str, Any]) -> Instrument:
-    """The published rig with some tables changed."""
-    table = to_builtins(load_instrument(REPO / "instrument.toml"))
-    for name, more in tables.items():
-        table[name] |= more
-    return decode(table, Instrument, "test")
+class Imaged:
+    """A simulated scan that went through the host's pipeline up to the images."""
+
+    def __init__(self, folder: Path) -> None:
+        self.pipeline = Pipeline(ScanFolder.load(folder))
+        for row in self.pipeline.source.rows():
+            self.pipeline.add_row(row)
+        self.images: ChannelImages = self.pipeline.form_images()
+        self.rig: Instrument = self.pipeline.source.instrument
+        self.plates: tuple[TruthPlate, ...] = read_truth(folder / "truth.json")
 
 
-def scene_of(*plates: dict[str, Any], columns: int, rows: int, pulses: int = 2, **more: Any) -> dict[str, Any]:
-    """A scene of plates on a coarse grid."""
-    return {
-        "name": "small",
-        "grid": {"columns": columns, "rows": rows, "step_x_mm": 14.0, "step_y_mm": 8.0},
-        "burst": {"pulses": pulses},
-        "image": {"columns": 50, "rows": 40, "pixel_mm": 4.0},
-        "plates": list(plates),
-        **more,
-    }
+Make = Callable[..., Imaged]
 
 
-def told_by(*arguments: object) -> str:
-    """What a command of the host says; it must succeed."""
-    said = StringIO()
-    with redirect_stdout(said):
-        assert main([str(word) for word in arguments]) == 0
-    return said.getvalue()
+@pytest.fixture(scope="session")
+def imaged(rig: Instrument, tmp_path_factory: pytest.TempPathFactory) -> Make:
+    """`imaged("nine-materials", seed=2, leakage_h=[0, 0])`: the example scene with changed disturbances, imaged."""
+    done: dict[str, Imaged] = {}
 
+    def make(name: str, seed: int | None = None, **disturbances: Any) -> Imaged:
+        key = f"{name} {seed} {disturbances}"
+        if key not in done:
+            scene: Scene = load_scene(EXAMPLES / f"{name}.toml").with_disturbances(**disturbances)
+            folder = tmp_path_factory.mktemp("scan")
+            done[key] = Imaged(simulate(rig, scene, folder / "scan", seed=seed))
+        return done[key]
 
-def content(path: Path) -> dict[str, Any]:
-    """Of a JSON file."""
-    return json.loads(path.read_text(encoding="utf-8"))
+    return make
 
 
 @pytest.fixture(scope="session")
@@ -61,7 +56,7 @@ def scan_of() -> Callable[..., Path]:
     """`scan_of(folder, scene, rig)`: a simulated scan, in a scan folder."""
 
     def make(folder: Path, scene: dict[str, Any], rig: Instrument | None = None, **more: Any) -> Path:
-        return simulate(rig or rig_of(), decode_scene(scene, "test"), folder, **more)
+        return simulate(rig or published_rig(), decode_scene(scene, "test"), folder, **more)
 
     return make
 

@@ -1,7 +1,6 @@
 """The published forms, written by the simulator, become the images of the rig they were made with."""
 
 import json
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -12,14 +11,15 @@ from polysight.host.cli import main
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.sources.published import AuthorsCube, open_scan
 from polysight.host.sync.synchronised import recognise
-from polysight.shared.config import Image, load_instrument
+from polysight.shared.config import Image
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins
 from polysight.simulators.authors_forms import write_cube
 from polysight.simulators.scene import decode_scene
 from polysight.simulators.simulate import simulate
+from tests.support.rigs import published_rig
 
-RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+RIG = published_rig()
 SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))
 SCENE = {
     "name": "two plates",

@@ -10,12 +10,13 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options
 from polysight.host.store.sources.published import open_scan
 from polysight.shared.tables import to_builtins
-
-from .conftest import COPPER, PET, content, rig_of, scene_of, told_by
+from tests.support.commands import content, told_by
+from tests.support.rigs import rig_with
+from tests.support.scenes import COPPER, PET, scene_of
 
 BANDS, COLUMNS, ROWS = 2, 13, 17
 IMAGE = {"columns": 50, "rows": 40, "pixel_mm": 4.0}
-RIG = rig_of(image=IMAGE)
+RIG = rig_with(image=IMAGE)
 
 
 @pytest.fixture(scope="module")

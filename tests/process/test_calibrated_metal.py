@@ -12,8 +12,8 @@ from polysight.host.calibration.metal import write_metal
 from polysight.host.jobs.calibrate import load_reference
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
-
-from .conftest import EVERYWHERE, content, scene_of, told_by
+from tests.support.commands import content, told_by
+from tests.support.scenes import EVERYWHERE, scene_of
 
 SCENE = scene_of(EVERYWHERE, columns=10, rows=8) | {"image": {"columns": 24, "rows": 24, "pixel_mm": 4.0}}
 

@@ -10,8 +10,7 @@ from polysight.host.report.context import ReportContext
 from polysight.host.report.tables import masked_positions
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.source import RowData
-
-from .conftest import EVERYWHERE, scene_of
+from tests.support.scenes import EVERYWHERE, scene_of
 
 COLUMNS, ROWS, PULSES = 7, 4, 2
 GONE = {0: [0, 1, 4], 1: [0, 1, 4], 3: [6]}  # row to points, in the order they were met

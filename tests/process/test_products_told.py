@@ -8,8 +8,7 @@ import shutil
 from polysight.host.products.files import FINISHED
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
-
-from .conftest import content, told_by
+from tests.support.commands import content, told_by
 
 METAL = "-40,10,30,30"  # inside the copper
 

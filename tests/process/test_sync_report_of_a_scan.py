@@ -8,8 +8,9 @@ import pytest
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
 from polysight.shared.geometry import rx_positions_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-
-from .conftest import EVERYWHERE, content, rig_of, scene_of, told_by
+from tests.support.commands import content, told_by
+from tests.support.rigs import published_rig, rig_with
+from tests.support.scenes import EVERYWHERE, scene_of
 
 COLUMNS, ROWS, PULSES = 10, 3, 8
 SYNC_NS = 5.0  # each board samples SYNC_IN so late at most, evenly drawn
@@ -24,7 +25,7 @@ def scan(scan_of, tmp_path_factory):
     found = BoardFilter(TRUE_KHZ, [1.0, 1.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
     made = head("hpf", [SourceScan("sweep", "sweep", True, 3)])
     path = write(FilterFile(**made, boards={"RH": found, "RV": found}), folder / "calibration")
-    true = rig_of(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
+    true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     more = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
     scan = scan_of(folder / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **more), true)
     _believe_programmed(scan)
@@ -45,7 +46,7 @@ def test_residuals_are_the_known_ones_and_those_of_processing(scan, tmp_path):
     told_by("image", scan, "--out", tmp_path / "image")
     report, quality = content(tmp_path / "report" / "sync.json"), content(tmp_path / "image" / "quality.json")
     assert report["simulated"] is True
-    slope = rig_of().chirp.slope_hz_per_s
+    slope = published_rig().chirp.slope_hz_per_s
     for name in ("RH", "RV"):
         found, stages = report["boards"][name], report["boards"][name]["stages"]
         assert (found["positions"], found["chirps"]) == (COLUMNS * ROWS, COLUMNS * ROWS * PULSES)
@@ -65,7 +66,7 @@ def test_residuals_are_the_known_ones_and_those_of_processing(scan, tmp_path):
 
 def test_the_direct_path_is_where_its_length_and_the_start_frequencies_put_it(scan_of, tmp_path):
     """In quality.json: smallest, median and largest IF over the positions."""
-    offset_hz, rig = 500e3, rig_of()
+    offset_hz, rig = 500e3, published_rig()
     disturbances = {"ideal": True, "if_offset_hz": offset_hz, "sync_uncertainty_ns": SYNC_NS}
     scene = scene_of(EVERYWHERE, columns=12, rows=2, pulses=1, disturbances=disturbances)
     told_by("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")

@@ -9,8 +9,9 @@ import tomli_w
 from polysight.host.cli import main
 from polysight.host.materials import Library
 from polysight.shared.tables import to_builtins
-
-from .conftest import COPPER, PET, rig_of, scene_of, told_by
+from tests.support.commands import told_by
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, PET, scene_of
 
 MORE = {"name": "rubber", "centre_mm": [-40.0, -50.0], "size_mm": [50.0, 50.0], "permittivity": [5.06, 1.11]}
 NAMES = ("PET", "copper", "rubber")
@@ -24,7 +25,7 @@ def scene(name: str):
 @pytest.fixture
 def rig_file(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_bytes(tomli_w.dumps(to_builtins(rig_of())).encode())
+    path.write_bytes(tomli_w.dumps(to_builtins(published_rig())).encode())
     return path
 
 

@@ -17,12 +17,12 @@ from polysight.host.jobs.materials import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.products.files import MATERIALS, SavedProducts, read_products
 from polysight.host.report import write_json
-from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins
+from tests.support.paths import RIG_FILE
+from tests.support.rigs import published_rig
 
-REPO = Path(__file__).resolve().parents[2]
-HERE = load_instrument(REPO / "instrument.toml")  # the rig file in the current folder
+HERE = published_rig()  # the rig file in the current folder
 USED = msgspec.structs.replace(  # the one the scan was made with: another slope, another window
     HERE, chirp=msgspec.structs.replace(HERE.chirp, slope_hz_per_s=HERE.chirp.slope_hz_per_s * 0.4, adc_start_us=9.0)
 )
@@ -48,7 +48,7 @@ def folder(tmp_path, monkeypatch):
     made = tmp_path / "made"
     write_json(made / "materials.json", {"segments": [row | part_of(complex(whole[0]))]})
     write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "instrument": to_builtins(USED)})
-    shutil.copy(REPO / "instrument.toml", tmp_path / "instrument.toml")
+    shutil.copy(RIG_FILE, tmp_path / "instrument.toml")
     monkeypatch.chdir(tmp_path)
     return made
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,14 +10,14 @@ import pytest
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.products.files import SCAN, write_scan_facts
-from polysight.shared.config import load_instrument
 from polysight.shared.tables import decode, to_builtins
+from tests.support.rigs import published_rig
 
 
 @pytest.fixture
 def rigs():
     """The scan's own rig, and another that the images were made with."""
-    own = load_instrument(Path(__file__).resolve().parents[2] / "instrument.toml")
+    own = published_rig()
     table = to_builtins(own)
     table["geometry"]["object_distance_mm"] = 501.25
     return own, decode(table, type(own), "as calibrated")

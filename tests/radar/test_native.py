@@ -16,7 +16,7 @@ from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.radar_board import RadarBoard
 from polysight.simulators.radar_usb import UsbChip
-from tests.radar.conftest import BoardWords
+from tests.support.radar.boards import BoardWords
 
 PERIOD_S = 1.5e-3
 FRAMES = 24

@@ -16,10 +16,8 @@ from polysight.host.products.files import read_products
 from polysight.host.report import export as hdf5
 from polysight.host.report import write_image, write_json
 from polysight.host.report.export import material_columns, write_csv, write_hdf5, write_mat
-from polysight.shared.config import load_instrument
-from polysight.shared.tables import to_builtins
+from tests.support.rigs import rig_table
 
-REPO = Path(__file__).resolve().parents[2]
 SEGMENTS = [
     {
         "label": 1, "name": "copper", "confidence": 1.0, "metal_reference": True, "metal_like": True,
@@ -51,7 +49,7 @@ def folder(tmp_path):
     write_image(made / "image.npz", h, v, h / v, x, y, valid)
     write_json(made / "materials.json", {"scan_id": "s", "simulated": True, "segments": SEGMENTS})
     write_json(made / "quality.json", {"boards": {"RH": {"frames_expected": 7}}})
-    rig = to_builtins(load_instrument(REPO / "instrument.toml"))
+    rig = rig_table()
     versions = {"polysight": "0.1.0", "numpy": np.__version__}
     write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "versions": versions, "instrument": rig})
     return made

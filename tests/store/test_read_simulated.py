@@ -8,13 +8,12 @@ import pytest
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.published import open_scan
 from polysight.host.store.validate import validate
-from polysight.shared.config import load_instrument
 from polysight.simulators.radar import SimulatedRig
 from polysight.simulators.scene import decode_scene
 from polysight.simulators.simulate import lost_bytes, simulate
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
-RIG = load_instrument(ROOT / "instrument.toml")
+RIG = published_rig()
 RAW = {
     "name": "plate",
     "grid": {"columns": 4, "rows": 3, "step_x_mm": 10.0, "step_y_mm": 6.0},

@@ -8,16 +8,14 @@ from typing import Any
 import tomli_w
 
 from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.tables import to_builtins
-
-from .conftest import REPO
+from tests.support.rigs import rig_table
 
 COLUMNS, ROWS, PULSES = 8, 3, 4
 
 
 def small_table(**limits: float) -> dict[str, Any]:
     """The rig file's tables for a scan of three rows of eight positions, with short limits."""
-    table = to_builtins(load_instrument(REPO / "instrument.toml"))
+    table = rig_table()
     table["grid"] |= {"columns": COLUMNS, "rows": ROWS}
     table["burst"] |= {"pulses": PULSES}
     table["limits"] |= {"end_of_record_s": 1.0, "row_retakes": 2, **limits}

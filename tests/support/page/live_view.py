@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,16 +13,7 @@ from polysight.host.page.server import make_app, server
 from polysight.host.page.watch import Watch
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import EVENTS, MANIFEST, utc_now
-
-LIMIT_S = 60.0
-
-
-def wait_for(condition: Callable[[], object], what: str, limit_s: float = LIMIT_S) -> None:
-    """Return when the condition holds; fail after the limit."""
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {limit_s:g} s: {what}"
-        time.sleep(0.02)
+from tests.support.processes import LIMIT_S, wait_for
 
 
 class GrowingScan:

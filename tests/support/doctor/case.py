@@ -8,26 +8,15 @@ import numpy as np
 from polysight.host.calibration.direct_signal import find_direct
 from polysight.host.doctor.bench import Bench, System, Wanted
 from polysight.host.sync import BoardSetup
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.radar import SimulatedRig
 from polysight.simulators.scene import decode_scene
+from tests.support.rigs import programmed_rig
 
-REPO = Path(__file__).resolve().parents[2]
 QUICK = System(write_speed=lambda _folder: 200e6)
 FRAMES = 32
 
 
-def rig_with(offset_hz=790e3, **tables):
-    table = to_builtins(load_instrument(REPO / "instrument.toml"))
-    for board in table["boards"]:
-        board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else offset_hz
-    for name, change in tables.items():
-        table[name] |= change
-    return decode(table, Instrument, "test")
-
-
-RIG = rig_with()
+RIG = programmed_rig()
 SMALL = {
     "name": "s",
     "grid": {"columns": 4, "rows": 2},

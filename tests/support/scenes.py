@@ -6,6 +6,10 @@ from typing import Any
 
 import tomli_w
 
+COPPER = {"name": "copper", "centre_mm": [-40.0, 10.0], "size_mm": [50.0, 50.0], "metal": True}
+PET = {"name": "PET", "centre_mm": [40.0, -10.0], "size_mm": [50.0, 50.0], "permittivity": [3.78, 0.7]}
+EVERYWHERE = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [500.0, 400.0], "metal": True}
+
 
 def small_scene(
     columns: int,
@@ -29,3 +33,15 @@ def small_scene(
         plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}
         scene["plates"] = [plate]
     return tomli_w.dumps(scene)
+
+
+def scene_of(*plates: dict[str, Any], columns: int, rows: int, pulses: int = 2, **more: Any) -> dict[str, Any]:
+    """A scene of plates on a coarse grid."""
+    return {
+        "name": "small",
+        "grid": {"columns": columns, "rows": rows, "step_x_mm": 14.0, "step_y_mm": 8.0},
+        "burst": {"pulses": pulses},
+        "image": {"columns": 50, "rows": 40, "pixel_mm": 4.0},
+        "plates": list(plates),
+        **more,
+    }

@@ -26,16 +26,16 @@ from polysight.host.store.scan_folder import MANIFEST, PART, ScanFolder
 from polysight.pi_controller.journal import JournalFolder, JournalFullError
 from polysight.pi_controller.ledger import Ledger
 from polysight.shared import messages as m
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.raster import plan_raster
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.radar import SimulatedRig
 from polysight.simulators.scene import load_scene
 from polysight.simulators.simulate import row_offsets_mm
-from tests.small_scene import small_scene
+from tests.support.rigs import published_rig
+from tests.support.scenes import small_scene
 
-REPO = Path(__file__).resolve().parents[2]
 SCENE = small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
 
 
@@ -44,7 +44,7 @@ class Samples:
 
     def __init__(self, folder: Path) -> None:
         (folder / "scene.toml").write_text(SCENE)
-        radar = SimulatedRig(load_instrument(REPO / "instrument.toml"), load_scene(folder / "scene.toml"))
+        radar = SimulatedRig(published_rig(), load_scene(folder / "scene.toml"))
         table = to_builtins(radar.rig)
         table["limits"] |= {"free_disk_bytes": 0}
         self.instrument = decode(table, Instrument, "small scan")

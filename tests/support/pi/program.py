@@ -8,7 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from tests.support.paths import REPO
+
 PROGRAM = (sys.executable, "-m", "polysight.pi_controller")
 
 
@@ -21,7 +22,7 @@ class Process:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            cwd=ROOT,
+            cwd=REPO,
             env={**os.environ, **environment},
         )
         assert self.popen.stdout is not None
@@ -50,7 +51,7 @@ def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
         capture_output=True,
         text=True,
         timeout=120,
-        cwd=ROOT,
+        cwd=REPO,
         env={**os.environ, **environment},
     )
     assert "Traceback" not in done.stderr

@@ -21,6 +21,7 @@ from polysight.host.store.validate import to_json, validate
 from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 from polysight.shared.messages import Fault, RunStarted
 from polysight.shared.raster import plan_raster
+from tests.support.acquisition.fake_rig import small_instrument
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -87,9 +88,9 @@ def test_two_writers_never_share_a_scan(tmp_path):
 
 
 @pytest.fixture
-def whole(make_instrument, tmp_path) -> Path:
+def whole(tmp_path) -> Path:
     """A scan folder of four rows, written without any rig; row 1 of RV lacks some bytes."""
-    instrument = make_instrument()
+    instrument = small_instrument()
     scan = ScanFolder.create(tmp_path / "scan", instrument, plan_raster(instrument.grid), simulated=True)
     frames = instrument.grid.columns * instrument.burst.pulses
     events = EventWriter(scan.path / "events.msgpack")
@@ -277,8 +278,8 @@ def test_scan_ids_fit_the_wire():
     json.dumps(name)
 
 
-def test_start_that_died_before_its_first_line_is_begun_anew(make_instrument, tmp_path):
-    instrument = make_instrument()
+def test_start_that_died_before_its_first_line_is_begun_anew(tmp_path):
+    instrument = small_instrument()
     for torn in (b"", b'{"fact":"scan_star'):
         (tmp_path / "manifest.jsonl").write_bytes(torn)
         assert ScanFolder.create(tmp_path, instrument, plan_raster(instrument.grid)).committed() == {}

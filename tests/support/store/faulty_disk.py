@@ -12,6 +12,7 @@ import os
 import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -20,6 +21,7 @@ import pytest
 
 Fault = Literal["full", "short", "killed", "killed within", "power cut"]
 SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "unlink", "ftruncate", "posix_fallocate")
+REAL_OPEN = io.open
 REAL = SimpleNamespace(**{name: getattr(os, name) for name in SEEN})
 GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsync")
 
@@ -100,106 +102,108 @@ class FaultyDisk:
     @contextmanager
     def __call__(self) -> Iterator[FaultyDisk]:
         """Within the block everything goes through here."""
-        real_open = io.open
-        disk = self
-
-        class File(io.FileIO):
-            """A file whose writes are seen."""
-
-            def write(self, data: Any) -> int:
-                path, start = Path(str(self.name)), self.tell()
-                disk._touch(path)
-                disk._hit("write", path, lambda: REAL.pwrite(self.fileno(), bytes(data)[: len(data) // 2], start))
-                return super().write(data)
-
-            def truncate(self, size: int | None = None) -> int:
-                disk._touch(Path(str(self.name)))
-                disk._hit("truncate", Path(str(self.name)))
-                return super().truncate(size)
-
-        def opened(file: Any, mode: str = "r", buffering: int = -1, *more: Any, **named: Any) -> Any:
-            path = Path(str(file))
-            if isinstance(file, int) or not str(path).startswith(disk._folder) or not set(mode) & set("wxa+"):
-                return real_open(file, mode, buffering, *more, **named)
-            new = not path.exists()
-            if new:
-                disk._hit("create", path)
-            disk._touch(path)
-            raw = File(str(path), mode.replace("b", ""))
-            if new:
-                disk._undo.append((path.parent, lambda: path.unlink(missing_ok=True)))
-            if buffering == 0:
-                return raw
-            return io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
-
-        def path_of(fd: int) -> Path:
-            return Path(f"/proc/self/fd/{fd}").readlink()
-
-        def os_open(path: Any, flags: int, *more: Any, **named: Any) -> int:
-            new = flags & os.O_CREAT and not Path(path).exists()
-            if new:
-                disk._hit("create", Path(path))
-            fd = REAL.open(path, flags, *more, **named)
-            if new and str(path).startswith(disk._folder):
-                disk._durable.setdefault(Path(path), b"")
-                disk._undo.append((Path(path).parent, lambda: Path(path).unlink(missing_ok=True)))
-            return fd
-
-        def pwrite(fd: int, data: Any, offset: int) -> int:
-            path = path_of(fd)
-            disk._touch(path)
-            disk._hit("pwrite", path, lambda: REAL.pwrite(fd, bytes(data)[: len(data) // 2], offset))
-            return REAL.pwrite(fd, data, offset)
-
-        def on_file(name: str) -> Callable[..., Any]:
-            def call(fd: int, *more: Any) -> Any:
-                disk._touch(path_of(fd))
-                disk._hit(name, path_of(fd))
-                return getattr(REAL, name)(fd, *more)
-
-            return call
-
-        def fsync(fd: int) -> None:
-            disk._hit("fsync", path_of(fd))
-            disk._synced(path_of(fd))  # not the real one: this machine's disk need not wait
-
-        def mkdir(path: Any, *more: Any, **named: Any) -> None:
-            disk._hit("mkdir", Path(path))
-            REAL.mkdir(path, *more, **named)
-            if str(path).startswith(disk._folder):
-                disk._undo.append((Path(path).parent, Path(path).rmdir))
-
-        def rename(a: Any, b: Any, **named: Any) -> None:
-            a, b = Path(a), Path(b)
-            disk._hit("rename", b)
-            before = b.read_bytes() if b.exists() else None
-            REAL.rename(a, b, **named)
-            disk._durable.pop(b, None)
-            if a in disk._durable:
-                disk._durable[b] = disk._durable.pop(a)
-
-            def back() -> None:
-                if b.exists():
-                    REAL.rename(b, a)
-                if before is not None:
-                    b.write_bytes(before)
-
-            disk._undo.append((b.parent, back))
-
-        def unlink(path: Any, **named: Any) -> None:
-            disk._hit("unlink", Path(path))
-            REAL.unlink(path, **named)
-            disk._durable.pop(Path(path), None)
-
+        calls = {"open": self._os_open, "pwrite": self._pwrite, "fsync": self._fsync, "mkdir": self._mkdir}
+        calls |= {"rename": self._rename, "unlink": self._unlink}
+        calls |= {name: partial(self._on_file, name) for name in ("ftruncate", "posix_fallocate")}
         with pytest.MonkeyPatch.context() as patch:
-            calls = {"open": os_open, "pwrite": pwrite, "fsync": fsync, "mkdir": mkdir, "rename": rename}
-            calls |= {"unlink": unlink} | {n: on_file(n) for n in ("ftruncate", "posix_fallocate")}
             for name, call in calls.items():
                 patch.setattr(os, name, call)
-            patch.setattr(io, "open", opened)
+            patch.setattr(io, "open", self._opened)
             try:
                 yield self
             finally:
                 killed = self._dead
         if killed and self._fault == "power cut":
             self.lose_power()
+
+    def _opened(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **named: Any) -> Any:
+        path = Path(str(file))
+        if isinstance(file, int) or not str(path).startswith(self._folder) or not set(mode) & set("wxa+"):
+            return REAL_OPEN(file, mode, buffering, *more, **named)
+        new = not path.exists()
+        if new:
+            self._hit("create", path)
+        self._touch(path)
+        raw = _SeenFile(self, str(path), mode.replace("b", ""))
+        if new:
+            self._undo.append((path.parent, lambda: path.unlink(missing_ok=True)))
+        if buffering == 0:
+            return raw
+        return io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
+
+    def _os_open(self, path: Any, flags: int, *more: Any, **named: Any) -> int:
+        new = flags & os.O_CREAT and not Path(path).exists()
+        if new:
+            self._hit("create", Path(path))
+        fd = REAL.open(path, flags, *more, **named)
+        if new and str(path).startswith(self._folder):
+            self._durable.setdefault(Path(path), b"")
+            self._undo.append((Path(path).parent, lambda: Path(path).unlink(missing_ok=True)))
+        return fd
+
+    def _pwrite(self, fd: int, data: Any, offset: int) -> int:
+        path = _path_of(fd)
+        self._touch(path)
+        self._hit("pwrite", path, lambda: REAL.pwrite(fd, bytes(data)[: len(data) // 2], offset))
+        return REAL.pwrite(fd, data, offset)
+
+    def _on_file(self, name: str, fd: int, *more: Any) -> Any:
+        self._touch(_path_of(fd))
+        self._hit(name, _path_of(fd))
+        return getattr(REAL, name)(fd, *more)
+
+    def _fsync(self, fd: int) -> None:
+        self._hit("fsync", _path_of(fd))
+        self._synced(_path_of(fd))  # not the real one: this machine's disk need not wait
+
+    def _mkdir(self, path: Any, *more: Any, **named: Any) -> None:
+        self._hit("mkdir", Path(path))
+        REAL.mkdir(path, *more, **named)
+        if str(path).startswith(self._folder):
+            self._undo.append((Path(path).parent, Path(path).rmdir))
+
+    def _rename(self, a: Any, b: Any, **named: Any) -> None:
+        a, b = Path(a), Path(b)
+        self._hit("rename", b)
+        before = b.read_bytes() if b.exists() else None
+        REAL.rename(a, b, **named)
+        self._durable.pop(b, None)
+        if a in self._durable:
+            self._durable[b] = self._durable.pop(a)
+
+        def back() -> None:
+            if b.exists():
+                REAL.rename(b, a)
+            if before is not None:
+                b.write_bytes(before)
+
+        self._undo.append((b.parent, back))
+
+    def _unlink(self, path: Any, **named: Any) -> None:
+        self._hit("unlink", Path(path))
+        REAL.unlink(path, **named)
+        self._durable.pop(Path(path), None)
+
+
+class _SeenFile(io.FileIO):
+    """A file whose writes the disk sees."""
+
+    def __init__(self, disk: FaultyDisk, path: str, mode: str) -> None:
+        self._disk = disk
+        super().__init__(path, mode)
+
+    def write(self, data: Any) -> int:
+        path, start = Path(str(self.name)), self.tell()
+        self._disk._touch(path)
+        self._disk._hit("write", path, lambda: REAL.pwrite(self.fileno(), bytes(data)[: len(data) // 2], start))
+        return super().write(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        self._disk._touch(Path(str(self.name)))
+        self._disk._hit("truncate", Path(str(self.name)))
+        return super().truncate(size)
+
+
+def _path_of(fd: int) -> Path:
+    """The path that a descriptor is open at."""
+    return Path(f"/proc/self/fd/{fd}").readlink()

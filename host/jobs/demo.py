@@ -147,7 +147,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
         scan = [
             sys.executable,
             "-m",
-            "polysight.host.cli",
+            "polysight.host",
             "scan",
             "--config",
             str(rig_file),

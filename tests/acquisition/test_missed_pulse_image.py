@@ -8,9 +8,8 @@ import pytest
 from polysight.host.acquisition.missed_pulses import place_frames
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.sources.source import RowData
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.host.store.source import RowData
+from polysight.simulators.scene import load_scene, simulate
 from tests.support.acquisition.arrival_model import PAYLOAD, Load, pulse_times, receive
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
@@ -21,6 +20,8 @@ SCENE = small_scene(24, 10, step_mm=(5.0, 10.0), pulses=6, pixels=24, pixel_mm=5
 class Missed:
     """The clean scan, of which every row of both boards misses pulses; `place` says whether its frames are placed."""
 
+    mirrored = synchronised = False
+
     def __init__(self, clean: ScanFolder, place: bool) -> None:
         self._clean, self._place = clean, place
         self.instrument, self.plan = clean.instrument, clean.plan
@@ -29,6 +30,9 @@ class Missed:
 
     def rows(self):
         return self._clean.rows()
+
+    def recording_facts(self):
+        return {}
 
     def read_row(self, board: str, row: int) -> RowData:
         whole, frame = self._clean.read_row(board, row), self.instrument.frame_bytes

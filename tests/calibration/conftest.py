@@ -12,8 +12,7 @@ import pytest
 
 from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import Change, rig_with
 
 

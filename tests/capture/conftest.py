@@ -11,7 +11,7 @@ import tomli_w
 
 from polysight.shared.config import Board, Instrument
 from polysight.shared.tables import to_builtins
-from polysight.simulators.card_faults import Faults
+from polysight.simulators.faults import Faults
 from polysight.simulators.loopback import on_free_subnet
 from tests.support.capture.cards import Cards
 from tests.support.rigs import rig_with

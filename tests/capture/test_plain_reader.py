@@ -19,8 +19,7 @@ from polysight.host.store.events import EventWriter
 from polysight.host.store.manifest import ManifestWriter
 from polysight.pi_controller.journal import Journal
 from polysight.shared.messages import Capture, RunStopped, pack
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import Library
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 from tests.support.paths import REPO
 from tests.support.rigs import published_rig
 

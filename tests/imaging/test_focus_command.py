@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.imaging.focus import Focus
 from polysight.host.jobs import process as offline
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 from tests.support.rigs import published_rig
 
 SCENE = {

@@ -11,7 +11,7 @@ import socket
 import pytest
 
 from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
-from polysight.host.cli import build_parser
+from polysight.host.cli.main import build_parser
 from polysight.host.page.server import STATIC, TOKEN_HEADER, is_loopback
 from tests.support.page.live_view import served
 from tests.support.paths import REPO

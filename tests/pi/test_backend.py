@@ -13,7 +13,7 @@ from polysight.pi_controller.lines_gpiomem import GpiomemLines
 from polysight.pi_controller.lines_wires import WireLines
 from polysight.pi_controller.service import Options, Service
 from polysight.shared import messages as m
-from polysight.shared.backends import is_simulated
+from polysight.shared.messages import is_simulated
 from tests.support.pi.host_side import HostSide
 
 

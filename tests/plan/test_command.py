@@ -8,7 +8,7 @@ import tomllib
 import pytest
 import tomli_w
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from tests.support.paths import RIG_FILE
 
 RIG = ["--config", str(RIG_FILE)]

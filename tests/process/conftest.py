@@ -13,8 +13,7 @@ from polysight.host.materials import TruthPlate, read_truth
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument
-from polysight.simulators.scene import Scene, decode_scene, load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import Scene, decode_scene, load_scene, simulate
 from tests.support.paths import EXAMPLES
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of

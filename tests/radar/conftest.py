@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from polysight.shared.config import Instrument
-from polysight.simulators.radar_board import RadarBoard
+from polysight.simulators.radars import RadarBoard
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
 

@@ -8,7 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 
 
 def told_by(*arguments: object) -> str:

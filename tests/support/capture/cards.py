@@ -10,12 +10,9 @@ from itertools import repeat
 from pathlib import Path
 
 from polysight.shared.config import Board
-from polysight.simulators.card_endpoint import CardEndpoint
-from polysight.simulators.card_faults import Faults
-from polysight.simulators.card_sender import Pace
-from polysight.simulators.dca1000 import Network
+from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace
+from polysight.simulators.faults import Faults
 from polysight.simulators.replay import Player, Recording
-from polysight.simulators.simulated_card import MAC
 
 LIMIT_S = 60.0
 

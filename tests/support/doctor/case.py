@@ -8,8 +8,7 @@ import numpy as np
 from polysight.host.calibration.direct_signal import find_direct
 from polysight.host.doctor.bench import Bench, System, Wanted
 from polysight.host.sync import BoardSetup
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import programmed_rig
 
 QUICK = System(write_speed=lambda _folder: 200e6)

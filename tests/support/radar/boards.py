@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import msgspec
 
 from polysight.shared.config import Instrument, NativeRadar, Radar
-from polysight.simulators.radar_board import FUNCTIONAL, RadarBoard
+from polysight.simulators.radars import FUNCTIONAL, RadarBoard
 from tests.support.rigs import published_rig
 
 

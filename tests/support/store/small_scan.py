@@ -30,9 +30,7 @@ from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.raster import plan_raster
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import row_offsets_mm
+from polysight.simulators.scene import SimulatedRig, load_scene, row_offsets_mm
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 

@@ -1,4 +1,4 @@
-"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> metal reference -> materials -> report."""
+"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> metal reference -> materials."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Pipeline:
         return tuple(images.transposed() for images in made) if self.source.mirrored else made
 
     def metal_plane(self, options: process.Options, in_scene: bool = False) -> polarimetry.PlaneReference | None:
-        """Metal scanned on its own: as asked for, or as calibrated unless metal `in_scene` is named. Raises DataError."""
+        """Metal scanned on its own: as asked for, or as calibrated unless metal `in_scene` is named."""
         in_scene = in_scene or options.metal_box_mm is not None
         return self.calibration.metal_plane(self.rig, options.reference, in_scene, options.bands)
 

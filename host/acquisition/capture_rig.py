@@ -12,12 +12,17 @@ from enum import Enum
 from pathlib import Path
 from types import TracebackType
 
-from polysight.host.capture.card import CardClient
-from polysight.host.capture.dca1000 import Status, Version
-from polysight.host.capture.network import check_receive_buffer
-from polysight.host.capture.receiver import Progress, ReceiverProcess, RowCapture
-from polysight.host.capture.scheduling import receiver_cores
-from polysight.host.store.scan_folder import PART
+from polysight.host.capture import (
+    CardClient,
+    Progress,
+    ReceiverProcess,
+    RowCapture,
+    Status,
+    Version,
+    check_receive_buffer,
+    receiver_cores,
+)
+from polysight.host.store import PART
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 

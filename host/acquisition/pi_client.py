@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import zmq
 
-from polysight.host.capture.scheduling import take_priority
+from polysight.host.capture import take_priority
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError, ProtocolError, ScanError
 from polysight.shared.messages import (

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from os import PRIO_PROCESS, getpriority, setpriority
 
-from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store import ScanFolder
 from polysight.shared.messages import ExitStatus
 
 OnRow = Callable[[int], None]

@@ -14,7 +14,7 @@ from pathlib import Path
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.pi_client import AT_WORK, PiClient
 from polysight.host.acquisition.take import ON_REQUEST
-from polysight.host.store.manifest import Fact
+from polysight.host.store import Fact
 from polysight.shared.config import Instrument, Stage
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import PiFault, explain

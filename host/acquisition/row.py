@@ -18,8 +18,8 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.slipped_row import ToldCapture, find_frames, find_slip
 from polysight.host.acquisition.take import ON_REQUEST, FaultKind, Take, TakeFault
-from polysight.host.radar.interface import RadarControl
-from polysight.host.store.scan_folder import PART
+from polysight.host.radar import RadarControl
+from polysight.host.store import PART
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import explain

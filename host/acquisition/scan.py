@@ -17,12 +17,17 @@ from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult
 from polysight.host.acquisition.ready import check_same_stage, differences, pi_fact
 from polysight.host.acquisition.scan_loop import RunningScan
-from polysight.host.calibration.active import keep_in_scan
-from polysight.host.radar.backends import radar_control
-from polysight.host.radar.interface import RadarControl
-from polysight.host.store.manifest import ManifestWriter
-from polysight.host.store.scan_folder import ScanFolder, check_same_scan, connection_of, new_scan_id, utc_now
-from polysight.host.store.validate import damaged_rows
+from polysight.host.calibration import keep_in_scan
+from polysight.host.radar import RadarControl, radar_control
+from polysight.host.store import (
+    ManifestWriter,
+    ScanFolder,
+    check_same_scan,
+    connection_of,
+    damaged_rows,
+    new_scan_id,
+    utc_now,
+)
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ScanError
 from polysight.shared.messages import HelloReply, is_simulated

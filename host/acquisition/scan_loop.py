@@ -21,10 +21,8 @@ from polysight.host.acquisition.progress import (
 from polysight.host.acquisition.ready import check_disk, check_may_move, make_ready
 from polysight.host.acquisition.row import RowState, RowTaker, RowTransaction
 from polysight.host.acquisition.take import ON_REQUEST, Take, commit_row, gave_up, reasons, reject_row
-from polysight.host.radar.interface import RadarControl
-from polysight.host.store.events import EventWriter, read_events
-from polysight.host.store.manifest import Fact, ManifestWriter
-from polysight.host.store.scan_folder import EVENTS, ScanFolder, utc_now
+from polysight.host.radar import RadarControl
+from polysight.host.store import EVENTS, EventWriter, Fact, ManifestWriter, ScanFolder, read_events, utc_now
 from polysight.shared.errors import PolysightError, advice
 from polysight.shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
 from polysight.shared.raster import Row

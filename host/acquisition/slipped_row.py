@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from polysight.host.capture.receiver import RowCapture
-from polysight.host.capture.segment import read_index, write_index
+from polysight.host.capture import RowCapture, read_index, write_index
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 from polysight.shared.messages import Capture

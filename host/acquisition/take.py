@@ -11,13 +11,9 @@ from enum import StrEnum
 
 from polysight.host.acquisition.missed_pulses import PlacedFrames
 from polysight.host.acquisition.slipped_row import ToldCapture, describe, write_in_place
-from polysight.host.capture.decode import valid_frames
-from polysight.host.capture.network import silent_radar
-from polysight.host.capture.receiver import RowCapture
-from polysight.host.radar.interface import BoardState, RadarState
-from polysight.host.store.append_only import sync_folder
-from polysight.host.store.manifest import Fact, ManifestWriter
-from polysight.host.store.scan_folder import PART, ScanFolder, utc_now
+from polysight.host.capture import RowCapture, silent_radar, valid_frames
+from polysight.host.radar import BoardState, RadarState
+from polysight.host.store import PART, Fact, ManifestWriter, ScanFolder, sync_folder, utc_now
 from polysight.shared.errors import DeviceError, ScanError, advice
 from polysight.shared.faults import explain
 from polysight.shared.messages import RowFinished

@@ -15,17 +15,15 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from polysight.host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
-from polysight.host.imaging.gain_conditions import ImagedWith
-from polysight.host.imaging.geometry import image_grid
-from polysight.host.store import manifest
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.host.imaging import ImagedWith, image_grid
+from polysight.host.store import MANIFEST, ScanFolder, manifest
 from polysight.shared.config import Board, Instrument, MountStep
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import to_builtins
 
 if TYPE_CHECKING:
     from polysight.host.polarimetry import PlaneReference
-    from polysight.host.sync.high_pass import HighPass
+    from polysight.host.sync import HighPass
 
 FOLDER = "calibration"
 FACT = "calibration"
@@ -84,7 +82,7 @@ class Calibration:
 
     def high_pass(self, board: str) -> HighPass | None:
         """A board's filter as measured; None: as programmed."""
-        from polysight.host.sync.high_pass import HighPass
+        from polysight.host.sync import HighPass
 
         found = None if self.filters is None else self.filters.boards.get(board)
         return None if found is None else HighPass(tuple(1e3 * corner for corner in found.corners_khz))

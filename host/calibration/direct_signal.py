@@ -19,14 +19,9 @@ from numpy.typing import NDArray
 
 from polysight.host.calibration.files import BoardStart
 from polysight.host.calibration.rows import board_rows
-from polysight.host.radar.constraints import direct_if_hz
-from polysight.host.store.source import RawSource
-from polysight.host.sync import BoardSetup
-from polysight.host.sync.align import AlignedRow, align_row, whole_blocks
-from polysight.host.sync.direct_path import reference
-from polysight.host.sync.passes import FOLD
-from polysight.host.sync.residuals import noise_power
-from polysight.host.sync.tone import cis
+from polysight.host.radar import direct_if_hz
+from polysight.host.store import RawSource
+from polysight.host.sync import FOLD, AlignedRow, BoardSetup, align_row, cis, noise_power, reference, whole_blocks
 from polysight.shared.config import Board, Instrument
 from polysight.shared.errors import DataError
 

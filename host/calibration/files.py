@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import msgspec
 import tomli_w
 
-from polysight.host.imaging.gain_conditions import ImagedWith
-from polysight.host.store.scan_folder import versions
+from polysight.host.imaging import ImagedWith
+from polysight.host.store import versions
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.tables import decode, read_toml, to_builtins

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from polysight.host.calibration.direct_signal import find_direct
 from polysight.host.calibration.files import BoardFilter, places_crc32
 from polysight.host.calibration.rows import board_rows
-from polysight.host.store.source import RawSource
-from polysight.host.sync import BoardSetup
-from polysight.host.sync.high_pass import HighPass, fit_high_pass
+from polysight.host.store import RawSource
+from polysight.host.sync import BoardSetup, HighPass, fit_high_pass
 from polysight.shared.config import Board
 from polysight.shared.errors import DataError
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.calibration.files import MetalBand, MetalFile, SourceScan, head, write
-from polysight.host.imaging.images import SubBand
+from polysight.host.imaging import SubBand
 from polysight.host.polarimetry import PlaneReference
 from polysight.shared.errors import DataError, DeviceError
 

@@ -27,11 +27,9 @@ from numpy.typing import NDArray
 
 from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, head, places_crc32
 from polysight.host.calibration.rows import board_rows
-from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
-from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.host.store.source import RawSource
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.high_pass import HighPass
+from polysight.host.imaging import Antennas, image_grid, reduction, row_offsets_m, scene_gate_m
+from polysight.host.store import RawSource
+from polysight.host.sync import BoardSetup, HighPass, synchronise_row
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import specular_midpoint_m

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.calibration.files import SourceScan
-from polysight.host.capture.decode import row_words
-from polysight.host.store.source import RawSource, raw_source
-from polysight.host.store.sources.open import open_source
+from polysight.host.capture import row_words
+from polysight.host.store import RawSource, open_source, raw_source
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 

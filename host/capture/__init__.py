@@ -1,1 +1,50 @@
-"""Radar samples from DCA1000 capture cards: control, reception, placement by byte count, decoding."""
+"""Radar samples from DCA1000 capture cards: control, reception, placement by byte count, decoding.
+
+`CardClient` controls a card over UDP, `survey_cards` tries each hop to it. One process a card (`receiver_process`, driven
+by `ReceiverProcess`) places packets into the row's file; `RowCapture` says what is missing. `row_words` turns payload into
+samples. `inspect_bin` and `inspect_pcap` say what is in any recording.
+"""
+
+from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
+from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES, Code, Status, Version
+from polysight.host.capture.decode import decode_row, raw_words, row_words, valid_frames
+from polysight.host.capture.inspect import CardReport, Known, Report, inspect_bin
+from polysight.host.capture.inspect_pcap import inspect_pcap, is_pcap
+from polysight.host.capture.network import check_receive_buffer, route_interface, silent_radar
+from polysight.host.capture.receiver import Progress, ReceiverProcess, RowCapture
+from polysight.host.capture.scheduling import receiver_cores, take_priority
+from polysight.host.capture.segment import read_index, write_index
+from polysight.host.capture.survey import CardSurvey, HopFinding, survey_cards
+
+__all__ = [
+    "MAX_PAYLOAD_BYTES",
+    "CardClient",
+    "CardReport",
+    "CardSurvey",
+    "Code",
+    "EepromSettings",
+    "HopFinding",
+    "Known",
+    "Progress",
+    "ReceiverProcess",
+    "Report",
+    "RowCapture",
+    "Status",
+    "Version",
+    "check_receive_buffer",
+    "decode_row",
+    "inspect_bin",
+    "inspect_pcap",
+    "is_pcap",
+    "program_eeprom",
+    "raw_words",
+    "read_index",
+    "receiver_cores",
+    "route_interface",
+    "row_words",
+    "silent_radar",
+    "survey_cards",
+    "take_priority",
+    "valid_frames",
+    "write_index",
+]

@@ -2,7 +2,7 @@
 
 What is not known is guessed from the statistics, and called a guess: of all layouts that fit, the one whose spectra
 have the least disorder is taken. A file of whole packets, headers included, is recognised and placed by byte count
-first. `inspect_pcap.py` reads packet captures; `polysight.host.jobs.scan_files` prints and plots the report.
+first. `inspect_pcap.py` reads packet captures; `polysight.host.jobs.look` prints and plots the report.
 """
 
 from __future__ import annotations

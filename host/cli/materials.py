@@ -10,7 +10,7 @@ from polysight.host.cli.options import Add, add_config_option, add_model_option,
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
-    from polysight.host.materials.layers import Layer
+    from polysight.host.materials import Layer
 
 
 def _materials(args: argparse.Namespace) -> int:
@@ -234,7 +234,7 @@ _FORMATS = {
 
 
 def _export(args: argparse.Namespace) -> int:
-    from polysight.host.report.export import export
+    from polysight.host.report import export
 
     return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
 

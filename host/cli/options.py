@@ -93,7 +93,7 @@ def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
 
 
 def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> None:
-    """Add `--config`. `shipped`: without hardware, the rig file that comes with polysight will do where none is here."""
+    """Add `--config`. `shipped`: the rig file that comes with polysight will do where none is here (no hardware)."""
     where = "instrument.toml here, or else the one that comes with polysight" if shipped else "instrument.toml"
     default = packaged(RIG) if shipped else RIG
     sub.add_argument("--config", type=Path, default=default, metavar="FILE", help=f"rig file (default: {where})")

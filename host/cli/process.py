@@ -18,12 +18,12 @@ from polysight.host.cli.options import (
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
-    from polysight.host.process.request import ProcessRequest
+    from polysight.host.process import ProcessRequest
 
 
 def request_of(args: argparse.Namespace, data: Path, out: Path) -> ProcessRequest:
     """What the options of `polysight process` ask to do with one scan. Raises ConfigError."""
-    from polysight.host.process.request import ProcessRequest
+    from polysight.host.process import ProcessRequest
 
     if args.reference is None and args.reference_by is not None:
         raise ConfigError(

@@ -88,8 +88,7 @@ def _add_card(add_command: Add) -> None:
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from polysight.host.doctor.bench import Wanted
-    from polysight.host.doctor.walk import doctor
+    from polysight.host.doctor import Wanted, doctor
 
     if args.move and not args.pulse:
         raise ConfigError(
@@ -144,8 +143,7 @@ _NUMBERS = (
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from polysight.host.plan.search import Changes
-    from polysight.host.plan.text import Wanted, plan
+    from polysight.host.plan import Changes, Wanted, plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     wanted = Wanted(args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json)
@@ -186,7 +184,7 @@ def _add_plan(add: Add) -> None:
 
 
 def _inspect(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.scan_files import inspect_file
+    from polysight.host.jobs.look import inspect_file
 
     return inspect_file(args.file, args.config, args.plot, args.card, args.json)
 

@@ -11,12 +11,12 @@ from polysight.host.cli.options import Add, add_config_option, add_material_opti
 from polysight.shared.errors import ConfigError
 
 if TYPE_CHECKING:
-    from polysight.host.process.request import ProcessRequest
+    from polysight.host.process import ProcessRequest
 
 
 def _request(args: argparse.Namespace, folder: Path) -> ProcessRequest:
     """How the scan is processed: its products go into its own folder."""
-    from polysight.host.process.request import ProcessRequest
+    from polysight.host.process import ProcessRequest
 
     return ProcessRequest(data=str(folder), out=str(folder / "products"), **material_request(args))
 
@@ -34,13 +34,13 @@ def _resume(args: argparse.Namespace) -> int:
 
 
 def _validate(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.scan_files import validate_folder
+    from polysight.host.jobs.look import validate_folder
 
     return validate_folder(args.folder, args.json)
 
 
 def _drop_raw(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.scan_files import drop_raw
+    from polysight.host.jobs.drop_raw import drop_raw
 
     return drop_raw(args.folder, args.products, args.yes)
 
@@ -121,7 +121,7 @@ def _preview(args: argparse.Namespace) -> int:
         )
     if args.folder.exists() and not args.folder.is_dir():
         raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
-    from polysight.host.page.server import preview
+    from polysight.host.page import preview
 
     return preview(args.folder, args.host, args.port, args.control)
 

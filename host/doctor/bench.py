@@ -27,20 +27,16 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from polysight.host.acquisition.capture_rig import CaptureRig
-from polysight.host.acquisition.pi_client import PiClient
-from polysight.host.capture.decode import row_words
-from polysight.host.capture.receiver import RowCapture
-from polysight.host.capture.survey import CardSurvey, survey_cards
-from polysight.host.radar.backends import radar_control
-from polysight.host.radar.interface import BoardState
-from polysight.host.store.scan_folder import PART
+from polysight.host.acquisition import CaptureRig, PiClient
+from polysight.host.capture import CardSurvey, RowCapture, row_words, survey_cards
+from polysight.host.radar import BoardState, radar_control
+from polysight.host.store import PART
 from polysight.shared.config import Board, Instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.messages import HelloReply, Pulsed
 
 if TYPE_CHECKING:
-    from polysight.host.calibration.direct_signal import DirectSignal
+    from polysight.host.calibration import DirectSignal
 
 Verdict = Literal["ok", "warning", "error", "not checked"]
 BURSTS = 4  # of a capture at rest

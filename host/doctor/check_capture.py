@@ -9,19 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from polysight.host.acquisition.pi_client import RefusedError
-from polysight.host.calibration.direct_signal import (
-    FULL_SCALE,
-    DirectSignal,
-    band_hz,
-    find_direct,
-    jitter_hz,
-    unwrapped,
-)
-from polysight.host.capture.network import route_interface, silent_radar
-from polysight.host.capture.survey import HopFinding
+from polysight.host.acquisition import RefusedError
+from polysight.host.calibration import FULL_SCALE, DirectSignal, band_hz, find_direct, jitter_hz, unwrapped
+from polysight.host.capture import HopFinding, route_interface, silent_radar
 from polysight.host.doctor.bench import Bench, Finding, error, nic, not_checked, ok, warning
-from polysight.host.radar.interface import RadarState
+from polysight.host.radar import RadarState
 from polysight.shared.config import Board, Instrument
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import MOST_PULSES, MOST_PULSES_S

@@ -6,13 +6,12 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-from polysight.host.calibration.active import checked
+from polysight.host.calibration import checked
 from polysight.host.doctor.bench import Bench, Finding, error, not_checked, ok, warning
-from polysight.host.materials import Library
-from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.plan.timing import scan_time
-from polysight.host.process.request import Options
-from polysight.host.radar.constraints import require
+from polysight.host.materials import SIMULATED_LIBRARY, Library
+from polysight.host.plan import scan_time
+from polysight.host.process import Options
+from polysight.host.radar import require
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import incidence_deg

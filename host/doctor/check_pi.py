@@ -10,10 +10,9 @@ import os
 import time
 from pathlib import Path
 
-from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.ready import differences, make_ready
+from polysight.host.acquisition import StopRequest, differences, make_ready
 from polysight.host.doctor.bench import Bench, Finding, error, not_checked, ok, warning
-from polysight.host.store.scan_folder import new_scan_id
+from polysight.host.store import new_scan_id
 from polysight.shared import __version__
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import explain

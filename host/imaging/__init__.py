@@ -1,17 +1,41 @@
-"""Imaging: range gate and reduction, three imagers of one contract, illumination, channel images."""
+"""From synchronised rows to the two channel images.
 
+`ImageBuilder` takes rows (range gate and reduction), chooses an imager and returns `ChannelImages`, flattened by the
+footprint of a mirror; `SubBandImages` does so for parts of the sweep. Three imagers keep one contract: direct
+(`backproject`, and its adjoint `project`), spectral, and row-incremental. `focus_sweep` finds the plane by sharpness,
+`imaging_facts` measures the point response.
+"""
+
+from polysight.host.imaging.aperture import Aperture
 from polysight.host.imaging.direct import backproject, project
-from polysight.host.imaging.geometry import ImageGrid, image_grid
-from polysight.host.imaging.images import ChannelImages, ImageBuilder, SubBandImages
-from polysight.host.imaging.resolution import imaging_facts
+from polysight.host.imaging.focus import focus_sweep
+from polysight.host.imaging.gain_conditions import ImagedWith
+from polysight.host.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
+from polysight.host.imaging.images import TAPERS, ChannelImages, ImageBuilder, SubBand, SubBandImages, sub_bands
+from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
+from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
 
 __all__ = [
+    "TAPERS",
+    "Antennas",
+    "Aperture",
     "ChannelImages",
     "ImageBuilder",
     "ImageGrid",
+    "ImagedWith",
+    "PointResponse",
+    "SubBand",
     "SubBandImages",
+    "Window",
     "backproject",
+    "focus_sweep",
     "image_grid",
     "imaging_facts",
+    "point_response",
     "project",
+    "reduction",
+    "row_offsets_m",
+    "scan_offsets_m",
+    "scene_gate_m",
+    "sub_bands",
 ]

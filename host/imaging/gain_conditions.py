@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 
 import msgspec
 
-from polysight.host.sync.high_pass import HighPass, high_pass
+from polysight.host.sync import HighPass, high_pass
 from polysight.shared.config import Board, Instrument
 from polysight.shared.geometry import Vector, place
 

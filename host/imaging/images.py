@@ -17,7 +17,7 @@ from scipy import ndimage
 from polysight.host.imaging.geometry import Antennas, image_grid
 from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
 from polysight.host.imaging.samples import BoardSamples, Image
-from polysight.host.sync.chain import SyncedRow
+from polysight.host.sync import SyncedRow
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.raster import plan_raster

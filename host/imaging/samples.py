@@ -19,7 +19,7 @@ from polysight.host.imaging.direct import DirectImager
 from polysight.host.imaging.geometry import Antennas, ImageGrid, scan_offsets_m
 from polysight.host.imaging.reduce import Reduction, burst_filters, undo_burst_motion
 from polysight.host.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
-from polysight.host.sync.chain import SyncedRow
+from polysight.host.sync import SyncedRow
 from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.raster import plan_raster

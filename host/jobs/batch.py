@@ -21,11 +21,9 @@ from typing import Any, Literal
 
 import msgspec
 
-from polysight.host.process.request import ProcessRequest
-from polysight.host.products.files import FINISHED, SavedProducts, write_json
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder, versions
-from polysight.host.store.sources.open import is_source
-from polysight.host.store.sources.published_settings import COLLECTION
+from polysight.host.process import ProcessRequest
+from polysight.host.products import FINISHED, SavedProducts, write_json
+from polysight.host.store import COLLECTION, MANIFEST, ScanFolder, is_source, versions
 from polysight.shared.errors import ConfigError, PolysightError
 
 SUMMARY = "processed.json"
@@ -283,7 +281,6 @@ def process_several(
 
 def _positions(data: Path) -> int:
     """Positions of a scan, or of the published grid where its files do not say it at a glance."""
-
     try:
         if (data / COLLECTION).exists():
             s = json.loads((data / COLLECTION).read_text(encoding="utf-8"))

@@ -10,7 +10,7 @@ import msgspec
 
 from polysight.host.jobs.batch import Job
 from polysight.host.jobs.process import process
-from polysight.host.products.files import FINISHED, write_json
+from polysight.host.products import FINISHED, write_json
 from polysight.shared.errors import PolysightError
 
 

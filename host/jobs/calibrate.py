@@ -16,8 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polysight.host.calibration.files import CalibrationFile, FilterFile, StartFile, head, write
-from polysight.host.calibration.rows import facts_of, open_raw
+from polysight.host.calibration import CalibrationFile, FilterFile, StartFile, facts_of, head, open_raw, write
 from polysight.host.jobs.process import imaged, load_reference, plane_of
 from polysight.host.polarimetry import (
     Leakage,
@@ -61,8 +60,7 @@ def _key(kind: str, path: Path) -> list[str]:
 
 def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
     """Places of boards and plane from a scan of known points. Raises PolysightError."""
-    from polysight.host.calibration.active import of_scan
-    from polysight.host.calibration.places import Prior, fit_places, look, places_file, read_target
+    from polysight.host.calibration import Prior, fit_places, look, of_scan, places_file, read_target
 
     points = read_target(target)
     given = None if config is None else load_instrument(config)
@@ -97,7 +95,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
 
 def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) -> int:
     """The receivers' filters from scans at several start frequencies. Raises PolysightError."""
-    from polysight.host.calibration.filters import fit_filter
+    from polysight.host.calibration import fit_filter
 
     rig = None if config is None else load_instrument(config)
     sources = [open_raw(folder, rig) for folder in scans]
@@ -125,9 +123,8 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
 
 def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
     """Gains at every pixel from a scan of a metal plate over the plane, in sub-bands too. Raises PolysightError."""
-    from polysight.host.calibration.files import MetalFile, read
-    from polysight.host.calibration.metal import write_metal
-    from polysight.host.imaging.images import sub_bands
+    from polysight.host.calibration import MetalFile, read, write_metal
+    from polysight.host.imaging import sub_bands
 
     source = open_raw(scan, None if config is None else load_instrument(config))
     parts = sub_bands(source.instrument.chirp, bands) if bands > 1 else ()
@@ -150,7 +147,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
 
 def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -> int:
     """Start offsets that put the direct paths in the middle of the band. Raises PolysightError."""
-    from polysight.host.calibration.direct_signal import fit_start
+    from polysight.host.calibration import fit_start
 
     source = open_raw(scan, None if config is None else load_instrument(config))
     boards = {b.name: fit_start(source, b.name) for b in source.instrument.receivers}

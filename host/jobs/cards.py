@@ -9,14 +9,22 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
-from polysight.host.capture.survey import CardSurvey, HopFinding, survey_cards
-from polysight.host.jobs.scan_files import typed
+from polysight.host.capture import CardClient, CardSurvey, EepromSettings, HopFinding, program_eeprom, survey_cards
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DeviceError
 
 _ASK_S = 1.5  # limit of one question to a card that is perhaps just starting, all attempts together
 _PAUSE_S = 0.2
+
+
+def typed(what: str, word: str, yes: bool) -> str:
+    """Say what would be done, and return what is typed in answer; `word` unasked when `yes` was given."""
+    sys.stdout.write(f"{what}\n")
+    if yes:
+        return word
+    sys.stdout.write(f"type {word} to do it: ")
+    sys.stdout.flush()
+    return sys.stdin.readline().strip()
 
 
 def show_cards(config: Path, listen_s: float, as_json: bool) -> int:

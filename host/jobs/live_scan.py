@@ -16,19 +16,25 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from polysight.host.acquisition.control import ControlDesk, StopRequest, hangups_pass
-from polysight.host.acquisition.progress import OnProgress
-from polysight.host.acquisition.scan import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
-from polysight.host.calibration.active import Calibration, of_rig, of_scan
-from polysight.host.imaging.geometry import image_grid
+from polysight.host.acquisition import (
+    ControlDesk,
+    OnProgress,
+    OnRow,
+    ScanProgress,
+    ScanResult,
+    StopRequest,
+    hangups_pass,
+    resume_scan,
+    run_scan,
+)
+from polysight.host.calibration import Calibration, of_rig, of_scan
+from polysight.host.imaging import image_grid
 from polysight.host.jobs.process import TRUTH, check_options, load_options, make_products, truth_of
 from polysight.host.materials import read_truth
 from polysight.host.pipeline import Pipeline
-from polysight.host.process.request import Options, ProcessRequest
-from polysight.host.products.folder import check_products_folder
-from polysight.host.store import manifest
-from polysight.host.store.raw import require_raw
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder, check_same_scan
+from polysight.host.process import Options, ProcessRequest
+from polysight.host.products import check_products_folder
+from polysight.host.store import MANIFEST, ScanFolder, check_same_scan, manifest, require_raw
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, PolysightError, ScanError, advice
 

@@ -17,16 +17,25 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.imaging.images import sub_bands
-from polysight.host.materials import Classifier, Library, Verdict
-from polysight.host.materials.concentration import fit_concentration
-from polysight.host.materials.layers import Layer, LayerFit, fit_layer
-from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.materials.patch_files import PATCHES, MatchedPatch, match_patches
-from polysight.host.materials.published import read_materials
-from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row
-from polysight.host.products.files import MATERIALS, SCAN, SavedProducts, find_products, read_products
-from polysight.host.report.context import classifier_sentence
+from polysight.host.imaging import sub_bands
+from polysight.host.materials import (
+    AMPLITUDE_ERROR,
+    PATCHES,
+    SIMULATED_LIBRARY,
+    Classifier,
+    Layer,
+    LayerFit,
+    Library,
+    MatchedPatch,
+    Verdict,
+    bands_of_row,
+    fit_concentration,
+    fit_layer,
+    match_patches,
+    read_materials,
+)
+from polysight.host.products import MATERIALS, SCAN, SavedProducts, find_products, read_products
+from polysight.host.report import classifier_sentence
 from polysight.shared.config import Chirp, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 
@@ -221,7 +230,7 @@ def report(folder: Path) -> int:
     found = find_products(folder, REPORT)
     if found is None:
         from polysight.host.jobs.process import process
-        from polysight.host.process.request import ProcessRequest
+        from polysight.host.process import ProcessRequest
 
         return process(ProcessRequest(data=str(folder), out=str(folder / "products")))
     sys.stdout.write(f"report:   {found.folder / REPORT}\n")
@@ -268,9 +277,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
 
 
 def _judge(data: Path, as_json: bool) -> int:
-    from polysight.host.materials.classify import MODELS
-    from polysight.host.materials.samples import Samples
-    from polysight.host.materials.train import score
+    from polysight.host.materials import MODELS, Samples, score
 
     library = read_materials(data) if data.is_dir() else Library.load(data)
     if len(library.angles_deg) > 1:

@@ -14,24 +14,25 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from polysight.host.calibration.active import of_scan
-from polysight.host.imaging import ChannelImages
-from polysight.host.imaging.focus import focus_sweep
+from polysight.host.calibration import of_scan
+from polysight.host.imaging import ChannelImages, focus_sweep
 from polysight.host.jobs.demo import check_scenes, run_simulator
-from polysight.host.materials import TrainingScan, TruthPlate, make_library, patches_from_plates, read_truth
-from polysight.host.materials.analyse import KnownScene, MetalChoice
-from polysight.host.materials.patch_files import read_labels
+from polysight.host.materials import (
+    KnownScene,
+    MetalChoice,
+    TrainingScan,
+    TruthPlate,
+    make_library,
+    patches_from_plates,
+    read_labels,
+    read_truth,
+)
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
-from polysight.host.process.request import Options, ProcessRequest
-from polysight.host.process.save import Products, save_images
-from polysight.host.products.files import IMAGE
-from polysight.host.products.folder import check_products_folder, making_products
-from polysight.host.report import write_json
-from polysight.host.report.figures import focus_figure
-from polysight.host.store.scan_folder import versions
-from polysight.host.store.source import Source, raw_source
-from polysight.host.store.sources.open import open_source
+from polysight.host.process import Options, ProcessRequest, Products, save_images
+from polysight.host.products import IMAGE, check_products_folder, making_products, write_json
+from polysight.host.report import focus_figure
+from polysight.host.store import Source, open_source, raw_source, versions
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, ScanError, advice
 
@@ -229,8 +230,8 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:
     """What synchronisation leaves of errors: figures, JSON, text; returns the exit status. Raises PolysightError."""
-    from polysight.host.capture.decode import row_words
-    from polysight.host.report.sync_report import SyncReport, write_sync_report
+    from polysight.host.capture import row_words
+    from polysight.host.report import SyncReport, write_sync_report
     from polysight.host.sync import BoardSetup, synchronise_row
 
     source = raw_source(open_source(data, config), data)

@@ -1,4 +1,10 @@
-"""Materials: patches, permittivity, the reference library and the classifier."""
+"""From the two images to named patches with their permittivity.
+
+`analyse` takes an `ImagePair`, the `Optics`, which metal is the reference (`MetalChoice`) and what is known of the
+scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patches by a `Library` of labelled patches;
+`make_library` and `fit_library` make one. `fit_layer` fits thin layers, `fit_concentration` solutions. What is shared
+between scans is in `patch_files`; `published` reads the published data set's material and label files.
+"""
 
 from polysight.host.materials.analyse import (
     FOUND,
@@ -11,29 +17,86 @@ from polysight.host.materials.analyse import (
     PatchResult,
     analyse,
     image_centre_mm,
+    permittivity_change,
     pixel_accuracy,
 )
-from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, Verdict
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER, UNKNOWN, Classifier, NamedPatch, Verdict
+from polysight.host.materials.concentration import (
+    ConcentrationResult,
+    concentrations,
+    fit_concentration,
+    polarisation_angle_rad,
+)
 from polysight.host.materials.knn import Fit, Weights, fit_weights
-from polysight.host.materials.library import Entry, Library
+from polysight.host.materials.layers import Layer, LayerFit, fit_layer
+from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
-from polysight.host.materials.patch_files import patches_from_labels, patches_from_plates, read_labels, write_labels
+from polysight.host.materials.patch_files import (
+    PATCHES,
+    MatchedPatch,
+    SeenPatches,
+    labels_of,
+    match_patches,
+    pack_patches,
+    patches_from_labels,
+    patches_from_plates,
+    read_labels,
+    read_patches,
+    write_labels,
+)
 from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
-from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, segment
-from polysight.host.materials.sub_bands import with_bands
-from polysight.host.materials.train import TrainingScan, entries_of, fit_library, make_library
+from polysight.host.materials.published import (
+    METALS,
+    LabelledScan,
+    entries_of_boxes,
+    is_metal,
+    label_folders,
+    read_labelled_scan,
+    read_material,
+    read_materials,
+    reading_of,
+    told_angle,
+)
+from polysight.host.materials.samples import CHANNELS, Samples, feature_matrix
+from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, segment
+from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row, with_bands
+from polysight.host.materials.train import (
+    Score,
+    TrainingScan,
+    best_model,
+    entries_of,
+    fit_library,
+    make_library,
+    score,
+    strangers,
+)
 from polysight.host.materials.truth import Plates, TruthPlate, read_truth, truth_labels, truth_plates
 
 __all__ = [
+    "AMPLITUDE_ERROR",
+    "CHANNELS",
+    "DISCRIMINANT",
     "FOUND",
+    "METALS",
+    "MODELS",
+    "PAPER",
+    "PATCHES",
+    "SAME_ANGLE_DEG",
+    "SIMULATED_LIBRARY",
     "UNKNOWN",
     "UNKNOWN_SCENE",
+    "Box",
     "Classifier",
+    "ConcentrationResult",
     "Entry",
     "Fit",
     "ImagePair",
     "KnownScene",
+    "LabelledScan",
+    "Layer",
+    "LayerFit",
     "Library",
+    "MatchedPatch",
     "MaterialsResult",
     "MetalChoice",
     "MetalReference",
@@ -43,6 +106,9 @@ __all__ = [
     "PatchResult",
     "Permittivity",
     "Plates",
+    "Samples",
+    "Score",
+    "SeenPatches",
     "SegmentSettings",
     "Segmentation",
     "TrainingScan",
@@ -50,22 +116,44 @@ __all__ = [
     "Verdict",
     "Weights",
     "analyse",
+    "bands_of_row",
+    "best_model",
+    "concentrations",
     "entries_of",
+    "entries_of_boxes",
     "estimate_permittivity",
+    "feature_matrix",
     "find_metal",
+    "fit_concentration",
+    "fit_layer",
     "fit_library",
     "fit_weights",
     "image_centre_mm",
+    "is_metal",
+    "label_folders",
+    "labels_of",
     "make_library",
+    "match_patches",
     "median_ratio",
     "metal_by_label",
     "metal_in_box",
+    "pack_patches",
     "patches_from_labels",
     "patches_from_plates",
+    "permittivity_change",
     "pixel_accuracy",
+    "polarisation_angle_rad",
+    "read_labelled_scan",
     "read_labels",
+    "read_material",
+    "read_materials",
+    "read_patches",
     "read_truth",
+    "reading_of",
+    "score",
     "segment",
+    "strangers",
+    "told_angle",
     "truth_labels",
     "truth_plates",
     "with_bands",

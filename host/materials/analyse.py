@@ -64,7 +64,8 @@ class MaterialsResult:
     theta_rad
         Incidence angle, a number or [ny, nx].
     bands
-        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.sub_bands`); empty when not asked for.
+        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.sub_bands`); empty when not
+        asked for.
     boxes
         Patch number to the name of the box drawn by hand; empty when the patches were found.
     """

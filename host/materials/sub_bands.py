@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.imaging import ChannelImages
-from polysight.host.imaging.images import SubBand
+from polysight.host.imaging import ChannelImages, SubBand
 from polysight.host.materials.analyse import MaterialsResult, Optics, reference_error, smooth_inside, to_metal
 from polysight.host.materials.layers import Bands, Spectrum
 from polysight.host.materials.permittivity import inverse_spread, median_ratio

@@ -18,14 +18,11 @@ import numpy as np
 from matplotlib.image import imsave
 from numpy.typing import NDArray
 
-from polysight.host.imaging import ChannelImages
-from polysight.host.imaging.geometry import Antennas, image_grid
-from polysight.host.imaging.reduce import scene_gate_m
+from polysight.host.imaging import Antennas, ChannelImages, image_grid, scene_gate_m
 from polysight.host.page.story import Notice, of_error
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.manifest import Manifest
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.sync.chain import SyncedRow
+from polysight.host.store import Manifest, ScanFolder
+from polysight.host.sync import SyncedRow
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.raster import plan_raster

@@ -28,7 +28,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from polysight.host.acquisition.control import Wish
+from polysight.host.acquisition import Wish
 from polysight.host.page.images import AMPLITUDE, PHASE, colour_bar
 from polysight.host.page.watch import Watch
 from polysight.shared.errors import DeviceError, PolysightError

@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from polysight.host.acquisition.control import Wish
-from polysight.host.acquisition.progress import time_left
+from polysight.host.acquisition import Wish, time_left
 from polysight.host.page.images import Shown
 from polysight.host.page.listener import Heard
 from polysight.host.page.story import Notice, Story

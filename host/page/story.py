@@ -11,11 +11,9 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from polysight.host.acquisition.progress import usual_row_s
-from polysight.host.acquisition.take import FaultKind
-from polysight.host.plan.timing import scan_time
-from polysight.host.store.manifest import Fact
-from polysight.host.store.scan_folder import reconnected
+from polysight.host.acquisition import FaultKind, usual_row_s
+from polysight.host.plan import scan_time
+from polysight.host.store import Fact, reconnected
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from polysight.host.acquisition.control import Wish
+from polysight.host.acquisition import Wish
 from polysight.host.page.images import Shown
 from polysight.host.page.listener import Heard
 from polysight.host.page.story import Notice, Story, sentence

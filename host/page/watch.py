@@ -17,15 +17,13 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from polysight.host.acquisition.control import Wish, ask, last_sign_of_life
+from polysight.host.acquisition import Wish, ask, last_sign_of_life
 from polysight.host.page.images import RowViewer, Shown
 from polysight.host.page.listener import Heard, PiListener
 from polysight.host.page.snapshot import Content, make_motion, make_snapshot
 from polysight.host.page.story import Story
 from polysight.host.page.verdict import Signs
-from polysight.host.store import manifest
-from polysight.host.store.manifest import Fact, Manifest
-from polysight.host.store.scan_folder import EVENTS, MANIFEST
+from polysight.host.store import EVENTS, MANIFEST, Fact, Manifest, manifest
 from polysight.shared.errors import PolysightError, ProtocolError
 from polysight.shared.messages import AnyEvent, unpack_kept
 

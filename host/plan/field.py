@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import scipy.optimize
 
-from polysight.host.imaging.geometry import Antennas
+from polysight.host.imaging import Antennas
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import specular_midpoint_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S

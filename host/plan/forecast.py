@@ -14,15 +14,22 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
-from polysight.host.imaging.aperture import Aperture
-from polysight.host.imaging.geometry import Antennas, image_grid, scan_offsets_m
-from polysight.host.imaging.images import TAPERS
-from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
-from polysight.host.imaging.resolution import PointResponse, point_response
+from polysight.host.imaging import (
+    TAPERS,
+    Antennas,
+    Aperture,
+    PointResponse,
+    Window,
+    image_grid,
+    point_response,
+    reduction,
+    scan_offsets_m,
+    scene_gate_m,
+)
 from polysight.host.plan.field import FieldLimits, PhaseSlope, field_limits
 from polysight.host.plan.timing import ROW_OVERHEAD_S, ScanTime, payload_bytes, scan_time, tail_s
-from polysight.host.process.request import Options
-from polysight.host.radar.constraints import constraints
+from polysight.host.process import Options
+from polysight.host.radar import constraints
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.raster import burst_duration_s, check_burst_fits, plan_raster

@@ -24,8 +24,7 @@ from polysight.host.plan.forecast import (
     noise_facts,
 )
 from polysight.host.plan.timing import ROW_OVERHEAD_S, payload_bytes, scan_time
-from polysight.host.radar.constraints import INTER_FRAME_US
-from polysight.host.radar.program import TRIGGER_MARGIN_US, chirp_us
+from polysight.host.radar import INTER_FRAME_US, TRIGGER_MARGIN_US, chirp_us
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, to_builtins

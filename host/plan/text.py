@@ -16,14 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from polysight.host.capture.decode import row_words
+from polysight.host.capture import row_words
 from polysight.host.plan.forecast import Forecast, Noise, forecast
 from polysight.host.plan.search import Changes, propose, rig_lines
 from polysight.host.plan.timing import ROW_OVERHEAD_S, row_motion_s, tail_s, turn_s
-from polysight.host.report.sync_report import SyncReport
-from polysight.host.store.events import read_events
-from polysight.host.store.scan_folder import EVENTS, ScanFolder
-from polysight.host.store.source import RawSource
+from polysight.host.report import SyncReport
+from polysight.host.store import EVENTS, RawSource, ScanFolder, read_events
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES
+from polysight.host.capture import MAX_PAYLOAD_BYTES
 from polysight.shared.config import Grid, Instrument, Stage
 from polysight.shared.raster import burst_duration_s
 

@@ -1,4 +1,9 @@
-"""Polarimetry: from the two images to the material's reflection and permittivity."""
+"""From the two images to the material's reflection and permittivity.
+
+`calibrate` references the images to metal in the scene, `PlaneReference` to a plate scanned on its own; leakage is
+estimated from metal at two orientations. `incidence_choice` gives the angle, `fresnel` and `multilayer` the reflection
+of a material, `permittivity_from_ratio` the material of a reflection (Eq. 2 and 3 of the paper).
+"""
 
 from polysight.host.polarimetry.calibrate import (
     Calibrated,

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, stats
 
-from polysight.host.imaging.gain_conditions import ImagedWith
+from polysight.host.imaging import ImagedWith
 from polysight.host.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
 from polysight.shared.errors import DataError
 

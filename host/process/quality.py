@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.materials.analyse import MaterialsResult, permittivity_change
+from polysight.host.materials import MaterialsResult, permittivity_change
 from polysight.host.polarimetry import IncidenceChoice, PlaneReference
-from polysight.host.store.source import CubeRow, RowData
-from polysight.host.sync.backlash import echo_of_row, estimate_backlash, object_filter
-from polysight.host.sync.chain import SyncedRow
+from polysight.host.store import CubeRow, RowData
+from polysight.host.sync import SyncedRow, echo_of_row, estimate_backlash, object_filter
 from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import plan_raster
 

@@ -5,16 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy.typing as npt
 
-from polysight.host.materials import Classifier, Library
-from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY
-from polysight.host.materials.patch_files import patches_from_labels
-from polysight.host.materials.published import is_metal
-from polysight.host.materials.segment import Box, Segmentation
+from polysight.host.materials import (
+    SAME_ANGLE_DEG,
+    SIMULATED_LIBRARY,
+    Box,
+    Classifier,
+    Library,
+    Segmentation,
+    is_metal,
+    patches_from_labels,
+)
 from polysight.host.polarimetry import Incidence, PlaneReference
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
@@ -76,7 +82,7 @@ class DrawnBoxes(NamedTuple):
     """Boxes drawn by hand as patches, their names by patch number, and which of them is the metal reference."""
 
     segmentation: Segmentation | None = None
-    names: dict[int, str] = {}
+    names: Mapping[int, str] = MappingProxyType({})
     metal: int | None = None
 
 

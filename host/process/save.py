@@ -10,23 +10,31 @@ from typing import Any
 import tomli_w
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
-from polysight.host.materials.patch_files import PATCHES, labels_of, pack_patches, write_labels
+from polysight.host.materials import (
+    PATCHES,
+    Classifier,
+    MaterialsResult,
+    TruthPlate,
+    labels_of,
+    pack_patches,
+    pixel_accuracy,
+    write_labels,
+)
 from polysight.host.polarimetry import ratio
 from polysight.host.process.quality import Quality
-from polysight.host.products.files import (
+from polysight.host.products import (
     IMAGE,
     LABELS,
     MATERIALS,
     QUALITY,
     rx_gains,
     write_atomically,
+    write_image,
+    write_json,
     write_scan_facts,
 )
-from polysight.host.report import write_image, write_json, write_report
-from polysight.host.report.context import ReportContext, classifier_sentence, context_of
-from polysight.host.store.scan_folder import versions
-from polysight.host.store.source import Scan
+from polysight.host.report import ReportContext, classifier_sentence, context_of, write_report
+from polysight.host.store import Scan, versions
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.shared.raster import RasterPlan

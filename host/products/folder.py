@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from polysight.host.materials.patch_files import PATCHES
+from polysight.host.materials import PATCHES
 from polysight.host.products.files import FINISHED, IMAGE, LABELS, MATERIALS, QUALITY, SCAN, SavedProducts
-from polysight.host.store.append_only import sync_folder
+from polysight.host.store import sync_folder
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 
 PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, "report.html", "figures")

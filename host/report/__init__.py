@@ -1,19 +1,33 @@
-"""The report and the product files."""
+"""The report of a processed scan, its figures and tables, and exports for other programs.
 
-from polysight.host.products.files import plain, read_image, write_atomically, write_image, write_json
-from polysight.host.report.context import ReportContext, context_of
-from polysight.host.report.figures import banner_png, figures
+`context_of` collects what a report shows, `write_report` makes the page; `sync_report` shows what synchronisation
+leaves of errors; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from saved products.
+"""
+
+from polysight.host.report.context import ReportContext, classifier_sentence, context_of
+from polysight.host.report.export import export
+from polysight.host.report.figures import PALETTE, banner_png, draw_channel, extent_mm, figures, focus_figure, png
 from polysight.host.report.report import write_report
+from polysight.host.report.sync_report import QUANTITIES, SyncReport, write_sync_report
+from polysight.host.report.tables import INK, MUTED, STAMP
 
 __all__ = [
+    "INK",
+    "MUTED",
+    "PALETTE",
+    "QUANTITIES",
+    "STAMP",
     "ReportContext",
+    "SyncReport",
     "banner_png",
+    "classifier_sentence",
     "context_of",
+    "draw_channel",
+    "export",
+    "extent_mm",
     "figures",
-    "plain",
-    "read_image",
-    "write_atomically",
-    "write_image",
-    "write_json",
+    "focus_figure",
+    "png",
     "write_report",
+    "write_sync_report",
 ]

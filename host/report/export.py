@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from polysight.host.products.files import SavedProducts, read_products
-from polysight.host.report import ReportContext, figures, write_atomically
+from polysight.host.products import SavedProducts, read_products, write_atomically
+from polysight.host.report.context import ReportContext
+from polysight.host.report.figures import figures
 from polysight.shared.errors import ConfigError, DataError
 
 _COLUMNS = (

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from polysight.host.products.files import write_atomically
+from polysight.host.products import write_atomically
 from polysight.host.report.context import ReportContext
 from polysight.host.report.figures import FIGURES, UNKNOWN_COLOUR, colours_of, figures
 from polysight.host.report.tables import coverage_sentence, key_numbers, masked_positions, quality_tables, text

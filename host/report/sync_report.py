@@ -16,10 +16,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from polysight.host.products.files import write_atomically, write_json
-from polysight.host.report.figures import INK, MUTED, STAMP
-from polysight.host.sync.chain import SyncedRow
-from polysight.host.sync.residuals import STAGES
+from polysight.host.products import write_atomically, write_json
+from polysight.host.report.tables import INK, MUTED, STAMP
+from polysight.host.sync import STAGES, SyncedRow
 
 PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
 """Standard deviations after all stages, paper section 9.1."""

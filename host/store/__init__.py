@@ -4,22 +4,61 @@
 hold data, `read_row` and facts about the recording; `raw_source` asks for one with the chirps still in it.
 """
 
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder, versions
+from polysight.host.store.append_only import sync_folder
+from polysight.host.store.events import EventWriter, read_events
+from polysight.host.store.manifest import Fact, Manifest, ManifestWriter
+from polysight.host.store.raw import Digests, drop, droppable, require_raw
+from polysight.host.store.scan_folder import (
+    EVENTS,
+    MANIFEST,
+    PART,
+    ScanFolder,
+    check_same_scan,
+    connection_of,
+    new_scan_id,
+    reconnected,
+    utc_now,
+    versions,
+)
 from polysight.host.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
 from polysight.host.store.sources.open import is_source, open_source
-from polysight.host.store.sources.published_settings import mirrored
+from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
+from polysight.host.store.validate import damaged_rows, to_json, validate
 
 __all__ = [
+    "COLLECTION",
+    "EVENTS",
     "MANIFEST",
+    "PART",
     "CubeRow",
+    "Digests",
+    "EventWriter",
+    "Fact",
+    "Manifest",
+    "ManifestWriter",
     "RawSource",
     "RowData",
     "Scan",
     "ScanFolder",
     "Source",
+    "check_same_scan",
+    "connection_of",
+    "damaged_rows",
+    "drop",
+    "droppable",
     "is_source",
     "mirrored",
+    "new_scan_id",
     "open_source",
     "raw_source",
+    "read_events",
+    "read_settings",
+    "reconnected",
+    "require_raw",
+    "rig_of",
+    "sync_folder",
+    "to_json",
+    "utc_now",
+    "validate",
     "versions",
 ]

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polysight.host.capture.segment import read_index
+from polysight.host.capture import read_index
 from polysight.host.store import manifest
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact, Manifest, ManifestWriter

@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
-from polysight.host.capture.segment import read_index
+from polysight.host.capture import read_index
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
 from polysight.host.store.raw import dropped_files

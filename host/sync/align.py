@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.sync import high_pass as hpf
-from polysight.host.sync.passes import FOLD, Passes, passes_for
+from polysight.host.sync.numpy_passes import FOLD
+from polysight.host.sync.passes import Passes, passes_for
 from polysight.host.sync.tone import Real, Tone, cis
 
 _REFERENCES = 4  # reference chirps to try before a position is given up

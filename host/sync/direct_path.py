@@ -30,7 +30,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from polysight.host.sync.align import AlignedRow, whole_blocks
-from polysight.host.sync.passes import FOLD
+from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.tone import Complex, cis, phasor
 from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m

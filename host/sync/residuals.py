@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from polysight.host.sync.align import AlignedRow
 from polysight.host.sync.direct_path import DirectPath, Referenced
-from polysight.host.sync.passes import FOLD
+from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.tone import Complex, Real, block_edges, block_times, cis, phasor, refine
 
 STAGES = {

@@ -1,4 +1,4 @@
-"""Recorded rows of a scan, synchronised: raw rows by the chain, rows of published cubes by bringing them to our form."""
+"""Recorded rows of a scan, synchronised: raw rows by the chain, rows of published cubes brought to our form."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from polysight.host.capture.decode import row_words
-from polysight.host.store.source import CubeRow, RowData, Source
+from polysight.host.capture import row_words
+from polysight.host.store import CubeRow, RowData, Source
 from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
 from polysight.host.sync.high_pass import HighPass
 from polysight.host.sync.synchronised import CubeForm, recognise

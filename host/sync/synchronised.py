@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from polysight.host.sync.align import AlignedRow, whole_blocks
 from polysight.host.sync.chain import SyncedRow
 from polysight.host.sync.direct_path import DirectPath, excess_path_m, prepare, reference
-from polysight.host.sync.passes import FOLD
+from polysight.host.sync.numpy_passes import FOLD
 from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m

@@ -15,11 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from polysight.host.materials.classify import DISCRIMINANT, PAPER
-from polysight.host.materials.samples import CHANNELS, Samples
-from polysight.host.materials.train import Score, best_model, score, strangers
+from polysight.host.materials import CHANNELS, DISCRIMINANT, PAPER, Samples, Score, best_model, score, strangers
 from polysight.host.polarimetry import fresnel
-from polysight.host.report.figures import INK, PALETTE
+from polysight.host.report import INK, PALETTE
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, percent
 from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups
 from polysight.papers.sensys2026.table2 import Published, published

@@ -8,15 +8,15 @@ from dataclasses import asdict
 import numpy as np
 from matplotlib.axes import Axes
 
-from polysight.host.materials import Library
-from polysight.host.materials.concentration import (
+from polysight.host.materials import (
     ConcentrationResult,
+    Library,
     concentrations,
     fit_concentration,
     polarisation_angle_rad,
 )
 from polysight.host.polarimetry import permittivity_from_ratio
-from polysight.host.report.figures import INK, PALETTE
+from polysight.host.report import INK, PALETTE
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
 from polysight.papers.sensys2026.patches import calibrated_errors, draw, groups
 from polysight.papers.sensys2026.table2 import published, table2

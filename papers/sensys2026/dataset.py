@@ -16,11 +16,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from polysight.host.materials import Entry, Library, fit_library
-from polysight.host.materials.published import (
+from polysight.host.materials import (
     METALS,
+    Entry,
     LabelledScan,
+    Library,
     entries_of_boxes,
+    fit_library,
     label_folders,
     read_labelled_scan,
     read_material,
@@ -28,7 +30,7 @@ from polysight.host.materials.published import (
     told_angle,
 )
 from polysight.host.polarimetry import correct_leakage
-from polysight.host.store.sources.published_settings import COLLECTION, read_settings, rig_of
+from polysight.host.store import COLLECTION, read_settings, rig_of
 from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError

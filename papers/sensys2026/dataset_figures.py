@@ -11,12 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from polysight.host.materials import Library
-from polysight.host.materials.classify import DISCRIMINANT, PAPER
-from polysight.host.materials.concentration import concentrations, fit_concentration, polarisation_angle_rad
-from polysight.host.materials.samples import CHANNELS, Samples
-from polysight.host.materials.train import Score, score
-from polysight.host.report.figures import INK, PALETTE
+from polysight.host.materials import (
+    CHANNELS,
+    DISCRIMINANT,
+    PAPER,
+    Library,
+    Samples,
+    Score,
+    concentrations,
+    fit_concentration,
+    polarisation_angle_rad,
+    score,
+)
+from polysight.host.report import INK, PALETTE
 from polysight.papers.sensys2026.classification import confusion_figure
 from polysight.papers.sensys2026.concentration import WATER
 from polysight.papers.sensys2026.dataset import AuthorsData

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from polysight.host.materials import Permittivity, estimate_permittivity
 from polysight.host.polarimetry import permittivity_from_ratio
-from polysight.host.report.figures import INK, PALETTE
+from polysight.host.report import INK, PALETTE
 from polysight.papers.sensys2026.dataset import IMAGES, AuthorsData, read_authors
 from polysight.papers.sensys2026.dataset_figures import Judgements, authors_fig18, authors_fig20, authors_fig21
 from polysight.papers.sensys2026.item import Item, Picture, Table, dress, new_figure

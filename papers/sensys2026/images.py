@@ -19,8 +19,7 @@ from scipy.ndimage import gaussian_filter
 
 from polysight.host.materials import MaterialsResult
 from polysight.host.polarimetry import ratio_from_permittivity
-from polysight.host.report import ReportContext, context_of
-from polysight.host.report.figures import INK, draw_channel, extent_mm
+from polysight.host.report import INK, ReportContext, context_of, draw_channel, extent_mm
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
 from polysight.papers.sensys2026.scenes import imaged, plate, scanned
 from polysight.papers.sensys2026.table2 import table2

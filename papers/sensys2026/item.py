@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from polysight.host.report.figures import INK, MUTED
+from polysight.host.report import INK, MUTED
 
 MARKERS = "osD^vP*X<>"
 

@@ -20,10 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from polysight.host.materials import Entry, Library
-from polysight.host.materials.classify import PAPER
-from polysight.host.materials.samples import Samples, feature_matrix
-from polysight.host.materials.train import score
+from polysight.host.materials import PAPER, Entry, Library, Samples, feature_matrix, score
 from polysight.host.polarimetry import fresnel
 from polysight.papers.sensys2026.table2 import Published, published, table2
 

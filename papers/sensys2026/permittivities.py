@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from polysight.host.materials import estimate_permittivity
 from polysight.host.polarimetry import brewster_angle_rad, fresnel, permittivity_from_ratio, ratio_from_permittivity
-from polysight.host.report.figures import INK, PALETTE
+from polysight.host.report import INK, PALETTE
 from polysight.papers.sensys2026.item import MARKERS, Item, Picture, Run, Table, dress, new_figure
 from polysight.papers.sensys2026.patches import calibrated_errors, draw, groups
 from polysight.papers.sensys2026.scenes import imaged, plate, scanned

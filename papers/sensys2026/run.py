@@ -14,8 +14,8 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
-from polysight.host.products.files import write_atomically, write_json
-from polysight.host.report.figures import STAMP, png
+from polysight.host.products import write_atomically, write_json
+from polysight.host.report import STAMP, png
 from polysight.papers.sensys2026.classification import fig18, fig20
 from polysight.papers.sensys2026.concentration import fig21
 from polysight.papers.sensys2026.images import fig4, fig13, fig14, fig19

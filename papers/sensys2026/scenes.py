@@ -15,11 +15,16 @@ import tomli_w
 
 from polysight.host.jobs.demo import run_simulator
 from polysight.host.jobs.process import EDGE_MM, TRUTH
-from polysight.host.materials import MaterialsResult, TruthPlate, patches_from_plates, read_truth
-from polysight.host.materials.analyse import KnownScene, MetalChoice
+from polysight.host.materials import (
+    KnownScene,
+    MaterialsResult,
+    MetalChoice,
+    TruthPlate,
+    patches_from_plates,
+    read_truth,
+)
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.source import RawSource
+from polysight.host.store import RawSource, ScanFolder
 from polysight.shared.errors import ScanError
 
 PLATE_MM = 45.0

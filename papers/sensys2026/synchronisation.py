@@ -17,13 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 from scipy import signal
 
-from polysight.host.capture.decode import decode_row, row_words
+from polysight.host.capture import decode_row, row_words
 from polysight.host.imaging import ImageBuilder
-from polysight.host.report.figures import INK, PALETTE
-from polysight.host.report.sync_report import QUANTITIES, SyncReport
-from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.high_pass import HighPass, fit_high_pass, high_pass
-from polysight.host.sync.residuals import STAGES
+from polysight.host.report import INK, PALETTE, QUANTITIES, SyncReport
+from polysight.host.sync import STAGES, BoardSetup, HighPass, fit_high_pass, high_pass, synchronise_row
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure
 from polysight.papers.sensys2026.scenes import plate, scanned
 from polysight.papers.sensys2026.table2 import published

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from polysight.host.jobs.drop_raw import drop_raw, processed_digests
 from polysight.host.jobs.live_scan import resume
-from polysight.host.jobs.scan_files import drop_raw, processed_digests
 from polysight.host.process.request import Options
 from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw

@@ -1,8 +1,6 @@
-"""Commands on files: `drop-raw`, `validate` and `inspect`.
+"""Commands that only look: `validate` names every fault of a scan folder, `inspect` says what is in a capture.
 
-`drop_raw` removes raw rows once saved products were made from them, after a word typed in confirmation (`typed`).
-`validate_folder` prints every fault of a scan folder. `inspect_file` says what is in a capture, and plots its range
-profile.
+They load nothing of the processing, so that they answer at once.
 """
 
 from __future__ import annotations
@@ -13,93 +11,14 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from polysight.host.capture.dca1000 import Code
-from polysight.host.capture.inspect import CardReport, Known, Report, inspect_bin
-from polysight.host.capture.inspect_pcap import inspect_pcap, is_pcap
-from polysight.host.products.files import QUALITY, read_products
-from polysight.host.products.folder import RAW_DROPPED
-from polysight.host.report import write_json
-from polysight.host.store.raw import Digests, drop, droppable
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder, utc_now
-from polysight.host.store.validate import to_json, validate
+from polysight.host.capture import CardReport, Code, Known, Report, inspect_bin, inspect_pcap, is_pcap
+from polysight.host.store import MANIFEST, ScanFolder, to_json, validate
 from polysight.shared.config import load_instrument
-from polysight.shared.errors import ConfigError, DataError, PolysightError
+from polysight.shared.errors import DataError, PolysightError
 
-WORD = "drop"  # confirms the removal of raw rows
 BOTTOM_DB = -20.0  # of the plot of a range profile
-
-
-def typed(what: str, word: str, yes: bool) -> str:
-    """Say what would be done, and return what is typed in answer; `word` unasked when `yes` was given."""
-    sys.stdout.write(f"{what}\n")
-    if yes:
-        return word
-    sys.stdout.write(f"type {word} to do it: ")
-    sys.stdout.flush()
-    return sys.stdin.readline().strip()
-
-
-def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
-    """Remove every raw row that saved products were made from, once confirmed; returns the exit status.
-
-    Raises
-    ------
-    DataError
-        when there are no products, or they were made from nothing of this scan.
-    ConfigError
-        when it is not confirmed; nothing was removed.
-    """
-    scan = ScanFolder.load(folder)
-    products = read_products(products or folder).folder
-    processed = processed_digests(products)
-    what = droppable(scan, processed)
-    for line in what.kept:
-        sys.stdout.write(f"kept: {line}\n")
-    if not what.files:
-        if what.kept:
-            raise DataError(
-                f"{folder}: nothing can be dropped",
-                f"{products} is made from none of its rows",
-                f"`polysight process {folder} --out DIR`, then --products DIR",
-            )
-        sys.stdout.write(f"{folder}: every processed row is dropped already\n")
-        return 0
-    text = (
-        f"{folder}: the raw data of {len(what.files)} rows, {what.bytes / 1e6:.1f} MB, is removed. {products} stays;"
-        " it cannot be processed again."
-    )
-    said = typed(text, WORD, yes)
-    if said != WORD:
-        raise ConfigError(f"nothing dropped: answered {said!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
-    _keep(products, scan)
-    drop(scan, processed, products)
-    sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
-    return 0
-
-
-def _keep(products: Path, scan: ScanFolder) -> None:
-    """Have the products say that they are all that is left of the scan, so that no other's ever replace them."""
-    told = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
-    write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: told})
-
-
-def processed_digests(folder: Path) -> Digests:
-    """What saved products were made from, as quality.json beside a readable image.npz says. Raises DataError."""
-    products = read_products(folder)
-    _ = products.image  # raises when it cannot be read
-    try:
-        boards = products.quality["boards"]
-        return {name: {int(r): str(crc) for r, crc in b["raw_crc32"].items()} for name, b in boards.items()}
-    except (ValueError, KeyError, AttributeError, TypeError) as e:
-        raise DataError(
-            f"{products.folder / QUALITY}: does not say what it was made from: {e}",
-            "made by an earlier release, damaged, or from another program's recordings",
-            "`polysight process SCAN --out DIR` makes it again",
-        ) from None
 
 
 def main_text(report: Report) -> str:
@@ -202,7 +121,7 @@ def inspect_file(file: Path, config: Path | None, plot: Path | None, card_addres
     report = inspect_pcap(file, known, card_address) if pcap else inspect_bin(file, known)
     report.simulated = scan is not None and scan.simulated
     if as_json:
-        from polysight.host.report import plain
+        from polysight.host.products import plain
 
         sys.stdout.write(json.dumps(plain(asdict(report)), indent=1) + "\n")
     else:
@@ -221,6 +140,9 @@ def plot_profile(report: Report, path: Path) -> None:
     DataError
         when the recording holds no chirp, or the file cannot be written.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     if not report.profile_db.size:
         raise DataError(f"{report.path}: no chirp to plot", "the recording holds no data", "record again")
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")

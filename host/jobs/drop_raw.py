@@ -1,0 +1,72 @@
+"""`polysight drop-raw`: delete raw rows once saved products were made from them, after a word typed in confirmation."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from polysight.host.jobs.cards import typed
+from polysight.host.products import QUALITY, RAW_DROPPED, read_products, write_json
+from polysight.host.store import Digests, ScanFolder, drop, droppable, utc_now
+from polysight.shared.errors import ConfigError, DataError
+
+WORD = "drop"  # confirms the removal of raw rows
+
+
+def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
+    """Remove every raw row that saved products were made from, once confirmed; returns the exit status.
+
+    Raises
+    ------
+    DataError
+        when there are no products, or they were made from nothing of this scan.
+    ConfigError
+        when it is not confirmed; nothing was removed.
+    """
+    scan = ScanFolder.load(folder)
+    products = read_products(products or folder).folder
+    processed = processed_digests(products)
+    what = droppable(scan, processed)
+    for line in what.kept:
+        sys.stdout.write(f"kept: {line}\n")
+    if not what.files:
+        if what.kept:
+            raise DataError(
+                f"{folder}: nothing can be dropped",
+                f"{products} is made from none of its rows",
+                f"`polysight process {folder} --out DIR`, then --products DIR",
+            )
+        sys.stdout.write(f"{folder}: every processed row is dropped already\n")
+        return 0
+    text = (
+        f"{folder}: the raw data of {len(what.files)} rows, {what.bytes / 1e6:.1f} MB, is removed. {products} stays;"
+        " it cannot be processed again."
+    )
+    said = typed(text, WORD, yes)
+    if said != WORD:
+        raise ConfigError(f"nothing dropped: answered {said!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")
+    _keep(products, scan)
+    drop(scan, processed, products)
+    sys.stdout.write(f"{folder}: dropped; its digests stay in the manifest\n")
+    return 0
+
+
+def _keep(products: Path, scan: ScanFolder) -> None:
+    """Have the products say that they are all that is left of the scan, so that no other's ever replace them."""
+    told = {"scan_id": scan.scan_id, "scan": str(scan.path.resolve()), "dropped_utc": utc_now()}
+    write_json(products / QUALITY, {**read_products(products).quality, RAW_DROPPED: told})
+
+
+def processed_digests(folder: Path) -> Digests:
+    """What saved products were made from, as quality.json beside a readable image.npz says. Raises DataError."""
+    products = read_products(folder)
+    _ = products.image  # raises when it cannot be read
+    try:
+        boards = products.quality["boards"]
+        return {name: {int(r): str(crc) for r, crc in b["raw_crc32"].items()} for name, b in boards.items()}
+    except (ValueError, KeyError, AttributeError, TypeError) as e:
+        raise DataError(
+            f"{products.folder / QUALITY}: does not say what it was made from: {e}",
+            "made by an earlier release, damaged, or from another program's recordings",
+            "`polysight process SCAN --out DIR` makes it again",
+        ) from None

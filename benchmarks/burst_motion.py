@@ -23,9 +23,7 @@ from polysight.host.imaging.geometry import row_offsets_m
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.raster import mean_burst_travel_mm, plan_raster
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import Point, Scene, apply_scene
-from polysight.simulators.simulate import row_offsets_mm
+from polysight.simulators.scene import Point, Scene, SimulatedRig, apply_scene, row_offsets_mm
 
 Images = dict[str, NDArray[np.complex64]]
 TREATMENTS = {

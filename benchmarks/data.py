@@ -18,15 +18,12 @@ from numpy.typing import NDArray
 
 from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import scene_gate_m
-from polysight.host.store.sources.source import RowData
+from polysight.host.store.source import RowData
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.raster import RasterPlan, Row, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.layouts import OwnLayout
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import Scene, apply_scene, load_scene
-from polysight.simulators.simulate import row_offsets_mm
+from polysight.simulators.scene import OwnLayout, Scene, SimulatedRig, apply_scene, load_scene, row_offsets_mm
 
 ROOT = Path(__file__).parents[1]
 RIG = ROOT / "instrument.toml"
@@ -88,6 +85,12 @@ class RepeatedRows:
     files: dict[str, list[Path]]
     simulated: bool = True
     scan_id: str = "benchmark"
+    mirrored: bool = False
+    synchronised: bool = False
+
+    def recording_facts(self) -> dict[str, Any]:
+        """None are known."""
+        return {}
 
     @property
     def plan(self) -> RasterPlan:

@@ -37,15 +37,14 @@ from polysight.host.materials import (
     pixel_accuracy,
     truth_plates,
 )
+from polysight.host.materials.analyse import ImagePair, KnownScene, Optics
+from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.plan import Changes, scan_time
-from polysight.host.polarimetry import incidence_map
-from polysight.host.process.request import LIBRARY
+from polysight.host.polarimetry import incidence_choice
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.raster import plan_raster
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import Scene, load_scene
-from polysight.simulators.simulate import row_offsets_mm, truth
+from polysight.simulators.scene import Scene, SimulatedRig, load_scene, row_offsets_mm, truth
 
 ROOT = Path(__file__).parents[1]
 ITERATIONS = 40
@@ -124,19 +123,9 @@ def image_error(images: ChannelImages, ideal: ChannelImages) -> float:
 
 def named(rig: Instrument, images: ChannelImages, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
     """Patches, permittivities and names."""
-    p = rig.polarimetry
-    return analyse(
-        images.h,
-        images.v,
-        images.x_m,
-        images.y_m,
-        images.valid,
-        theta_rad=incidence_map(rig, images.x_m, images.y_m),
-        classifier=Classifier(Library.load(LIBRARY)),
-        leakage=(complex(*p.leakage_h), complex(*p.leakage_v)),
-        smooth_px=p.smooth_px,
-        plates=plates,
-    )
+    angles = incidence_choice(rig, images.x_m, images.y_m, "one")
+    classifier = Classifier(Library.load(SIMULATED_LIBRARY))
+    return analyse(ImagePair.of(images), Optics.of(rig, angles), known=KnownScene(plates=plates), classifier=classifier)
 
 
 def measure(

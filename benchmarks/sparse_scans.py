@@ -22,8 +22,7 @@ from polysight.host.imaging.sparse import reconstruct
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, load_instrument
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 
 ROOT = Path(__file__).parents[1]
 SCENES = ("point-targets", "nine-materials")

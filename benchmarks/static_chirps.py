@@ -17,8 +17,7 @@ import numpy as np
 from polysight.host.report.sync_report import SyncReport, write_sync_report
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import load_instrument
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene import SimulatedRig, decode_scene
 
 SNR_DB = 7.2
 SCENE = {

@@ -13,8 +13,7 @@ from typing import NamedTuple
 from polysight.pi_controller.trigger_lines import TriggerLines
 from polysight.shared.config import Burst
 from polysight.shared.faults import PiFault
-from polysight.shared.raster import FIRST_PULSE_DELAY_S
-from polysight.shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS
+from polysight.shared.raster import FIRST_PULSE_DELAY_S, MAX_WIDTH_NS, MIN_PERIOD_NS
 from polysight.shared.units import us_to_ns
 
 # From edge to first pulse. A fixed delay longer than the usual wake-up keeps the pulses of all positions at the same

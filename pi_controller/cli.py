@@ -16,7 +16,7 @@ from polysight.shared import __version__
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.faults import explain
-from polysight.shared.sync_in import WIDTH_TEXT
+from polysight.shared.raster import WIDTH_TEXT
 
 Command = Callable[[argparse.Namespace], int]
 AddCommand = Callable[[str, Command, str, str], argparse.ArgumentParser]  # name, action, help, example

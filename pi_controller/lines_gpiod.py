@@ -14,10 +14,10 @@ from types import ModuleType
 from typing import Any
 
 from polysight.pi_controller.trigger_lines import Clock, Edge
-from polysight.shared.backends import GPIOD
 from polysight.shared.config import Pi
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.faults import PiFault
+from polysight.shared.messages import GPIOD
 
 # The kernel keeps 16 events a line unless asked for more; a starved process would lose edges.
 EVENT_BUFFER = 1024

@@ -12,9 +12,9 @@ from typing import Any
 
 from polysight.pi_controller.lines_gpiod import GpiodLines
 from polysight.pi_controller.trigger_lines import Clock
-from polysight.shared.backends import GPIOMEM
 from polysight.shared.config import Pi
 from polysight.shared.errors import DeviceError
+from polysight.shared.messages import GPIOMEM
 
 GPFSEL0, GPSET0, GPCLR0 = 0x00, 0x1C, 0x28  # bytes from the start of the block
 FUNCTION_OUTPUT = 0b001

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 from polysight.pi_controller.trigger_lines import Edge
-from polysight.shared.backends import WIRES
 from polysight.shared.config import Pi
+from polysight.shared.messages import WIRES
 from polysight.shared.wires import WireClient, WireEdge
 
 

@@ -9,8 +9,15 @@ from polysight.shared.config import Stage
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import BeginRun
-from polysight.shared.raster import RasterPlan, Row
-from polysight.shared.sync_in import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT
+from polysight.shared.raster import (
+    MAX_WIDTH_NS,
+    MIN_PERIOD_NS,
+    MIN_PERIOD_US,
+    MIN_WIDTH_NS,
+    WIDTH_TEXT,
+    RasterPlan,
+    Row,
+)
 from polysight.shared.units import us_to_ns
 
 

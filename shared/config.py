@@ -10,10 +10,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from polysight.shared.section import Count, NonNegative, Positive, Section, require
-from polysight.shared.stage import Grid, Stage
-from polysight.shared.sync_in import MIN_PERIOD_US, WIDTH_TEXT, WIDTH_US
-from polysight.shared.tables import decode, read_toml, to_builtins
+from polysight.shared.raster import Burst, Grid, Stage
+from polysight.shared.tables import Count, NonNegative, Positive, Section, decode, read_toml, require, to_builtins
 
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
@@ -68,22 +66,6 @@ class Chirp(Section, frozen=True):
     def swept_hz(self) -> float:
         """Bandwidth swept within the ADC window."""
         return self.hz_per_sample * self.samples
-
-
-class Burst(Section, frozen=True):
-    """SYNC_IN pulses of one position; each starts one frame of one chirp."""
-
-    pulses: Count
-    period_us: Positive
-    width_us: Positive = 1.0
-
-    def __post_init__(self) -> None:
-        require(
-            self.period_us >= MIN_PERIOD_US,
-            f"period_us must be at least {MIN_PERIOD_US:g} us (shortest frame period of the AWR2243)",
-        )
-        shortest, longest = WIDTH_US
-        require(shortest <= self.width_us <= longest, f"width_us must be {WIDTH_TEXT} (SYNC_IN pulse of the AWR2243)")
 
 
 class Pi(Section, frozen=True):

@@ -23,6 +23,14 @@ Natural = Annotated[int, msgspec.Meta(ge=0)]
 RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]
 State = Literal["idle", "homing", "homed", "ready", "running", "held", "done", "fault"]
+GPIOD, GPIOMEM, WIRES = "gpiod", "gpiomem", "wires"
+"""The Pi's trigger lines by name (`HelloReply.backend`): through the kernel, by the chip's registers, simulated."""
+_HARDWARE = (GPIOD, GPIOMEM)
+
+
+def is_simulated(backend: str) -> bool:
+    """Whether nothing real is driven. A name that is not known counts as simulated: nothing is called measured then."""
+    return backend not in _HARDWARE
 
 
 class _Message(msgspec.Struct, frozen=True, tag_field="type", tag=True, kw_only=True):
@@ -224,7 +232,7 @@ AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume |
 
 
 class HelloReply(_Message, frozen=True, kw_only=True):
-    """Who answers, and in which state. Not told: 0 of the wall clock, {} of `stage` (`polysight.shared.stage.Stage.placing`)."""
+    """Who answers, and in which state. Not told: 0 of the wall clock, {} of `stage` (`shared.raster.Stage.placing`)."""
 
     pi_release: str
     firmware: str

@@ -1,6 +1,7 @@
-"""The serpentine raster plan: which rows, in which order and direction, and where every position is.
+"""How the stage walks the grid: `[grid]`, `[stage]` and `[burst]` of the rig file, and the serpentine plan of rows.
 
-Offsets are in the rig frame, in millimetres, zero = middle of the grid (docs/spec/scan-folder.md).
+Offsets are in the rig frame, in millimetres, zero = middle of the grid (docs/spec/scan-folder.md). Limits of SYNC_IN
+are those of the AWR2243 (TI mmWave Radar Interface Control, frame configuration; data sheet).
 """
 
 from __future__ import annotations
@@ -9,11 +10,94 @@ from collections.abc import Iterator
 
 import msgspec
 
-from polysight.shared.config import Burst, Grid, Stage
 from polysight.shared.errors import ConfigError
+from polysight.shared.tables import Count, NonNegative, Positive, Section, require
+from polysight.shared.units import us_to_ns
 
 FIRST_PULSE_DELAY_S = 200e-6
 """From a trigger edge to its first SYNC_IN pulse: the Pi's fixed delay, longer than its usual wake-up."""
+MIN_PERIOD_US = 300.0  # from one rising edge to the next: an earlier one is a fatal fault of the RF core
+WIDTH_US = (0.025, 4.0)
+WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
+MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
+MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
+_PLACING = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
+
+
+class Burst(Section, frozen=True):
+    """SYNC_IN pulses of one position; each starts one frame of one chirp."""
+
+    pulses: Count
+    period_us: Positive
+    width_us: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        require(
+            self.period_us >= MIN_PERIOD_US,
+            f"period_us must be at least {MIN_PERIOD_US:g} us (shortest frame period of the AWR2243)",
+        )
+        shortest, longest = WIDTH_US
+        require(shortest <= self.width_us <= longest, f"width_us must be {WIDTH_TEXT} (SYNC_IN pulse of the AWR2243)")
+
+
+class Grid(Section, frozen=True):
+    """Serpentine raster of stage positions."""
+
+    columns: Count
+    rows: Count
+    step_x_mm: Positive
+    step_y_mm: Positive
+
+
+class Stage(Section, frozen=True):
+    """Motion stage and its serial link."""
+
+    port: str
+    baud: Count = 115200
+    steps_per_mm: Positive = 200.0
+    speed_mm_s: Positive = 20.0
+    travel_speed_mm_s: Positive = 40.0
+    accel_mm_s2: Positive = 200.0
+    heartbeat_ms: Count = 500
+    trigger_width_us: Count = 20
+    travel_x_mm: Positive = 800.0
+    travel_y_mm: Positive = 500.0
+    centre_x_mm: NonNegative = 400.0
+    centre_y_mm: NonNegative = 250.0
+    backlash_mm: NonNegative = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.centre_x_mm <= self.travel_x_mm, "centre_x_mm must lie within travel_x_mm")
+        require(self.centre_y_mm <= self.travel_y_mm, "centre_y_mm must lie within travel_y_mm")
+
+    @property
+    def placing(self) -> dict[str, float]:
+        """The values by which rows are placed: they come from the Pi's rig file, and must be those of the host's."""
+        return {key: float(getattr(self, key)) for key in _PLACING}
+
+    def run_up_mm(self, step_mm: float, speed_mm_s: float | None = None) -> float:
+        """From rest to a row's first point: the ramp v^2 / 2a, and a step (or the backlash) at constant speed.
+
+        `speed_mm_s`: of the row; `[stage]`'s own when None. docs/spec/stage-line.md, "A row".
+        """
+        speed = self.speed_mm_s if speed_mm_s is None else speed_mm_s
+        return speed**2 / (2 * self.accel_mm_s2) + max(step_mm, self.backlash_mm)
+
+    def misfit(self, raster: Grid | RasterPlan, speed_mm_s: float | None = None) -> str:
+        """Why a raster with its run-up does not fit the travel around the centre; "" when it does."""
+        for axis, n, step, margin, centre, travel in (
+            ("x", raster.columns, raster.step_x_mm, self.run_up_mm(raster.step_x_mm, speed_mm_s),
+             self.centre_x_mm, self.travel_x_mm),
+            ("y", raster.rows, raster.step_y_mm, self.backlash_mm, self.centre_y_mm, self.travel_y_mm),
+        ):  # fmt: skip
+            half = (n - 1) / 2 * step + margin
+            if half > centre or centre + half > travel:
+                return (
+                    f"grid of {n} x {step} mm in {axis} with {margin:g} mm of run-up on either side does not fit the"
+                    f" travel 0..{travel} mm around centre {centre} mm: narrow the grid, slow down, or raise"
+                    " accel_mm_s2"
+                )
+        return ""
 
 
 class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,4 +1,4 @@
-"""TOML and JSON tables checked against a typed declaration, and back.
+"""TOML and JSON tables checked against a typed declaration, and back; what declarations are made of.
 
 Unknown keys, wrong types and broken rules are refused with the file, the key, the value and the rule.
 """
@@ -7,13 +7,26 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from polysight.shared.errors import ConfigError
 
 T = TypeVar("T")
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A table of the rig file: frozen, unknown keys refused."""
+
+
+def require(ok: bool, rule: str) -> None:
+    """Hold a rule of a table. Raises ValueError, which the reader of the file turns into words."""
+    if not ok:
+        raise ValueError(rule)
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -14,8 +14,7 @@ from typing import Any
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.card_sender import bound_udp
-from polysight.simulators.dca1000 import SOURCE_PORT
+from polysight.simulators.cards import SOURCE_PORT, bound_udp
 
 _TRIES = 50
 _COMMAND_PORT, _EVENT_PORT = 5601, 5602

@@ -22,13 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.errors import ConfigError, DataError, PolysightError
-from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
-from polysight.simulators.card_endpoint import CardEndpoint, Clock
-from polysight.simulators.card_faults import OF_CONTROL, read_faults
-from polysight.simulators.card_sender import Pace
-from polysight.simulators.dca1000 import Network
-from polysight.simulators.fault_draws import EventKind
-from polysight.simulators.simulated_card import MAC
+from polysight.simulators.cards import MAC, CardEndpoint, Clock, EventKind, Network, Pace
+from polysight.simulators.faults import OF_CONTROL, read_faults
+from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
 
 _OF_PULSES = ("overflow", "ddr_full", "missed_pulse", "miss_pulses", *(kind.value for kind in EventKind))
 _OF_RADARS = tuple(key for keys in OF_CONTROL.values() for key in keys)

@@ -24,11 +24,10 @@ import tomli_w
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DeviceError, PolysightError, os_error
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
-from polysight.simulators.card_faults import read_faults
+from polysight.simulators.faults import read_faults
 from polysight.simulators.loopback import on_free_subnet
-from polysight.simulators.scene import Scene, apply_scene, load_scene
-from polysight.simulators.simulate import truth
+from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight.simulators.wires import MAX_SOCKET_PATH
 
 PATIENT_HEARTBEAT_MS = 2000

@@ -16,7 +16,7 @@ from threading import Event
 
 from polysight.shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError
 from polysight.shared.wires import WireMotion, parse
-from polysight.simulators._process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
 
 MAX_LINE_BYTES = 200
 MAX_PENDING_BYTES = 64 << 20

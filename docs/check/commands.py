@@ -16,7 +16,7 @@ from unittest import mock
 
 from docs.check.pages import ROOT
 
-PROGRAMS = {"polysight": "polysight.host.cli", "polysight-pi": "polysight.pi_controller.cli"}
+PROGRAMS = {"polysight": "polysight.host.cli.main", "polysight-pi": "polysight.pi_controller.cli"}
 OWN = ("benchmarks", "docs", "polysight", "papers")
 _BEFORE = ("sudo", "env", "exec", "time", "nohup", "ssh", "timeout", "nice")
 _ENDS = re.compile(r"[|&;()\n]+")

@@ -18,8 +18,7 @@ from polysight.host.products.files import read_products
 from polysight.host.report.export import material_columns
 from polysight.shared.config import load_instrument
 from polysight.shared.geometry import incidence_deg
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 
 ROOT = Path(__file__).parents[2]
 

@@ -12,8 +12,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import load_instrument
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 
 ROOT = Path(__file__).parents[2]
 

@@ -23,10 +23,9 @@ from polysight.host.radar.interface import RadarControl
 from polysight.host.store.manifest import ManifestWriter
 from polysight.host.store.scan_folder import ScanFolder, check_same_scan, connection_of, new_scan_id, utc_now
 from polysight.host.store.validate import damaged_rows
-from polysight.shared.backends import is_simulated
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ScanError
-from polysight.shared.messages import HelloReply
+from polysight.shared.messages import HelloReply, is_simulated
 from polysight.shared.raster import check_burst_fits, plan_raster
 
 __all__ = ["OnRow", "ScanProgress", "ScanResult", "resume_scan", "run_scan"]

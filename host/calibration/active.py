@@ -97,18 +97,52 @@ class Calibration:
 
         return read_metal(self.metal, self._path("metal").parent / self.metal.images)
 
+    def high_passes(self, rig: Instrument) -> dict[str, HighPass | None]:
+        """Every receiver's filter as measured; None: as programmed."""
+        return {board.name: self.high_pass(board.name) for board in rig.receivers}
+
+    def metal_plane(
+        self, rig: Instrument, chosen: PlaneReference | None, in_scene: bool, bands: int
+    ) -> PlaneReference | None:
+        """Metal scanned on its own that images of a rig are referenced to; None: metal in the scene is.
+
+        Parameters
+        ----------
+        rig
+            Of the images, calibrated.
+        chosen
+            The scan of metal that was asked for.
+        in_scene
+            Metal in the scene was named (a box): it comes before the calibration, and after `chosen`.
+        bands
+            Sub-bands that are imaged.
+
+        Raises
+        ------
+        DataError
+            when the metal was imaged with another rig, or without these sub-bands.
+        """
+        plane, name = chosen, "the metal reference"
+        if plane is None and not in_scene:
+            plane, name = self.reference(), self.name_of("metal")
+        if plane is not None:
+            plane.check_rig(self.imaged_with(rig), name)
+            plane.check_bands(bands, name)
+        return plane
+
     def imaged_with(self, placed: Instrument) -> ImagedWith:
         """What the gains of images depend on; `placed` is a rig that :meth:`rig` made."""
-        return ImagedWith.of(placed, {b.name: self.high_pass(b.name) for b in placed.receivers})
+        return ImagedWith.of(placed, self.high_passes(placed))
 
     def facts(self) -> dict[str, Any]:
-        """For quality.json: which files were in force."""
+        """For quality.json: `calibration`, the active files by kind; empty when there are none."""
         kinds = {"direct_path": self.places, "hpf": self.filters, "metal": self.metal}
-        return {
+        active = {
             kind: {"file": str(self._path(kind)), "made_utc": file.made_utc, "simulated": file.simulated}
             for kind, file in kinds.items()
             if file is not None
         }
+        return {"calibration": active} if active else {}
 
     def name_of(self, kind: str) -> str:
         """The file of a kind, for messages."""

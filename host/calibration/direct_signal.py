@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from polysight.host.calibration.files import BoardStart
 from polysight.host.calibration.rows import board_rows
 from polysight.host.radar.constraints import direct_if_hz
-from polysight.host.store.sources.source import ScanSource
+from polysight.host.store.source import RawSource
 from polysight.host.sync import BoardSetup
 from polysight.host.sync.align import AlignedRow, align_row, whole_blocks
 from polysight.host.sync.direct_path import reference
@@ -163,7 +163,7 @@ def _power(
     return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
 
 
-def fit_start(source: ScanSource, board_name: str) -> BoardStart:
+def fit_start(source: RawSource, board_name: str) -> BoardStart:
     """The start offset of a board, from where its direct path was.
 
     Raises

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from polysight.host.calibration.direct_signal import find_direct
 from polysight.host.calibration.files import BoardFilter, places_crc32
 from polysight.host.calibration.rows import board_rows
-from polysight.host.store.sources.source import ScanSource
+from polysight.host.store.source import RawSource
 from polysight.host.sync import BoardSetup
 from polysight.host.sync.high_pass import HighPass, fit_high_pass
 from polysight.shared.config import Board
@@ -25,7 +25,7 @@ LEAST = 6  # chirps that a bin needs
 CLEAR = 20.0  # times the noise that it must hold
 
 
-def fit_filter(scans: list[ScanSource], board_name: str) -> BoardFilter:
+def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
     """Fit a board's filter to a sweep.
 
     Parameters
@@ -61,7 +61,7 @@ def fit_filter(scans: list[ScanSource], board_name: str) -> BoardFilter:
     )
 
 
-def _power(scan: ScanSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
+def _power(scan: RawSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
     """IF (Hz), power and the noise in it (ADC counts squared) of the direct path in every chirp of some rows."""
     rig = scan.instrument
     key = f"{places_crc32(rig)} {rig.chirp} {rig.burst}"  # scans of one sweep share it

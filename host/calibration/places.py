@@ -29,7 +29,7 @@ from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan,
 from polysight.host.calibration.rows import board_rows
 from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import reduction, scene_gate_m
-from polysight.host.store.sources.source import ScanSource
+from polysight.host.store.source import RawSource
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.host.sync.high_pass import HighPass
 from polysight.shared.config import Instrument
@@ -116,7 +116,7 @@ def read_target(path: Path) -> list[TargetPoint]:
     return points
 
 
-def look(source: ScanSource, rig: Instrument, filters: dict[str, HighPass | None] | None = None) -> dict[str, Seen]:
+def look(source: RawSource, rig: Instrument, filters: dict[str, HighPass | None] | None = None) -> dict[str, Seen]:
     """What each receiving board saw in a scan, by name; `filters` are measured ones. Raises DataError."""
     return {b.name: _look(source, rig, b.name, (filters or {}).get(b.name)) for b in rig.receivers}
 
@@ -164,7 +164,7 @@ def fit_places(seen: dict[str, Seen], rig: Instrument, points: list[TargetPoint]
     return PlacesFit(found.x, covariance, explained, list(seen))
 
 
-def _look(source: ScanSource, rig: Instrument, name: str, model: HighPass | None) -> Seen:
+def _look(source: RawSource, rig: Instrument, name: str, model: HighPass | None) -> Seen:
     """A board's scan, synchronised, reduced to the gate, its RX alike, its noise white."""
     board, plan = rig.by_name(name), plan_raster(rig.grid)
     setup = BoardSetup.of(rig, board, model=model)

@@ -4,47 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.calibration.files import SourceScan
 from polysight.host.capture.decode import row_words
-from polysight.host.store.raw import require_raw
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.sources.published import AuthorsCube, open_scan
-from polysight.host.store.sources.source import ScanSource
+from polysight.host.store.source import RawSource, raw_source
+from polysight.host.store.sources.open import open_source
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 
 
-def open_raw(folder: Path, rig: Instrument | None = None) -> ScanSource:
+def open_raw(folder: Path, rig: Instrument | None = None) -> RawSource:
     """A recorded scan whose chirps are there. Raises DataError.
 
     `rig` is for recordings that bring none of their own.
     """
-    source = open_scan(folder, None if (folder / MANIFEST).exists() else rig)
-    if isinstance(source, AuthorsCube):
-        raise DataError(f"{folder}: the chirps are not in it", "these cubes were synchronised already", "give raw data")
-    if isinstance(source, ScanFolder):
-        require_raw(source)
+    source = raw_source(open_source(folder, rig), folder)
     if next(iter(source.rows()), None) is None:
         raise DataError(
             f"{folder}: no row is recorded whole",
             "the scan was stopped in its first row, or files are missing",
             f"`polysight resume {folder}` takes the missing rows",
         )
-    return cast(ScanSource, source)
+    return source
 
 
-def facts_of(source: ScanSource, folder: Path) -> SourceScan:
+def facts_of(source: RawSource, folder: Path) -> SourceScan:
     """Where a calibration comes from."""
     return SourceScan(source.scan_id, str(folder), source.simulated, len(list(source.rows())))
 
 
 def board_rows(
-    source: ScanSource, board: str, at_most: int | None = None
+    source: RawSource, board: str, at_most: int | None = None
 ) -> Iterator[tuple[int, NDArray[np.int16], NDArray[np.bool_]]]:
     """Index, words int16 [frame, sample, 2, rx] and valid bool [frame] of rows; `at_most` of them, evenly spread."""
     rows = list(source.rows())

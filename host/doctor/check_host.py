@@ -9,13 +9,14 @@ from pathlib import Path
 from polysight.host.calibration.active import checked
 from polysight.host.doctor.bench import Bench, Finding, error, not_checked, ok, warning
 from polysight.host.materials import Library
+from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.plan.timing import scan_time
-from polysight.host.process.request import LIBRARY, Options
+from polysight.host.process.request import Options
 from polysight.host.radar.constraints import require
-from polysight.shared.backends import is_simulated
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import incidence_deg
+from polysight.shared.messages import is_simulated
 from polysight.shared.raster import check_burst_fits
 
 SPARE = 2.0  # the disk should take so many times what comes
@@ -105,13 +106,13 @@ def check_calibration(bench: Bench) -> Finding:
 
 def check_library(bench: Bench) -> Finding:
     """A scan can be made without it, but nothing of it would be named."""
-    angle, known = incidence_deg(bench.rig, bench.rig.receivers[0]), Library.load(LIBRARY).angles_deg
+    angle, known = incidence_deg(bench.rig, bench.rig.receivers[0]), Library.load(SIMULATED_LIBRARY).angles_deg
     held = " and ".join(f"{a:g}" for a in known)
     facts = {"incidence_deg": angle, "library_deg": list(known)}
     if not Options().unnamed(bench.rig):
-        return ok(f"{LIBRARY.name} holds {held} degrees of incidence, the rig looks at {angle:.1f}", **facts)
+        return ok(f"{SIMULATED_LIBRARY.name} holds {held} degrees of incidence, the rig looks at {angle:.1f}", **facts)
     return warning(
-        f"the rig looks at {angle:.1f} degrees of incidence, {LIBRARY.name} holds {held} degrees only",
+        f"the rig looks at {angle:.1f} degrees of incidence, {SIMULATED_LIBRARY.name} holds {held} degrees only",
         "|P| changes by a tenth in a degree, so that nothing of its scans will be named",
         "train a library at this angle (docs/how-to/add-a-material.md) and scan with --library; or --model none",
         **facts,

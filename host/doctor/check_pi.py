@@ -15,10 +15,9 @@ from polysight.host.acquisition.ready import differences, make_ready
 from polysight.host.doctor.bench import Bench, Finding, error, not_checked, ok, warning
 from polysight.host.store.scan_folder import new_scan_id
 from polysight.shared import __version__
-from polysight.shared.backends import is_simulated
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import explain
-from polysight.shared.messages import BeginRun, RowFinished
+from polysight.shared.messages import BeginRun, RowFinished, is_simulated
 from polysight.shared.raster import RasterPlan
 from polysight.shared.sockets import HOST_KEYS, is_loopback
 

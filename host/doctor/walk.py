@@ -14,9 +14,9 @@ from polysight.host.doctor.bench import Bench, Finding, System, Wanted, not_chec
 from polysight.host.doctor.check_capture import check_buffer, check_card, check_network, check_pulses, check_radar
 from polysight.host.doctor.check_host import check_config, check_disk, check_host_clock, check_pi_clock, check_time
 from polysight.host.doctor.check_pi import SIMULATED, check_free, check_keys, check_pi, check_stage, check_trigger
-from polysight.shared.backends import is_simulated
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError, PolysightError
+from polysight.shared.messages import is_simulated
 
 _WIDTH = 16  # of the column of names
 

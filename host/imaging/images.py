@@ -206,11 +206,11 @@ class SubBandImages:
     rig
         The scan's rig file.
     count
-        Sub-bands.
+        Sub-bands; 1: none, the image of the whole sweep is enough.
     """
 
     def __init__(self, rig: Instrument, count: int) -> None:
-        self.bands = sub_bands(rig.chirp, count)
+        self.bands = sub_bands(rig.chirp, count) if count > 1 else ()
         self.builders = tuple(ImageBuilder(_part(rig, band)) for band in self.bands)
 
     def add_row(self, board_name: str, row_index: int, row: SyncedRow) -> None:

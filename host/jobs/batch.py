@@ -6,45 +6,47 @@ what it was made with; a later run passes over it unless data, options, rig file
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import os
-import pickle
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Event
 from typing import Any, Literal
 
-from polysight.host.products.files import FINISHED
-from polysight.host.report import write_json
-from polysight.host.store.scan_folder import MANIFEST, versions
+import msgspec
+
+from polysight.host.process.request import ProcessRequest
+from polysight.host.products.files import FINISHED, SavedProducts, write_json
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder, versions
+from polysight.host.store.sources.open import is_source
 from polysight.host.store.sources.published_settings import COLLECTION
-from polysight.shared.errors import ConfigError
+from polysight.shared.errors import ConfigError, PolysightError
 
 SUMMARY = "processed.json"
 Status = Literal["done", "skipped", "failed", "stopped"]
 _PRODUCTS = ("image.npz", "quality.json")
-_CLI = ("data", "out", "run", "command", "jobs", "dask", "again")  # what does not change what comes out
-PROGRAM = (sys.executable, "-m", "polysight.host.cli_process")
+PROGRAM = (sys.executable, "-m", "polysight.host.jobs.batch_worker")
 """Processes the one job on its standard input."""
 _FREE = 0.8  # of the free memory is used
 _POLL_S = 0.2
 
 
-@dataclass(frozen=True)
-class Job:
-    """One scan to process: where it is, where its products go, the command's options, and what that amounts to."""
+class Job(msgspec.Struct, frozen=True):
+    """One scan to process, as plain data: what is asked, and what the products will depend on."""
 
-    data: Path
-    out: Path
-    options: Mapping[str, Any]
-    made_with: Mapping[str, Any]
+    request: ProcessRequest
+    made_with: dict[str, Any]
+
+    @property
+    def out(self) -> Path:
+        """Folder of its products."""
+        return Path(self.request.out)
 
     @property
     def name(self) -> str:
@@ -67,65 +69,55 @@ def scans_of(paths: Sequence[Path]) -> list[Path]:
     """The scans behind paths: a scan folder is itself, any other folder the scans in it, if it holds any."""
     out: list[Path] = []
     for path in paths:
-        inside = [] if is_scan(path) or not path.is_dir() else sorted(p for p in path.iterdir() if is_scan(p))
+        inside = [] if is_source(path) or not path.is_dir() else sorted(p for p in path.iterdir() if is_source(p))
         out += inside or [path]
     return out
 
 
-def is_scan(path: Path) -> bool:
-    """Whether a folder is a scan folder, or `unsynced/<scan>` or `raw/<scan>` of the published data."""
-    known = (MANIFEST, COLLECTION)
-    return path.is_dir() and (any((path / name).exists() for name in known) or any(path.glob("*_synced.npy")))
-
-
-def jobs_of(
-    scans: Sequence[Path], out: Path, args: argparse.Namespace, rig_file: Callable[[Path], Path | None]
-) -> list[Job]:
-    """A job for each scan, into `out`/<its name>.
+def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
+    """A job for each request.
 
     Raises
     ------
     ConfigError
-        when two scans have one name.
+        when two scans have one name, and so one folder of products.
     """
-    options = {key: _absolute(value) for key, value in vars(args).items() if key not in _CLI}
     jobs: dict[str, Job] = {}
-    for data in (p.absolute() for p in scans):
+    for request in (r.absolute() for r in requests):
+        data = Path(request.data)
         if data.name in jobs:
             raise ConfigError(
-                f"two scans are named {data.name}: {jobs[data.name].data} and {data}",
+                f"two scans are named {data.name}: {jobs[data.name].request.data} and {data}",
                 "their products would go into one folder",
                 "process them in two runs, each with its own --out",
             )
-        config = None if (data / MANIFEST).exists() else rig_file(data)
-        chosen = {**options, "config": None if config is None else config.absolute()}
-        jobs[data.name] = Job(data, out.absolute() / data.name, chosen, made_with(data, chosen))
+        if (data / MANIFEST).exists():  # it brings its own rig file
+            request = msgspec.structs.replace(request, config=None)
+        jobs[data.name] = Job(request, made_with(request))
     return list(jobs.values())
 
 
-def _absolute(value: Any) -> Any:
-    return value.absolute() if isinstance(value, Path) else value
-
-
-_MEANING = 2  # counts changes of what products of the same data hold
+PRODUCTS_VERSION = 3  # counts changes of what products of the same data hold
 NOT_DATA = ("products", ".products.new", ".products.old", "products-export", "control")  # folders of a scan
 
 
-def made_with(data: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What products depend on: releases, options (files by their digest), and the data's files by size and time."""
-    told = {key: _told(value) for key, value in sorted(options.items())}
+def made_with(request: ProcessRequest) -> dict[str, Any]:
+    """What products depend on: releases, choices (files by their digest), and the data's files by size and time."""
+    data = Path(request.data)
+    choices = {**request.choices(), **{name: _digest(path) for name, path in request.paths().items()}}
     files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
     listing = [f"{p.relative_to(data)} {s.st_size} {s.st_mtime_ns}" for p in files for s in (p.stat(),)]
     digest = hashlib.sha256("\n".join(listing).encode()).hexdigest()
-    return {"versions": versions(), "products": _MEANING, "options": told, "data": digest}
+    return {"versions": versions(), "products": PRODUCTS_VERSION, "options": choices, "data": digest}
 
 
-def _told(value: Any) -> Any:
-    if isinstance(value, Path) and value.is_file():
-        return hashlib.sha256(value.read_bytes()).hexdigest()
-    if isinstance(value, Path) and value.is_dir():  # products of another scan, such as a metal reference
-        return [f"{p.name} {p.stat().st_size} {p.stat().st_mtime_ns}" for p in sorted(value.iterdir()) if p.is_file()]
-    return value if isinstance(value, int | float | None) else str(value)
+def _digest(path: Path) -> Any:
+    """A file by its content, a folder (a scan, products) by its files' names, sizes and times."""
+    if path.is_file():
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    if path.is_dir():
+        return [f"{p.name} {p.stat().st_size} {p.stat().st_mtime_ns}" for p in sorted(path.iterdir()) if p.is_file()]
+    return str(path)
 
 
 def finished(job: Job) -> bool:
@@ -147,7 +139,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     with log.open("wb") as said:
         child = subprocess.Popen(PROGRAM, stdin=subprocess.PIPE, stdout=said, stderr=said, env=environment)
         if child.stdin is not None:
-            child.stdin.write(pickle.dumps(job))
+            child.stdin.write(msgspec.msgpack.encode(job))
             child.stdin.close()
         while child.poll() is None:
             if stop is not None and stop.wait(_POLL_S):
@@ -267,3 +259,66 @@ def process_many(
         sys.stderr.write(f"[{n}/{len(todo)}] {outcome.name}: {outcome.status}, {outcome.seconds:.0f} s{tail}\n")
         write_json(out / SUMMARY, {"scans": [asdict(outcomes[j.name]) for j in jobs if j.name in outcomes]})
     return [outcomes[j.name] for j in jobs]
+
+
+def process_several(
+    requests: Sequence[ProcessRequest], out: Path, at_a_time: int | None, dask: str | None, again: bool
+) -> int:
+    """Process several scans, `at_a_time` (None: as many as fit); prints their table and returns the exit status.
+
+    Raises
+    ------
+    PolysightError
+        when none can be begun.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"{out} is a file", "several scans need a folder", "give another --out")
+    jobs = jobs_of(requests)
+    positions = max((_positions(Path(r.data)) for r in requests), default=0)
+    n = at_a_time or at_once(positions, cores(), free_memory_bytes())
+    outcomes = process_many(jobs, out, min(n, len(jobs)), dask, again)
+    sys.stdout.write(table(outcomes, out))
+    return 0 if all(o.status in ("done", "skipped") for o in outcomes) else 1
+
+
+def _positions(data: Path) -> int:
+    """Positions of a scan, or of the published grid where its files do not say it at a glance."""
+
+    try:
+        if (data / COLLECTION).exists():
+            s = json.loads((data / COLLECTION).read_text(encoding="utf-8"))
+            return int(s["total_x"]) * int(s["total_y"])
+        return ScanFolder.load(data).plan.positions
+    except (PolysightError, OSError, ValueError, KeyError, TypeError):  # its own program will say what is wrong
+        return 350 * 200
+
+
+def table(outcomes: Sequence[Outcome], out: Path) -> str:
+    """What became of every scan, and the counts."""
+    rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
+    for o in outcomes:
+        masked, patches = _found(out / o.name) if o.status in ("done", "skipped") else ("", "")
+        seconds = f"{o.seconds:.0f}" if o.seconds else ""
+        memory = f"{o.memory_gb:.1f} GB" if o.memory_gb else ""
+        rows.append((o.name, o.status, seconds, memory, masked, patches, o.message))
+    widths = [max(len(row[k]) for row in rows) for k in range(6)]
+    lines = []
+    for row in rows:
+        words = [cell.ljust(w) for cell, w in zip(row[:2], widths[:2], strict=True)]
+        numbers = [cell.rjust(w) for cell, w in zip(row[2:6], widths[2:], strict=True)]
+        lines.append("  ".join([*words, *numbers, row[6]]).rstrip())
+    count = {status: sum(o.status == status for o in outcomes) for status in ("done", "skipped", "failed", "stopped")}
+    counts = ", ".join(f"{n} {status}" for status, n in count.items() if n)
+    end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY}"
+    return "\n".join([*lines, end, ""])
+
+
+def _found(products: Path) -> tuple[str, str]:
+    """Share of positions that are masked, and number of patches, as the products say."""
+    saved = SavedProducts(products)
+    try:
+        boards = saved.quality["boards"].values()
+        share = sum(b["positions_masked"] for b in boards) / max(1, sum(b["positions"] for b in boards))
+        return f"{100 * share:.2g} %", str(len(saved.materials["segments"]))
+    except (PolysightError, AttributeError, KeyError, TypeError):
+        return "", ""

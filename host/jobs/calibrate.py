@@ -1,8 +1,7 @@
 """`polysight calibrate` and `polysight leakage`: what recorded scans say of the rig.
 
 Each `calibrate` command looks at scans, writes one dated file, and says what that changes; neither the scans nor the
-rig file are written. `leakage` prints what belongs into the rig file's [polarimetry]. Scans of a metal plate become the
-reference by position (`load_reference`).
+rig file are written. `leakage` prints what belongs into the rig file's [polarimetry].
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +17,10 @@ import numpy as np
 
 from polysight.host.calibration.files import CalibrationFile, FilterFile, StartFile, head, write
 from polysight.host.calibration.rows import facts_of, open_raw
-from polysight.host.imaging import ChannelImages
-from polysight.host.jobs.process import imaged
-from polysight.host.pipeline import Pipeline
+from polysight.host.jobs.process import imaged, load_reference, plane_of
 from polysight.host.polarimetry import (
     Leakage,
-    PlaneReference,
     leakage_from_images,
-    plane_reference,
     specular_incidence_rad,
 )
 from polysight.shared.config import Instrument, load_instrument
@@ -177,39 +171,6 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     return _tell(path, file, lines, what_to_set, as_json)
 
 
-def _reference(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
-    name = pipeline.source.scan_id
-    found = plane_reference(images.h, images.v, images.x_m, images.y_m, images.valid, name=name)
-    return replace(found, made_with=pipeline.imaged_with)
-
-
-def load_reference(
-    folder: Path, config: Path | None = None, by_position: bool = True, bands: int = 1
-) -> PlaneReference:
-    """The reference from a scan of a metal plate that covers the plane.
-
-    Parameters
-    ----------
-    folder
-        Scan folder, or the authors' unsynced/<scan>.
-    config
-        Rig file for the latter.
-    by_position
-        A value for each pixel; else one number a channel.
-    bands
-        Sub-bands to image too.
-
-    Raises
-    ------
-    PolysightError
-        when the scan cannot be read, or shows no metal plate.
-    """
-    pipeline, images = imaged(folder, config, bands)
-    parts = tuple(_reference(pipeline, band) for band in pipeline.band_images())
-    found = replace(_reference(pipeline, images), bands=parts)
-    return found if by_position else found.mean()
-
-
 def leakage_of_scans(
     plate: Path, strips: Sequence[tuple[float, Path]], config: Path | None = None
 ) -> tuple[Leakage, dict[str, Any]]:
@@ -236,13 +197,13 @@ def leakage_of_scans(
         when the scans are of different rigs, do not show metal at the same pixels, or are too alike in orientation.
     """
     pipeline, images = imaged(plate, config)
-    whole = _reference(pipeline, images)
+    whole = plane_of(pipeline, images)
     theta = specular_incidence_rad(pipeline.rig)
     mask, turned, names = whole.valid & images.valid, [], [pipeline.source.scan_id]
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
         other, seen = imaged(folder, config)
-        whole.check_rig(other.imaged_with, str(plate))
+        whole.check_rig(other.calibration.imaged_with(other.rig), str(plate))
         whole.check_axes(seen.x_m, seen.y_m)
         mask = mask & seen.valid
         turned.append((float(np.radians(degrees)), seen.h, seen.v))

@@ -5,7 +5,6 @@ The simulators are started as programs, never imported: nothing at run time depe
 
 from __future__ import annotations
 
-import importlib.util
 import selectors
 import shutil
 import signal
@@ -27,11 +26,7 @@ TIME_SCALE = 40.0
 
 
 def run_simulator(arguments: Sequence[str]) -> int:
-    """Run `python -m polysight.simulators ...` and return its exit status.
-
-    Raises ConfigError when it is not installed.
-    """
-    _require_simulators()
+    """Run `python -m polysight.simulators ...` and return its exit status."""
     return subprocess.run([sys.executable, "-m", "polysight.simulators", *arguments], check=False).returncode
 
 
@@ -41,9 +36,8 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
     Raises
     ------
     ConfigError
-        naming the file, the key and the rule that is broken; or when the simulators are not installed.
+        naming the file, the key and the rule that is broken.
     """
-    _require_simulators()
     command = [sys.executable, "-m", "polysight.simulators", "check", *map(str, scenes), "--config", str(config)]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     if checked.returncode != 0:
@@ -54,15 +48,6 @@ def _error_of(status: int, said: str) -> PolysightError:
     """The error that a simulator ended with: its words, which say what, why and what to do, and its exit status."""
     kind = {e.exit_status: e for e in (ConfigError, DataError)}.get(status, DeviceError)
     return kind(said.strip().removeprefix("error: ") or f"a simulator ended with status {status}, without a word")
-
-
-def _require_simulators() -> None:
-    if importlib.util.find_spec("polysight.simulators") is None:
-        raise ConfigError(
-            "the simulators are not installed",
-            "only the host half was installed",
-            "pip install ./simulators from the repository, or use make",
-        )
 
 
 def _check_folder(out: Path) -> None:
@@ -92,7 +77,6 @@ def simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) ->
     PolysightError
         when it does not start, as it said itself; its logs are in `folder`/logs.
     """
-    _require_simulators()
     command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(config), "--scene", str(scene)]
     command += ["--dir", str(folder), "--time-scale", str(time_scale), "--with-pi", "--native"]
     rig = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
@@ -150,7 +134,7 @@ def run_demo(scene: Path, config: Path, out: Path, time_scale: float | None) -> 
         scan = [
             sys.executable,
             "-m",
-            "polysight.host.cli",
+            "polysight.host",
             "scan",
             "--config",
             str(rig_file),

@@ -21,10 +21,10 @@ from polysight.host.acquisition.progress import OnProgress
 from polysight.host.acquisition.scan import OnRow, ScanProgress, ScanResult, resume_scan, run_scan
 from polysight.host.calibration.active import Calibration, of_rig, of_scan
 from polysight.host.imaging.geometry import image_grid
-from polysight.host.jobs.process import TRUTH, check_options, make_products, truth_of
+from polysight.host.jobs.process import TRUTH, check_options, load_options, make_products, truth_of
 from polysight.host.materials import read_truth
 from polysight.host.pipeline import Pipeline
-from polysight.host.process.request import Options
+from polysight.host.process.request import Options, ProcessRequest
 from polysight.host.products.folder import check_products_folder
 from polysight.host.store import manifest
 from polysight.host.store.raw import require_raw
@@ -165,10 +165,10 @@ def _check_options(options: Options, rig: Instrument, calibration: Calibration) 
     placed = calibration.rig(rig)
     grid = image_grid(placed)
     metal = check_options(options, placed, (grid.x_m, grid.y_m))
-    reference = calibration.reference()
-    if reference is not None and options.metal_box_mm is None and metal is None:
-        reference.check_rig(calibration.imaged_with(placed), calibration.name_of("metal"))
-        reference.check_axes(grid.x_m, grid.y_m)
+    in_scene = options.metal_box_mm is not None or metal is not None
+    plane = calibration.metal_plane(placed, None, in_scene, options.bands)
+    if plane is not None:
+        plane.check_axes(grid.x_m, grid.y_m)
 
 
 def _check_new(folder: Path) -> None:
@@ -185,8 +185,9 @@ def _check_new(folder: Path) -> None:
         raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")
 
 
-def scan(config: Path, folder: Path, truth: Path | None, options: Options, keep_incomplete: bool, process: bool) -> int:
-    """Run a new scan and process it; returns the exit status. Raises PolysightError."""
+def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incomplete: bool, process: bool) -> int:
+    """Run a new scan into the request's `data`, and process it; returns the exit status. Raises PolysightError."""
+    options, folder = load_options(request), Path(request.data)
     rig = load_instrument(config)
     _check_new(folder)
     if truth is not None and not truth.is_file():
@@ -211,11 +212,12 @@ def scan(config: Path, folder: Path, truth: Path | None, options: Options, keep_
     return _run(folder, options, process, take)
 
 
-def resume(folder: Path, options: Options, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
-    """Take a scan up at its first row that is not committed; returns the exit status. Raises PolysightError.
+def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config: Path | None = None) -> int:
+    """Take the scan `data` up at its first row that is not committed; returns the exit status. Raises PolysightError.
 
     `config` is a rig file that says how the rig is reached from now on; the scan's own, where it is None.
     """
+    options, folder = load_options(request), Path(request.data)
     source = ScanFolder.load(folder)
     require_raw(source)
     rig_now = None if config is None else load_instrument(config)

@@ -21,10 +21,10 @@ from polysight.host.imaging.images import sub_bands
 from polysight.host.materials import Classifier, Library, Verdict
 from polysight.host.materials.concentration import fit_concentration
 from polysight.host.materials.layers import Layer, LayerFit, fit_layer
+from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.materials.patch_files import PATCHES, MatchedPatch, match_patches
 from polysight.host.materials.published import read_materials
 from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row
-from polysight.host.process.request import LIBRARY
 from polysight.host.products.files import MATERIALS, SCAN, SavedProducts, find_products, read_products
 from polysight.host.report.context import classifier_sentence
 from polysight.shared.config import Chirp, load_instrument
@@ -221,9 +221,9 @@ def report(folder: Path) -> int:
     found = find_products(folder, REPORT)
     if found is None:
         from polysight.host.jobs.process import process
-        from polysight.host.process.request import Options
+        from polysight.host.process.request import ProcessRequest
 
-        return process(folder, folder / "products", None, Options())
+        return process(ProcessRequest(data=str(folder), out=str(folder / "products")))
     sys.stdout.write(f"report:   {found.folder / REPORT}\n")
     return 0
 
@@ -251,7 +251,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     scans = [find_products(folder, PATCHES) for folder in data]
     found = [s for s in scans if s is not None]
     if len(found) == len(scans):
-        return _name(found, library or LIBRARY, model, as_json)
+        return _name(found, library or SIMULATED_LIBRARY, model, as_json)
     if len(data) > 1:
         other = data[scans.index(None)]
         raise ConfigError(

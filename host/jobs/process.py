@@ -19,18 +19,20 @@ from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.focus import focus_sweep
 from polysight.host.jobs.demo import check_scenes, run_simulator
 from polysight.host.materials import TrainingScan, TruthPlate, make_library, patches_from_plates, read_truth
+from polysight.host.materials.analyse import KnownScene, MetalChoice
+from polysight.host.materials.patch_files import read_labels
 from polysight.host.pipeline import Pipeline
-from polysight.host.process.request import Options
-from polysight.host.process.save import Products, write_images, write_quality
-from polysight.host.products.files import IMAGE, write_scan_facts
+from polysight.host.polarimetry import PlaneReference, plane_reference
+from polysight.host.process.request import Options, ProcessRequest
+from polysight.host.process.save import Products, save_images
+from polysight.host.products.files import IMAGE
 from polysight.host.products.folder import check_products_folder, making_products
 from polysight.host.report import write_json
 from polysight.host.report.figures import focus_figure
-from polysight.host.store.raw import require_raw
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder, versions
-from polysight.host.store.sources.published import AuthorsCube, open_scan
-from polysight.host.store.sources.source import ScanSource
-from polysight.shared.config import Instrument, load_instrument
+from polysight.host.store.scan_folder import versions
+from polysight.host.store.source import Source, raw_source
+from polysight.host.store.sources.open import open_source
+from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, ScanError, advice
 
 TRUTH = "truth.json"
@@ -39,27 +41,14 @@ EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
 
 
-def _open(data: Path, config: Path | None) -> ScanSource | AuthorsCube:
-    """A recorded scan of any layout; the rig file is read only where the data brings none."""
-    own = (data / MANIFEST).exists()
-    source = open_scan(data, None if own or config is None else load_instrument(config))
-    if isinstance(source, ScanFolder):
-        require_raw(source)
-    return source
-
-
-def _rows(
-    source: ScanSource | AuthorsCube,
-    data: Path,
-    depth_m: float = 0.0,
-    bands: int = 1,
-    options: Options | None = None,
+def _all_rows(
+    source: Source, data: Path, depth_m: float = 0.0, bands: int = 1, options: Options | None = None
 ) -> Pipeline:
     """A pipeline with all rows of a source, with a progress bar. What `options` cannot use is refused first."""
     pipeline = Pipeline(source, depth_m=depth_m, bands=bands)
     if options is not None:
         metal = check_options(options, pipeline.rig, pipeline.axes_m)
-        pipeline.metal_reference(options, metal is not None)
+        pipeline.metal_plane(options, metal is not None)
     rows = list(source.rows())
     if not rows:
         raise DataError(
@@ -75,7 +64,7 @@ def _rows(
 
 def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, ChannelImages]:
     """A recorded scan of any layout, processed up to its images. Raises PolysightError."""
-    pipeline = _rows(_open(data, config), data, bands=bands)
+    pipeline = _all_rows(open_source(data, config), data, bands=bands)
     return pipeline, pipeline.form_images()
 
 
@@ -107,7 +96,7 @@ def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None
     DataError
         when the library cannot be read or fitted, or a box holds no pixel.
     """
-    _, _, metal = options.drawn(*axes_m)
+    metal = options.drawn(*axes_m).metal
     if options.classifier(rig) is None and options.model != "none":
         sys.stderr.write(f"note: {options.unnamed(rig).replace('was', 'will be', 1)}\n")
     return metal
@@ -132,40 +121,92 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
     raise failed
 
 
-def process(data: Path, out: Path, config: Path | None, options: Options) -> int:
-    """Images, materials and report; returns the exit status. Raises PolysightError."""
-    source, plates = _open(data, config), truth_of(data)
+def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
+    """Images of a metal plate as the reference of other scans. Raises DataError when they show none."""
+    name = pipeline.source.scan_id
+    found = plane_reference(images.h, images.v, images.x_m, images.y_m, images.valid, name=name)
+    return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
+
+
+def load_reference(
+    folder: Path, config: Path | None = None, by_position: bool = True, bands: int = 1
+) -> PlaneReference:
+    """The reference from a scan of a metal plate that covers the plane.
+
+    Parameters
+    ----------
+    folder
+        Scan folder, or the authors' unsynced/<scan>.
+    config
+        Rig file for the latter.
+    by_position
+        A value for each pixel; else one number a channel.
+    bands
+        Sub-bands to image too.
+
+    Raises
+    ------
+    PolysightError
+        when the scan cannot be read, or shows no metal plate.
+    """
+    pipeline, images = imaged(folder, config, bands)
+    parts = tuple(plane_of(pipeline, band) for band in pipeline.band_images())
+    found = replace(plane_of(pipeline, images), bands=parts)
+    return found if by_position else found.mean()
+
+
+def load_options(request: ProcessRequest) -> Options:
+    """The options of a request: its label file is read, its reference scan is processed. Raises PolysightError."""
+    reference = None
+    if request.reference is not None:
+        config = None if request.config is None else Path(request.config)
+        by_position = request.reference_by == "position"
+        reference = load_reference(Path(request.reference), config, by_position, request.bands)
+    return Options(
+        metal_box_mm=request.metal_box_mm,
+        library=None if request.library is None else Path(request.library),
+        model=request.model,
+        reference=reference,
+        bands=request.bands,
+        incidence=request.incidence,
+        labels=None if request.labels is None else read_labels(Path(request.labels)),
+    )
+
+
+def process(request: ProcessRequest) -> int:
+    """Images, materials and report of one scan; returns the exit status. Raises PolysightError."""
+    options, data, out = load_options(request), Path(request.data), Path(request.out)
+    source = open_source(data, None if request.config is None else Path(request.config))
+    plates = truth_of(data)
     check_products_folder(out, source.scan_id)
-    pipeline = _rows(source, data, bands=options.bands, options=options)
+    pipeline = _all_rows(source, data, bands=options.bands, options=options)
     sys.stdout.write(make_products(pipeline, out, options, plates).summary())
     return 0
 
 
 def image(data: Path, out: Path, config: Path | None) -> int:
     """image.npz and quality.json only; returns the exit status. Raises PolysightError."""
-    source = _open(data, config)
+    source = open_source(data, config)
     check_products_folder(out, source.scan_id)
-    pipeline = _rows(source, data)
+    pipeline = _all_rows(source, data)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
-        write_images(new, images)
-        write_scan_facts(new, pipeline.source, pipeline.rig, images)
-        write_quality(new, pipeline.quality.to_dict(**pipeline.quality_notes))
+        save_images(new, source, pipeline.rig, images, pipeline.quality)
     sys.stdout.write(f"image: {out / IMAGE}\n")
     return 0
 
 
 def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     """Find the object plane's distance and tilt by sharpness; focus.json and focus.png. Raises PolysightError."""
-    source = _open(data, config)
+    source = open_source(data, config)
     out.mkdir(parents=True, exist_ok=True)
-    pipeline = _rows(source, data, depth_mm / 1e3)
+    pipeline = _all_rows(source, data, depth_mm / 1e3)
     builder = pipeline.images
     found = focus_sweep(builder, depth_mm / 1e3)
     grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
     moved = replace(grid, z_m=grid.z_m + found.depth_mm / 1e3)
     pictures = (board.image()[0], board.image(moved)[0])
-    if pipeline.by_columns:  # the builder's image is that of the mirrored rig
+    if source.mirrored:  # the builder's image is that of the mirrored rig
         found, pictures = found.transposed(), (pictures[0].T, pictures[1].T)
     sweep = found.to_dict()
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
@@ -192,13 +233,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     from polysight.host.report.sync_report import SyncReport, write_sync_report
     from polysight.host.sync import BoardSetup, synchronise_row
 
-    source = _open(data, config)
-    if isinstance(source, AuthorsCube):
-        raise DataError(
-            f"{data}: the chirps are not in it",
-            "these cubes were synchronised already, by the authors",
-            "give the same scan's unsynced/ folder",
-        )
+    source = raw_source(open_source(data, config), data)
     calibration = of_scan(source)
     rig = calibration.rig(source.instrument)
     chirp, reports = rig.chirp, {}
@@ -214,8 +249,8 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
 
 
 def _training_scan(data: Path, config: Path) -> TrainingScan:
-    source = _open(data, config)
-    pipeline, plates = _rows(source, data), truth_of(data)
+    source = open_source(data, config)
+    pipeline, plates = _all_rows(source, data), truth_of(data)
     if not plates:
         raise DataError(f"{data}: no {TRUTH}", "its plates are not known", "give scans made by polysight simulate")
     metal = next((t for t in plates if t.metal), None)
@@ -223,7 +258,7 @@ def _training_scan(data: Path, config: Path) -> TrainingScan:
         raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
     images = pipeline.form_images()
     known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
-    found = pipeline.find_materials(images, metal.box_mm, plates=plates, segmentation=known)
+    found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
     return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names)
 
 

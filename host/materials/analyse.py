@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from polysight.host.imaging import ChannelImages
 from polysight.host.materials.classify import Classifier, Verdict, features_of
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
 from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, inverse_spread
@@ -25,6 +26,7 @@ from polysight.host.polarimetry import (
     ratio,
     smooth,
 )
+from polysight.shared.config import Instrument
 
 Image = npt.NDArray[np.complexfloating]
 FILLED = 0.1
@@ -99,81 +101,131 @@ class MaterialsResult:
         return row
 
 
-def analyse(
-    h: Image,
-    v: Image,
-    x_m: npt.ArrayLike,
-    y_m: npt.ArrayLike,
-    valid: npt.NDArray[np.bool_] | None = None,
-    *,
-    theta_rad: npt.ArrayLike,
-    classifier: Classifier | None = None,
-    metal_box_mm: Box | None = None,
-    metal_label: int | None = None,
-    leakage: tuple[complex, complex] = (0.0, 0.0),
-    smooth_px: float = 2.0,
-    plates: Sequence[TruthPlate] = (),
-    settings: SegmentSettings | None = None,
-    segmentation: Segmentation | None = None,
-    reference: PlaneReference | None = None,
-) -> MaterialsResult:
-    """Find the patches of an image pair and say what they are.
+@dataclass(frozen=True)
+class ImagePair:
+    """The two channel images that are analysed.
 
-    Parameters
+    Attributes
     ----------
     h, v
         complex [ny, nx], flattened by the footprint of a mirror, not yet metal-referenced.
     x_m, y_m
-        Pixel centres, metres.
+        Pixel centres, metres, [nx] and [ny].
     valid
-        bool [ny, nx].
+        bool [ny, nx]; None: all of it.
+    """
+
+    h: Image
+    v: Image
+    x_m: npt.ArrayLike
+    y_m: npt.ArrayLike
+    valid: npt.NDArray[np.bool_] | None = None
+
+    @classmethod
+    def of(cls, images: ChannelImages) -> ImagePair:
+        """The pair of channel images as imaging makes them."""
+        return cls(images.h, images.v, images.x_m, images.y_m, images.valid)
+
+    def within(self, area: npt.NDArray[np.bool_]) -> ImagePair:
+        """The same, valid only inside `area`, bool [ny, nx]."""
+        return replace(self, valid=area if self.valid is None else self.valid & area)
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What turns images into permittivity.
+
+    Attributes
+    ----------
     theta_rad
         Incidence angle, a number or [ny, nx].
-    classifier
-        None: patches are not named.
-    metal_box_mm, metal_label
-        The metal reference, when the user says where it is; else it is found (:func:`find_metal`).
     leakage
         Cross-polar leakage (p in H, s in V) to remove.
     smooth_px
-        Gaussian filter against speckle before permittivity and classification, inside each patch.
+        Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
+        inside each patch.
+    """
+
+    theta_rad: npt.ArrayLike
+    leakage: tuple[complex, complex] = (0.0, 0.0)
+    smooth_px: float = 2.0
+
+    @classmethod
+    def of(cls, rig: Instrument, angles: IncidenceChoice) -> Optics:
+        """A rig's leakage and filter, under the angles that were chosen."""
+        p = rig.polarimetry
+        return cls(angles.used_rad, (complex(*p.leakage_h), complex(*p.leakage_v)), p.smooth_px)
+
+
+@dataclass(frozen=True)
+class MetalChoice:
+    """Which metal is the reference: a box, a known patch, a plate scanned on its own; none of them: the metal is found.
+
+    Attributes
+    ----------
+    box_mm
+        x0, y0, x1, y1 in millimetres from the image centre.
+    label
+        Number of one of the known patches.
+    plane
+        A metal plate over the whole plane, instead of metal in this scene; where it is not valid nothing is looked at.
+    """
+
+    box_mm: Box | None = None
+    label: int | None = None
+    plane: PlaneReference | None = None
+
+
+@dataclass(frozen=True)
+class KnownScene:
+    """What is known of the scene.
+
+    Attributes
+    ----------
+    segmentation
+        Patches that are known (boxes drawn by hand); None: they are found.
     plates
         The truth, where known: only carried along to the results, never used for them.
-    settings, segmentation
-        How to segment; or patches that are already known (boxes drawn by hand).
-    reference
-        Metal scanned on its own, instead of a metal region in this scene; where it is not valid nothing is looked at.
+    settings
+        How to find patches.
+    """
+
+    segmentation: Segmentation | None = None
+    plates: Sequence[TruthPlate] = ()
+    settings: SegmentSettings | None = None
+
+
+FOUND = MetalChoice()
+"""The metal reference is found in the scene."""
+UNKNOWN_SCENE = KnownScene()
+
+
+def analyse(
+    images: ImagePair,
+    optics: Optics,
+    metal: MetalChoice = FOUND,
+    known: KnownScene = UNKNOWN_SCENE,
+    classifier: Classifier | None = None,
+) -> MaterialsResult:
+    """Find the patches of an image pair and say what they are; without a classifier they are not named.
 
     Raises
     ------
     DataError
         when there is no metal reference, or the image is empty.
     """
-    if reference is not None:
-        reference.check_axes(x_m, y_m)
-        valid = reference.valid if valid is None else valid & reference.valid
-        segmentation = _within(segmentation, valid)
-        even = reference.apply(h, v)
-        found = segmentation or segment(even.h, even.v, x_m, y_m, valid, settings)
-        if not found.patches and float(np.median(np.abs(even.h[valid]))) > FILLED:
-            found = whole_plane(valid, x_m, y_m, (settings or SegmentSettings()).margin_mm)
-    else:
-        segmentation = _within(segmentation, valid)
-        found = segmentation or segment(h, v, x_m, y_m, valid, settings)
-    if reference is not None:
-        metal = MetalReference(reference.valid, None, reference.how)
-    elif metal_box_mm is not None:
-        metal = metal_in_box(metal_box_mm, found, x_m, y_m, valid)
-    elif metal_label is not None:
-        metal = metal_by_label(metal_label, found)
-    else:
-        metal = find_metal(h, v, found, float(np.mean(np.asarray(theta_rad))), leakage)
-    calibrated = to_metal(h, v, metal, leakage, reference)
-    sh, sv = (smooth_inside(c, found, smooth_px) for c in (calibrated.h, calibrated.v))
+    plane = metal.plane
+    if plane is not None:
+        plane.check_axes(images.x_m, images.y_m)
+        images = images.within(plane.valid)
+    found = _patches(images, plane, known)
+    reference = _reference(images, optics, metal, found)
+    calibrated = to_metal(images.h, images.v, reference, optics.leakage, plane)
+    sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
-    theta = np.asarray(theta_rad, np.float64)
-    truth = match(found.patches, plates)
-    reference_std = reference_error(sh, sv, metal, reference)
+    theta = np.asarray(optics.theta_rad, np.float64)
+    truth = match(found.patches, known.plates)
+    reference_std = reference_error(sh, sv, reference, plane)
     inside = [patch.interior for patch in found.patches]
     named = classifier.scan([features_of(sh[at], sv[at], sp[at]) for at in inside]) if classifier else None
     results = []
@@ -189,7 +241,33 @@ def analyse(
                 truth.get(patch.label),
             )
         )
-    return MaterialsResult(calibrated, sh, sv, sp, metal, found, tuple(results), theta)
+    return MaterialsResult(calibrated, sh, sv, sp, reference, found, tuple(results), theta)
+
+
+def _patches(images: ImagePair, plane: PlaneReference | None, known: KnownScene) -> Segmentation:
+    """The known patches, as far as the image reaches, or those that are found."""
+    given = _within(known.segmentation, images.valid)
+    if given:
+        return given
+    if plane is None:
+        return segment(images.h, images.v, images.x_m, images.y_m, images.valid, known.settings)
+    even = plane.apply(images.h, images.v)
+    found = segment(even.h, even.v, images.x_m, images.y_m, images.valid, known.settings)
+    if not found.patches and float(np.median(np.abs(even.h[images.valid]))) > FILLED:
+        margin_mm = (known.settings or SegmentSettings()).margin_mm
+        return whole_plane(plane.valid if images.valid is None else images.valid, images.x_m, images.y_m, margin_mm)
+    return found
+
+
+def _reference(images: ImagePair, optics: Optics, metal: MetalChoice, found: Segmentation) -> MetalReference:
+    """The metal that was chosen, or the patch that must be metal. Raises DataError when there is none."""
+    if metal.plane is not None:
+        return MetalReference(metal.plane.valid, None, metal.plane.how)
+    if metal.box_mm is not None:
+        return metal_in_box(metal.box_mm, found, images.x_m, images.y_m, images.valid)
+    if metal.label is not None:
+        return metal_by_label(metal.label, found)
+    return find_metal(images.h, images.v, found, float(np.mean(np.asarray(optics.theta_rad))), optics.leakage)
 
 
 def to_metal(

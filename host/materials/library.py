@@ -21,6 +21,8 @@ from polysight.shared.errors import DataError
 
 FORMAT = "polysight-library-1"
 SAME_ANGLE_DEG = 1.0
+SIMULATED_LIBRARY = Path(__file__).with_name("simulated-library.npz")
+"""The library that names materials unless another is given: simulated scans of examples/library."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.images import SubBand
-from polysight.host.materials.analyse import MaterialsResult, reference_error, smooth_inside, to_metal
+from polysight.host.materials.analyse import MaterialsResult, Optics, reference_error, smooth_inside, to_metal
 from polysight.host.materials.layers import Bands, Spectrum
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.polarimetry import PlaneReference
@@ -22,6 +22,23 @@ from polysight.shared.errors import DataError
 Image = npt.NDArray[np.complexfloating]
 AMPLITUDE_ERROR = 0.1
 """Relative standard deviation of |H| of a patch: its size, its edges and its tilt are in it, and in no ratio."""
+
+
+def with_bands(
+    found: MaterialsResult,
+    bands: Sequence[SubBand],
+    images: Sequence[ChannelImages],
+    optics: Optics,
+    plane: PlaneReference | None = None,
+) -> MaterialsResult:
+    """The same result with each patch's ratios in sub-bands; as it is where no sub-bands were imaged.
+
+    `plane` is metal scanned on its own, imaged in the same sub-bands. Parameters and errors as :func:`band_rows`.
+    """
+    if not bands:
+        return found
+    parts = None if plane is None else plane.bands
+    return replace(found, bands=band_rows(found, bands, images, optics.leakage, optics.smooth_px, parts))
 
 
 def band_rows(

@@ -51,6 +51,9 @@ def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
         ) from None
 
 
+Plates = tuple[TruthPlate, ...]
+
+
 def read_truth(path: Path) -> tuple[TruthPlate, ...]:
     """Plates of a truth.json. Raises DataError."""
     try:

@@ -13,7 +13,7 @@ from polysight.host.page.images import Shown
 from polysight.host.page.listener import Heard
 from polysight.host.page.story import Notice, Story
 from polysight.host.page.verdict import Signs, judge, no_scan, sync_notices, unreadable
-from polysight.shared.sync_in import WIDTH_US
+from polysight.shared.raster import WIDTH_US
 
 PAPER_PHASE_RAD = 0.022
 """Phase residual after all stages, paper section 9.1."""

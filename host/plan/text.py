@@ -23,7 +23,7 @@ from polysight.host.plan.timing import ROW_OVERHEAD_S, row_motion_s, tail_s, tur
 from polysight.host.report.sync_report import SyncReport
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import EVENTS, ScanFolder
-from polysight.host.store.sources.source import ScanSource
+from polysight.host.store.source import RawSource
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError
@@ -152,7 +152,7 @@ def numbers(f: Forecast) -> dict[str, Any]:
     }
 
 
-def noise_of(source: ScanSource) -> Noise:
+def noise_of(source: RawSource) -> Noise:
     """Direct path over noise of a scan's weaker receiver, from a few of its rows.
 
     Raises

@@ -91,6 +91,11 @@ class PlaneReference:
                 "scan the metal plate with the same rig file; only [grid] may differ",
             )
 
+    def valid_on(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Where the reference is strong enough, on a scan's pixels, bool [ny, nx]. Raises DataError."""
+        self.check_axes(x_m, y_m)
+        return self.valid
+
     def check_rig(self, now: ImagedWith, name: str = "the metal reference") -> None:
         """Refuse images of another rig: the gains would not be theirs. `name` is for the message. Raises DataError."""
         if self.made_with is None:

@@ -1,1 +1,20 @@
-"""What one scan goes through: the request, the quality of its rows, and the products that are saved."""
+"""What one scan goes through between its rows and its products.
+
+`ProcessRequest` is what was asked, as plain data; `Options` the same with its files read. `Quality` collects figures
+while rows are processed; `save_images` and `save_materials` write the products.
+"""
+
+from polysight.host.process.quality import Quality
+from polysight.host.process.request import DrawnBoxes, Options, ProcessRequest
+from polysight.host.process.save import Findings, Products, save_images, save_materials
+
+__all__ = [
+    "DrawnBoxes",
+    "Findings",
+    "Options",
+    "ProcessRequest",
+    "Products",
+    "Quality",
+    "save_images",
+    "save_materials",
+]

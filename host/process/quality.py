@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.store.sources.source import RowData
+from polysight.host.materials.analyse import MaterialsResult, permittivity_change
+from polysight.host.polarimetry import IncidenceChoice, PlaneReference
+from polysight.host.store.source import CubeRow, RowData
 from polysight.host.sync.backlash import echo_of_row, estimate_backlash, object_filter
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument
@@ -30,7 +32,7 @@ class BoardQuality:
     def __post_init__(self) -> None:
         self._filter = object_filter(self.rig, self.board)
 
-    def add(self, row: int, recorded: RowData, frames_valid: int, synced: SyncedRow) -> None:
+    def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Take in one row."""
         self.echoes[row] = echo_of_row(synced, self._filter)
         self.rows[row] = {
@@ -90,6 +92,23 @@ class Quality:
     def __init__(self, rig: Instrument) -> None:
         self.boards = {board.name: BoardQuality(rig, board) for board in rig.receivers}
         self.seconds: dict[str, float] = {}
+        self.notes: dict[str, Any] = {}
+
+    def note(self, **entries: Any) -> None:
+        """Keep entries for quality.json."""
+        self.notes |= entries
+
+    def note_materials(
+        self,
+        found: MaterialsResult,
+        angles: IncidenceChoice,
+        valid: NDArray[np.bool_],
+        plane: PlaneReference | None,
+    ) -> None:
+        """Keep what the choice of the incidence angle changes, and how the metal plate was used."""
+        self.note(incidence={**angles.facts(valid), **permittivity_change(found, angles)})
+        if plane is not None:
+            self.note(metal_reference=plane.facts())
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -101,9 +120,10 @@ class Quality:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
 
     def to_dict(self, **more: Any) -> dict[str, Any]:
-        """Content of quality.json."""
+        """Content of quality.json; `more` are further entries."""
         return {
             "boards": {name: board.summary() for name, board in self.boards.items()},
             "seconds_per_stage": {stage: round(s, 4) for stage, s in self.seconds.items()},
             **more,
+            **self.notes,
         }

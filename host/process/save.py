@@ -13,11 +13,20 @@ from polysight.host.imaging import ChannelImages
 from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
 from polysight.host.materials.patch_files import PATCHES, labels_of, pack_patches, write_labels
 from polysight.host.polarimetry import ratio
-from polysight.host.products.files import LABELS, rx_gains, write_atomically
+from polysight.host.process.quality import Quality
+from polysight.host.products.files import (
+    IMAGE,
+    LABELS,
+    MATERIALS,
+    QUALITY,
+    rx_gains,
+    write_atomically,
+    write_scan_facts,
+)
 from polysight.host.report import write_image, write_json, write_report
 from polysight.host.report.context import ReportContext, classifier_sentence, context_of
 from polysight.host.store.scan_folder import versions
-from polysight.host.store.sources.source import Scan
+from polysight.host.store.source import Scan
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.shared.raster import RasterPlan
@@ -41,71 +50,94 @@ class Products:
         )
 
 
-def write_images(out: Path, images: ChannelImages) -> None:
-    """image.npz before any metal reference is known: p is h / v in arbitrary units."""
-    p = ratio(images.h, images.v)
-    write_image(out / "image.npz", images.h, images.v, p, images.x_m, images.y_m, images.valid)
+@dataclass(frozen=True)
+class Findings:
+    """What is saved of a processed scan.
 
-
-def write_quality(out: Path, quality: dict[str, Any]) -> None:
-    """quality.json."""
-    write_json(out / "quality.json", quality)
-
-
-def write_materials(
-    out: Path,
-    source: Scan,
-    images: ChannelImages,
-    found: MaterialsResult,
-    classifier: Classifier | None,
-    quality: dict[str, Any],
-    truth: tuple[TruthPlate, ...],
-    rig: Instrument | None = None,
-    unnamed: str = "",
-) -> Products:
-    """The metal-referenced image.npz, quality.json, materials.json, figures and report.
-
-    `rig` if it is not the scan's own; `unnamed` says why there is no classifier.
+    Attributes
+    ----------
+    images
+        Both channels, valid where they were analysed.
+    found
+        Patches, and what they are.
+    classifier
+        What named them, if anything did.
+    plates
+        The truth, where known.
     """
-    c = found.calibrated
-    write_image(out / "image.npz", c.h, c.v, c.p, images.x_m, images.y_m, images.valid)
-    write_quality(out, quality)
-    write_labels(out / LABELS, labels_of(found), f"patches of scan {source.scan_id}, in pixels of image.npz")
-    write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, source.simulated))
-    rows = found.rows()
+
+    images: ChannelImages
+    found: MaterialsResult
+    classifier: Classifier | None = None
+    plates: tuple[TruthPlate, ...] = ()
+
+
+def save_images(out: Path, scan: Scan, rig: Instrument, images: ChannelImages, quality: Quality) -> None:
+    """image.npz before any metal reference is known (p is h / v in arbitrary units), scan.json, quality.json.
+
+    `rig` is the one the images were made with.
+    """
+    p = ratio(images.h, images.v)
+    write_image(out / IMAGE, images.h, images.v, p, images.x_m, images.y_m, images.valid)
+    write_scan_facts(out, scan, rig, images)
+    write_json(out / QUALITY, quality.to_dict())
+
+
+def save_materials(
+    out: Path, scan: Scan, rig: Instrument, findings: Findings, unnamed: str, quality: Quality
+) -> Products:
+    """The metal-referenced image.npz, quality.json, materials.json, patches, labels, figures and report.
+
+    `unnamed` says why nothing was named; empty where it was.
+    """
+    found, images, c = findings.found, findings.images, findings.found.calibrated
+    accuracy = pixel_accuracy(found)
+    numbers = quality.to_dict(pixel_accuracy=accuracy)
+    write_image(out / IMAGE, c.h, c.v, c.p, images.x_m, images.y_m, images.valid)
+    write_json(out / QUALITY, numbers)
+    write_labels(out / LABELS, labels_of(found), f"patches of scan {scan.scan_id}, in pixels of image.npz")
+    write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, scan.simulated))
+    rows, classifier = found.rows(), findings.classifier
     named_by = classifier_sentence(classifier) if classifier else unnamed or "Nothing was named."
     write_json(
-        out / "materials.json",
+        out / MATERIALS,
         {
-            "scan_id": source.scan_id,
-            "simulated": source.simulated,
+            "scan_id": scan.scan_id,
+            "simulated": scan.simulated,
             "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
             "library": named_by,
             "model": classifier.model if classifier else None,
-            "pixel_accuracy": pixel_accuracy(found),
+            "pixel_accuracy": accuracy,
             "segments": rows,
         },
     )
+    write_report(out, _report_context(scan, rig, findings, numbers, (named_by, unnamed)))
+    return Products(out, _lines(scan, found, rows) + ((unnamed,) if unnamed else ()))
+
+
+def _report_context(
+    scan: Scan, rig: Instrument, findings: Findings, quality: dict[str, Any], naming: tuple[str, str]
+) -> ReportContext:
+    images, (named_by, unnamed) = findings.images, naming
     context = context_of(
-        found,
+        findings.found,
         images.x_m,
         images.y_m,
-        title=f"Scan {source.scan_id}",
-        simulated=source.simulated,
+        title=f"Scan {scan.scan_id}",
+        simulated=scan.simulated,
         valid=images.valid,
-        plates=truth,
+        plates=findings.plates,
         named_by=named_by,
         quality=quality,
-        config=_config_summary(rig or source.instrument),
+        config=_config_summary(rig),
         provenance={
-            "scan": source.scan_id,
+            "scan": scan.scan_id,
             "processed": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
             **versions(),
         },
         notes=[NOT_ON_HARDWARE, *([unnamed] if unnamed else [])],
     )
-    write_report(out, _with_scan(context, source.plan, rig or source.instrument, images))
-    return Products(out, _lines(source, found, rows) + ((unnamed,) if unnamed else ()))
+    return _with_scan(context, scan.plan, rig, images)
 
 
 def _with_scan(ctx: ReportContext, plan: RasterPlan, rig: Instrument, images: ChannelImages) -> ReportContext:
@@ -126,10 +158,8 @@ def _config_summary(rig: Instrument) -> dict[str, Any]:
     }
 
 
-def _lines(source: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
-    head = (
-        f"{'simulated ' if source.simulated else ''}scan {source.scan_id}: {len(rows)} patches; metal {found.metal.how}"
-    )
+def _lines(scan: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
+    head = f"{'simulated ' if scan.simulated else ''}scan {scan.scan_id}: {len(rows)} patches; metal {found.metal.how}"
     known = [r for r in rows if r["truth"] is not None and r["name"] is not None]
     if not known:
         return (head,)

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials.patch_files import PATCHES, SeenPatches, read_patches
 from polysight.host.store.scan_folder import versions
-from polysight.host.store.sources.source import Scan
+from polysight.host.store.source import Scan
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import decode, to_builtins

@@ -13,7 +13,7 @@ from polysight.host.radar.program import chirp_us, frame_period_us
 from polysight.shared.config import Board, Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import direct_path_m
-from polysight.shared.sync_in import MIN_PERIOD_US, WIDTH_US
+from polysight.shared.raster import MIN_PERIOD_US, WIDTH_US
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 BAND_HZ = (76e9, 81e9)

@@ -22,7 +22,7 @@ from polysight.host.capture.segment import read_index
 from polysight.host.store import manifest
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact, Manifest, ManifestWriter
-from polysight.host.store.sources.source import RowData
+from polysight.host.store.source import RowData
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, DeviceError
@@ -142,6 +142,9 @@ def versions() -> dict[str, str]:
 class ScanFolder:
     """A scan on disk, read. Build with :meth:`create` or :meth:`load`; :meth:`writer` opens it for appending."""
 
+    mirrored = False
+    synchronised = False
+
     def __init__(self, path: Path, content: Manifest) -> None:
         self.path = path
         self.content = content
@@ -252,7 +255,7 @@ class ScanFolder:
             rows[row.row] = row
         return dict(sorted(rows.items()))
 
-    def retaken(self) -> dict[str, Any]:
+    def recording_facts(self) -> dict[str, Any]:
         """For quality.json: `rows_retaken`, takes of all runs that did not count; `rows_incomplete`, rows kept so."""
         last = {f["row"]: f for f in self.facts("row_committed") if f["row"] in self._committed()}
         return {

@@ -11,14 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import msgspec
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from polysight.host.store.sources.source import SyncedSource
 from polysight.host.sync.align import AlignedRow, whole_blocks
 from polysight.host.sync.chain import SyncedRow
 from polysight.host.sync.direct_path import DirectPath, excess_path_m, prepare, reference
@@ -34,7 +32,6 @@ _AS_LEFT = 0.7  # the simplest reading stands unless another puts this much more
 _COHERENT = 0.5  # part of a direct path's power that is the same at all positions, if it is the reference
 _FOUND = 0.5  # of the positions
 _ALONE = 0.8  # part of the power that lies where the object is, if nothing else is in the cube
-_LOOKED_AT = 7  # rows of a cube that tell its form
 
 
 @dataclass(frozen=True)
@@ -81,30 +78,6 @@ class CubeForm:
 
     def _turned(self, cube: NDArray[np.complex64]) -> NDArray[np.complex64]:
         return ((cube.conj() if self.conjugate else cube) * self.turn[:, None]).astype(np.complex64)
-
-
-class CubeReader:
-    """A synchronised scan whose rows come out in our form; each board's form is found from a few rows of its cube."""
-
-    def __init__(self, source: SyncedSource) -> None:
-        self.instrument, self.plan, self.rows = source.instrument, source.plan, source.rows
-        self.simulated, self.scan_id = source.simulated, source.scan_id
-        self._source = source
-        self._forms: dict[str, CubeForm] = {}
-
-    def row(self, board_name: str, row: int) -> SyncedRow:
-        """One board's row, positions as they were met. Raises DataError."""
-        rig, source = self.instrument, self._source
-        if board_name not in self._forms:
-            some = sorted({int(r) for r in np.linspace(0, self.plan.rows - 1, _LOOKED_AT)})
-            looked_at = [source.read_synced(board_name, r) for r in some]
-            self._forms[board_name] = recognise(looked_at, rig, rig.by_name(board_name))
-        met = source.read_synced(board_name, row)[:, :: self.plan.row(row).direction]
-        return self._forms[board_name].synced(met, rig.burst.pulses)
-
-    def recording(self) -> dict[str, Any]:
-        """What quality.json says of how it was recorded, and of the form of its cubes."""
-        return {**self._source.recording(), "cubes": {name: form.how for name, form in self._forms.items()}}
 
 
 def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Board) -> CubeForm:

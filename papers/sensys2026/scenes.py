@@ -16,9 +16,10 @@ import tomli_w
 from polysight.host.jobs.demo import run_simulator
 from polysight.host.jobs.process import EDGE_MM, TRUTH
 from polysight.host.materials import MaterialsResult, TruthPlate, patches_from_plates, read_truth
+from polysight.host.materials.analyse import KnownScene, MetalChoice
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.sources.source import ScanSource
+from polysight.host.store.source import RawSource
 from polysight.shared.errors import ScanError
 
 PLATE_MM = 45.0
@@ -58,7 +59,7 @@ class Imaged:
     y_m: npt.NDArray[np.float64]
 
 
-def imaged(source: ScanSource, plates: tuple[TruthPlate, ...]) -> Imaged:
+def imaged(source: RawSource, plates: tuple[TruthPlate, ...]) -> Imaged:
     """Images of a scan, its plates' places known (as the paper segments by hand), referenced to its metal plate."""
     pipeline = Pipeline(source)
     for row in source.rows():
@@ -66,5 +67,5 @@ def imaged(source: ScanSource, plates: tuple[TruthPlate, ...]) -> Imaged:
     images = pipeline.form_images()
     metal = next(p for p in plates if p.metal)
     known, _ = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
-    result = pipeline.find_materials(images, metal.box_mm, plates=plates, segmentation=known)
+    result = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
     return Imaged(result, images.x_m, images.y_m)

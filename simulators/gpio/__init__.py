@@ -1,7 +1,8 @@
 """A stand-in GPIO chip, for one program at a time: the unmodified libgpiod bindings talk to it as to a kernel.
 
-`gpioshim.c` is preloaded into the program and answers the GPIO character device's calls; its outside world are the
-simulated wires (shared/wires.py). It is compiled on demand; :func:`missing` tells what that needs.
+A library (`gpioshim.c` the calls, `lines.c` the lines) is preloaded into the program and answers the GPIO character
+device's calls; its outside world are the simulated wires (shared/wires.py). It is compiled on demand; :func:`missing`
+tells what that needs.
 """
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ import shutil
 import signal
 from pathlib import Path
 
-from polysight.simulators.build_cache import compiled
+from polysight.simulators.builds import compiled
 
 ENABLING_COMMAND = "sudo apt-get install gcc libc6-dev"
 VANISH = signal.SIGUSR1
-_SOURCE = Path(__file__).with_name("gpioshim.c")
+_SOURCES = sorted(p for p in Path(__file__).parent.iterdir() if p.suffix in (".c", ".h"))
 _CC = ("gcc", "-shared", "-fPIC", "-O2", "-Wall", "-Wextra", "-Werror")
 _LIBRARIES = ("-ldl", "-lpthread")
 
@@ -27,10 +28,11 @@ def missing() -> list[str]:
 
 def shim() -> Path:
     """The compiled library. Raises DeviceError when it does not compile."""
+    code = [str(p) for p in _SOURCES if p.suffix == ".c"]
     return compiled(
         "gpioshim.so",
-        [_SOURCE],
-        [*_CC, "-o", "{folder}/gpioshim.so", str(_SOURCE), *_LIBRARIES],
+        _SOURCES,
+        [*_CC, "-o", "{folder}/gpioshim.so", *code, *_LIBRARIES],
         ("a package is missing, or the source was changed", ENABLING_COMMAND),
     )
 

@@ -4,7 +4,6 @@
 on demand; :func:`missing` tells what that needs.
 """
 
-from polysight.simulators.uno.board import HZ, Cost, EmulatedUno, PinEdge
-from polysight.simulators.uno.build import ENABLING_COMMAND, emulator, firmware, missing
+from polysight.simulators.uno.board import ENABLING_COMMAND, HZ, Cost, EmulatedUno, PinEdge, emulator, firmware, missing
 
 __all__ = ["ENABLING_COMMAND", "HZ", "Cost", "EmulatedUno", "PinEdge", "emulator", "firmware", "missing"]

@@ -1,4 +1,4 @@
-"""The emulated UNO at real time: a drop-in for `python -m polysight.simulators.stage` that runs the compiled sketch itself.
+"""The emulated UNO at real time: `python -m polysight.simulators.stage` with the flashed machine code itself.
 
 `--time-scale` is the speed of the whole board, its heartbeat clock included: a host that asks for the status four
 times per heartbeat allows 2, and a machine that cannot keep up slows the simulated world down.
@@ -12,8 +12,8 @@ from pathlib import Path
 
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import PolysightError
-from polysight.simulators._process import command_line, die_with_parent
-from polysight.simulators.stage_logic import homing_zero
+from polysight.simulators.process import command_line, die_with_parent
+from polysight.simulators.stage import homing_zero
 from polysight.simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 

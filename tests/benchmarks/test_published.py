@@ -13,9 +13,7 @@ from polysight.host.imaging import ImageGrid, backproject, image_grid
 from polysight.host.imaging.geometry import Antennas
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.raster import mean_burst_travel_mm, plan_raster
-from polysight.simulators.radar import SimulatedRig, reference_cube
-from polysight.simulators.scene import Scene, apply_scene, decode_scene
-from polysight.simulators.simulate import row_offsets_mm
+from polysight.simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, reference_cube, row_offsets_mm
 
 STEP_MM = 5.0
 SMALL = {

@@ -12,8 +12,7 @@ import pytest
 
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 REPO = Path(__file__).resolve().parents[2]
 Change = Callable[[dict[str, Any]], None]

@@ -6,7 +6,7 @@ import pytest
 from polysight.host.calibration.active import load_calibration
 from polysight.host.calibration.files import FilterFile, read
 from polysight.host.calibration.filters import BIN_HZ, LEAST, binned
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.sync.high_pass import HighPass, high_pass
@@ -56,7 +56,7 @@ def test_unknown_corners_are_recovered(scans, found):
 def test_processing_uses_the_filter_that_the_rig_file_names(found, tmp_path, make_rig, scan_of):
     rig = make_rig(grid={"columns": 4, "rows": 2}, image={"columns": 20, "rows": 20}, calibration={"hpf": str(found)})
     pipeline = Pipeline(ScanFolder.load(scan_of(tmp_path / "scan", rig)))
-    for name, setup in pipeline.setups.items():
+    for name, setup in pipeline.synchroniser.setups.items():
         measured = HighPass(tuple(1e3 * c for c in read(found, FilterFile, "hpf").boards[name].corners_khz))
         assert setup.equaliser.model == measured != high_pass(rig.chirp)
     assert load_calibration({"hpf": found}).high_pass("LS") is None

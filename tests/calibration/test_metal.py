@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polysight.host.calibration.active import load_calibration
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.jobs.calibrate import load_reference
 from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options

@@ -11,7 +11,7 @@ from polysight.host.calibration.active import Calibration, load_calibration
 from polysight.host.calibration.files import PlacesFile, read
 from polysight.host.calibration.places import Prior, TargetPoint, fit_places, look, places_file, read_target
 from polysight.host.calibration.rows import open_raw
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.imaging.geometry import Antennas
 from polysight.host.jobs.calibrate import with_places_of
 from polysight.shared.errors import ConfigError, DataError

@@ -10,10 +10,11 @@ import pytest
 from polysight.host.calibration.active import checked, load_calibration
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
 from polysight.host.calibration.metal import write_metal
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import image_grid
 from polysight.host.jobs.calibrate import load_reference
+from polysight.host.materials.analyse import MetalChoice
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import plane_reference
 from polysight.host.process.request import Options
@@ -193,10 +194,10 @@ def test_sub_bands_of_the_plate_are_kept_and_others_are_refused(plate, taken_wit
             np.testing.assert_array_equal(getattr(mine, name), getattr(made, name))
         assert (mine.spread, mine.how) == (made.spread, made.how)
     pipeline = Pipeline(taken_with(path))
-    assert len(pipeline.metal_reference(Options(bands=BANDS)).bands) == BANDS
-    assert pipeline.metal_reference(Options()) is not None
+    assert len(pipeline.metal_plane(Options(bands=BANDS)).bands) == BANDS
+    assert pipeline.metal_plane(Options()) is not None
     with pytest.raises(DataError, match="holds 2 sub-bands, not 3") as refused:
-        pipeline.metal_reference(Options(bands=3))
+        pipeline.metal_plane(Options(bands=3))
     assert "--bands 3" in refused.value.remedy
     assert "--bands 2" in refused.value.remedy
 
@@ -213,9 +214,9 @@ def test_each_sub_band_is_divided_by_its_own_metal(plate, taken_with, tmp_path):
     pipeline = Pipeline(taken_with(calibrated(plate, tmp_path / "c", "--bands", str(BANDS))), bands=BANDS)
     for row in pipeline.source.rows():
         pipeline.add_row(row)
-    reference = pipeline.metal_reference(Options(bands=BANDS))
-    (found,) = pipeline.find_materials(pipeline.form_images(), reference=reference).rows()
+    reference = pipeline.metal_plane(Options(bands=BANDS))
+    (found,) = pipeline.find_materials(pipeline.form_images(), MetalChoice(plane=reference)).rows()
     assert len(found["bands"]) == BANDS
     for band in found["bands"]:
         assert complex(*band["ratio"].values()) == pytest.approx(1.0, abs=0.02)
-    assert pipeline.quality_notes["metal_reference"]["sub_bands"] == BANDS
+    assert pipeline.quality.notes["metal_reference"]["sub_bands"] == BANDS

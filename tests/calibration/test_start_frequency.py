@@ -6,7 +6,7 @@ import pytest
 
 from polysight.host.calibration.direct_signal import by_geometry, start_of, unwrapped
 from polysight.host.calibration.files import StartFile, read
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.radar.constraints import direct_if_hz
 from polysight.shared.tables import to_builtins
 

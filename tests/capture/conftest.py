@@ -16,13 +16,10 @@ import tomli_w
 
 from polysight.shared.config import Board, Instrument, load_instrument
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.card_endpoint import CardEndpoint
-from polysight.simulators.card_faults import Faults
-from polysight.simulators.card_sender import Pace
-from polysight.simulators.dca1000 import Network
+from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace
+from polysight.simulators.faults import Faults
 from polysight.simulators.loopback import on_free_subnet
 from polysight.simulators.replay import Player, Recording
-from polysight.simulators.simulated_card import MAC
 
 sys.path.insert(0, str(Path(__file__).parent))  # for recordings.py
 

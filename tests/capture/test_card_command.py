@@ -14,8 +14,8 @@ import pytest
 import tomli_w
 
 from polysight.shared.tables import to_builtins
-from polysight.simulators.card_faults import Faults
-from polysight.simulators.card_sender import bound_udp
+from polysight.simulators.cards import bound_udp
+from polysight.simulators.faults import Faults
 
 POLYSIGHT = Path(sys.executable).parent / "polysight"
 LIMIT_S = 60.0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.host.capture.dca1000 import Code, Status, decode_request, encode_reply
 from polysight.shared.errors import ConfigError, DeviceError
-from polysight.simulators.dca1000 import Network
+from polysight.simulators.cards import Network
 
 
 def test_the_bytes_are_reversed():

@@ -20,8 +20,7 @@ from polysight.host.store.manifest import ManifestWriter
 from polysight.pi_controller.journal import Journal
 from polysight.shared.config import load_instrument
 from polysight.shared.messages import Capture, RunStopped, pack
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 from tests.small_scene import small_scene
 
 FRAMES, SAMPLES = 96, 256

@@ -13,7 +13,7 @@ from polysight.host.capture.card import CardClient
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.receiver import ReceiverProcess
 from polysight.shared.config import Card
-from polysight.simulators.card_faults import Faults
+from polysight.simulators.faults import Faults
 
 SIZE = 300 * 4096 + 1300  # ends with a short packet
 FULL = 1456

@@ -12,8 +12,8 @@ from docs.check.commands import command_faults, parser_of
 from docs.check.pages import ROOT
 
 MODULES = (
-    "polysight.host.cli", "polysight.pi_controller.cli", "polysight.host.radar", "docs.check", "polysight.simulators",
-    "polysight.simulators.rig", "polysight.simulators.cards", "polysight.simulators.stage",
+    "polysight.host.cli.main", "polysight.pi_controller.cli", "polysight.host.radar", "docs.check",
+    "polysight.simulators", "polysight.simulators.rig", "polysight.simulators.cards", "polysight.simulators.stage",
     "polysight.simulators.wires", "polysight.simulators.uno", "polysight.simulators.replay",
 )  # fmt: skip
 
@@ -52,7 +52,7 @@ def test_every_option_is_explained(parser):
 
 def test_readme_names_every_command():
     block = (ROOT / "README.md").read_text(encoding="utf-8").split("## Commands")[1]
-    for module, program in (("polysight.host.cli", "polysight"), ("polysight.pi_controller.cli", "polysight-pi")):
+    for module, program in (("polysight.host.cli.main", "polysight"), ("polysight.pi_controller.cli", "polysight-pi")):
         parser = parser_of(module)
         assert parser is not None
         for action in parser._actions:

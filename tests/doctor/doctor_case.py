@@ -10,8 +10,7 @@ from polysight.host.doctor.bench import Bench, System, Wanted
 from polysight.host.sync import BoardSetup
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene import SimulatedRig, decode_scene
 
 REPO = Path(__file__).resolve().parents[2]
 QUICK = System(write_speed=lambda _folder: 200e6)

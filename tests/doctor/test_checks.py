@@ -10,14 +10,13 @@ from doctor_case import QUICK, RIG, bench_of, rig_with
 
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
 from polysight.host.capture.network import route_interface
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.doctor import bench as kernel
 from polysight.host.doctor.bench import Bench, Finding, System, Wanted, error, ok
 from polysight.host.doctor.check_capture import check_network
 from polysight.host.doctor.check_host import check_config, check_disk, check_time
 from polysight.host.doctor.walk import CHECKS, _try, walk
-from polysight.shared.backends import GPIOD, GPIOMEM, WIRES
-from polysight.shared.messages import HelloReply
+from polysight.shared.messages import GPIOD, GPIOMEM, WIRES, HelloReply
 from polysight.shared.tables import to_builtins
 
 # --- the command ---

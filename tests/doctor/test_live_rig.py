@@ -11,7 +11,7 @@ import pytest
 
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.doctor.bench import System
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
@@ -155,8 +155,8 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     }
     assert validate(scan.path) == []
     pipeline = Pipeline(ScanFolder.load(scan.path))
-    assert pipeline.setups["RH"].equaliser.model.corners_hz == (180.5e3, 355e3)
-    assert pipeline.setups["RV"].equaliser.model.corners_hz == (172.5e3, 347e3)
+    assert pipeline.synchroniser.setups["RH"].equaliser.model.corners_hz == (180.5e3, 355e3)
+    assert pipeline.synchroniser.setups["RV"].equaliser.model.corners_hz == (172.5e3, 347e3)
 
 
 def test_a_trigger_wire_that_is_cut(live):
@@ -186,9 +186,9 @@ def test_a_stage_that_is_silent(live):
 
 def _stage_is_compiled():
     """Whether the stage is the sketch itself, not its Python stand-in."""
-    from polysight.simulators.stage import compiler
+    from polysight.simulators.builds import sketch_compiler
 
-    return compiler() is not None
+    return sketch_compiler() is not None
 
 
 def _wait(condition, limit_s=60.0):

@@ -11,8 +11,7 @@ import pytest
 
 from polysight.host.materials import Library
 from polysight.shared.config import load_instrument
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 REPO = Path(__file__).resolve().parents[2]
 SCRIPTS = REPO / "examples" / "scripts"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.products.files import read_products
 from polysight.host.report import export as hdf5
 from polysight.host.report import write_image, write_json
@@ -105,7 +105,7 @@ def test_matlab_round_trip(folder, tmp_path):
     config = found["config"]
     assert config["chirp"]["start_hz"] == products.scan["instrument"]["chirp"]["start_hz"]
     assert list(config["boards"][1]["mount"][0]["shift_mm"]) == [15.837, -3.35, 0.0]
-    assert found["versions"]["polysight_host"] == "0.1.0"
+    assert found["versions"]["polysight"] == "0.1.0"
     assert json.loads(found["materials_json"]) == products.materials
     assert bool(found["simulated"]) is True
 

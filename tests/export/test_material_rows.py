@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.report import write_image, write_json
 
 PATCH = {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.imaging.images import sub_bands
 from polysight.host.jobs.materials import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict

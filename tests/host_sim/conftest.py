@@ -11,8 +11,7 @@ from polysight.host.materials import TruthPlate, read_truth
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, load_instrument
-from polysight.simulators.scene import Scene, load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import Scene, load_scene, simulate
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.pipeline import Pipeline
-from polysight.host.store.sources.published import AuthorsCube, open_scan
+from polysight.host.store.sources.open import open_source
+from polysight.host.store.sources.published import PublishedCubes
 from polysight.host.sync.synchronised import recognise
 from polysight.shared.config import Image, load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins
-from polysight.simulators.authors_forms import write_cube
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate, write_cube
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))
@@ -34,7 +33,7 @@ SCENE = {
 
 def images(folder):
     """Both images of a scan of a layout, and what is said of its recording."""
-    source = open_scan(folder, SMALL)
+    source = open_source(folder, SMALL)
     pipeline = Pipeline(source)
     for row in source.rows():
         pipeline.add_row(row)
@@ -66,7 +65,7 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
     np.testing.assert_allclose(made.y_m, quiet.y_m, atol=1e-12)
     for channel in ("h", "v"):
         assert alike(made, quiet, channel) > 0.98
-    told = pipeline.quality_notes["recording"]
+    told = pipeline.quality.notes["recording"]
     assert told["direction"] == "col"
     assert told["boards"]["RV"]["positions_missing"] == 2
     assert told["boards"]["RH"]["packets_lost"] > 0
@@ -90,7 +89,7 @@ def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_p
     for channel in ("h", "v"):
         assert alike(made, quiet, channel) > 0.999
     for board in ("RH", "RV"):
-        assert said in pipeline.quality_notes["recording"]["cubes"][board]
+        assert said in pipeline.quality.notes["recording"]["cubes"][board]
     assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 0
 
 
@@ -109,16 +108,16 @@ def test_a_cube_that_is_not_referenced_is_referenced_here_and_its_zeros_are_mask
     made, pipeline = images(folder)
     for channel in ("h", "v"):
         assert alike(made, quiet, channel) > 0.99
-    assert "referenced here" in pipeline.quality_notes["recording"]["cubes"]["RV"]
+    assert "referenced here" in pipeline.quality.notes["recording"]["cubes"]["RV"]
     assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 2
 
 
 def test_an_empty_cube_is_an_error(tmp_path):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
-    source = open_scan(folder, SMALL)
-    assert isinstance(source, AuthorsCube)
+    source = open_source(folder, SMALL)
+    assert isinstance(source, PublishedCubes)
     with pytest.raises(DataError, match="no data"):
-        recognise([0 * source.read_synced("RH", 0)], source.instrument, source.instrument.receivers[0])
+        recognise([0 * source.read_row("RH", 0).cube], source.instrument, source.instrument.receivers[0])
 
 
 def test_cubes_are_processed_like_any_scan_but_for_a_sync_report(tmp_path, capsys):

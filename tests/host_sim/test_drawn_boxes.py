@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import Classifier, Library
+from polysight.host.materials.analyse import KnownScene, MetalChoice
+from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.materials.patch_files import labels_of, read_labels, write_labels
-from polysight.host.process.request import LIBRARY, Options
+from polysight.host.process.request import Options
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 
@@ -15,14 +17,16 @@ pytestmark = pytest.mark.xdist_group("host_sim")
 @pytest.fixture
 def found(imaged):
     scan = imaged("nine-materials")
-    return scan.pipeline.find_materials(scan.images, None, Classifier(Library.load(LIBRARY)), scan.plates)
+    return scan.pipeline.find_materials(
+        scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
+    )
 
 
 def again(scan, path, plates=()):
     boxes, names, metal = Options(labels=read_labels(path)).drawn(scan.images.x_m, scan.images.y_m)
-    return scan.pipeline.find_materials(
-        scan.images, None, Classifier(Library.load(LIBRARY)), plates, segmentation=boxes, metal_label=metal
-    ), names
+    classifier = Classifier(Library.load(SIMULATED_LIBRARY))
+    known = KnownScene(boxes, plates)
+    return scan.pipeline.find_materials(scan.images, MetalChoice(label=metal), known, classifier), names
 
 
 def test_labels_of_products_given_back_find_the_same_materials(imaged, found, tmp_path):

@@ -3,7 +3,8 @@
 import pytest
 
 from polysight.host.materials import Classifier, Library
-from polysight.host.process.request import LIBRARY
+from polysight.host.materials.analyse import KnownScene
+from polysight.host.materials.library import SIMULATED_LIBRARY
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 
@@ -14,8 +15,10 @@ def test_all_nine_plates_of_an_ideal_scan_are_named_right(imaged):
     rig = scan.rig
     assert (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) == (0.0, 0.0)
     assert rig.polarimetry.leakage_h == rig.polarimetry.leakage_v == (0.0, 0.0)
-    assert all(setup.equaliser is None for setup in scan.pipeline.setups.values())
-    found = scan.pipeline.find_materials(scan.images, None, Classifier(Library.load(LIBRARY)), scan.plates)
+    assert all(setup.equaliser is None for setup in scan.pipeline.synchroniser.setups.values())
+    found = scan.pipeline.find_materials(
+        scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
+    )
     assert [p.verdict.name for p in found.patches] == [p.truth.name for p in found.patches]
     assert len(found.patches) == 9
     assert found.metal.certain

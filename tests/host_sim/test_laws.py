@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import Classifier, Library, pixel_accuracy
+from polysight.host.materials.analyse import KnownScene
+from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.materials.segment import axis_mm, box_mask
 from polysight.host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
-from polysight.host.process.request import LIBRARY
 
 pytestmark = pytest.mark.xdist_group("host_sim")
 
@@ -93,7 +94,7 @@ def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances
     scan = imaged("nine-materials", **disturbances)
     leakage = complex(*disturbances.get("leakage_h", [0.05, 0.0]))
     c = calibrate(scan.images.h, scan.images.v, inside(scan, "copper"))
-    theta = scan.pipeline.find_materials(scan.images, plates=scan.plates).theta_rad[0, 0]
+    theta = scan.pipeline.find_materials(scan.images, known=KnownScene(plates=scan.plates)).theta_rad[0, 0]
     true = complex(ratio_from_permittivity(4.75 - 2.43j, theta))
     at = inside(scan, "ceramic")
     measured = np.sum(c.h[at]) / np.sum(c.v[at])
@@ -104,7 +105,9 @@ def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances
 
 def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
     scan = imaged("nine-materials")
-    found = scan.pipeline.find_materials(scan.images, None, Classifier(Library.load(LIBRARY)), scan.plates)
+    found = scan.pipeline.find_materials(
+        scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
+    )
     assert len(found.patches) == 9
     assert all(p.truth is not None and p.verdict is not None for p in found.patches)
     right = [p for p in found.patches if p.verdict.name == p.truth.name]
@@ -119,7 +122,7 @@ def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
 
 
 def test_the_library_never_saw_the_demo_scene():
-    library = Library.load(LIBRARY)
+    library = Library.load(SIMULATED_LIBRARY)
     assert library.simulated
     assert "nine-materials" not in library.scans
     assert len(library.scans) == 8

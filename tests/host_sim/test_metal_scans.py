@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.jobs.calibrate import load_reference
 from polysight.host.jobs.materials import parse_layer
 from polysight.host.jobs.process import imaged
 from polysight.host.materials import read_truth
+from polysight.host.materials.analyse import KnownScene, MetalChoice
 from polysight.host.materials.layers import fit_layer
 from polysight.host.materials.sub_bands import bands_of_row
 from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 pytestmark = pytest.mark.xdist_group("metal_scans")
 
@@ -100,7 +100,7 @@ def test_layers_come_back_where_one_interface_is_off(scan, reference, rig, name)
     """Water behind 3 mm of glass within 10 % in both parts; thin sheets within 5 %; Eq. 3 is beside in every row."""
     layers, truth = STACKS[name]
     pipeline, images = imaged(scan(name), None, bands=BANDS)
-    (row,) = pipeline.find_materials(images, reference=reference, incidence="pixel").rows()
+    (row,) = pipeline.find_materials(images, MetalChoice(plane=reference), incidence="pixel").rows()
     bands = bands_of_row(row, rig.chirp, BANDS)
     assert bands is not None
     fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row["incidence_deg"]))
@@ -187,7 +187,7 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
     scene = decode_scene({"name": "six", "seed": 5, "grid": grid, "burst": {"pulses": 8}, "plates": SIX}, "test")
     folder = simulate(rig, scene, tmp_path / "scan")
     pipeline, images = imaged(folder, None, bands=BANDS)
-    found = pipeline.find_materials(images, plates=read_truth(folder / "truth.json"))
+    found = pipeline.find_materials(images, known=KnownScene(plates=read_truth(folder / "truth.json")))
     assert len(found.patches) == 6
     assert not found.metal.certain  # thin sheets do not obey one interface
     for row in found.rows():

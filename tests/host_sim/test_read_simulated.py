@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.sources.published import open_scan
+from polysight.host.store.sources.open import open_source
 from polysight.host.store.validate import validate
 from polysight.shared.config import load_instrument
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import lost_bytes, simulate
+from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")
@@ -43,8 +41,8 @@ def test_a_simulated_scan_folder_is_whole(tmp_path: Path, loss: float) -> None:
 @pytest.mark.parametrize("zero_filling", [True, False])
 def test_both_layouts_read_alike(tmp_path: Path, loss: float, zero_filling: bool) -> None:
     scene = decode_scene(RAW, "t").with_disturbances(packet_loss=loss)
-    own = open_scan(simulate(RIG, scene, tmp_path / "own"))
-    theirs = open_scan(simulate(RIG, scene, tmp_path / "a", layout="authors", zero_filling=zero_filling), RIG)
+    own = open_source(simulate(RIG, scene, tmp_path / "own"))
+    theirs = open_source(simulate(RIG, scene, tmp_path / "a", layout="authors", zero_filling=zero_filling), RIG)
     assert isinstance(own, ScanFolder)
     assert theirs.simulated
     assert theirs.plan == own.plan

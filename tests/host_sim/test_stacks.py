@@ -3,8 +3,7 @@
 import numpy as np
 
 from polysight.host.polarimetry import multilayer
-from polysight.simulators.fresnel import layered
-from polysight.simulators.scene import Layer
+from polysight.simulators.scene import Layer, layered
 
 F = 78.5e9
 

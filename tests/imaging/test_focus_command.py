@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.imaging.focus import Focus
 from polysight.host.jobs import process as offline
 from polysight.shared.config import load_instrument
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 ROOT = Path(__file__).parents[2]
 SCENE = {

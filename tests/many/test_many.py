@@ -2,40 +2,35 @@
 
 import json
 import sys
-from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
-from polysight.host.cli import main
-from polysight.host.cli_process import table
+from polysight.host.cli.main import main
 from polysight.host.jobs import batch as many
-from polysight.host.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of
+from polysight.host.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of, table
+from polysight.host.process.request import ProcessRequest
 from polysight.host.products.files import FINISHED
 from polysight.shared.errors import ConfigError
 
 WORKER = """
-import json, os, pickle, sys, time
+import json, os, sys, time
 from pathlib import Path
-class Job:
-    name = property(lambda self: self.out.name)
-class Light(pickle.Unpickler):  # without the host's imports, which take seconds
-    def find_class(self, module, name):
-        return Job if name == "Job" else super().find_class(module, name)
-job = Light(sys.stdin.buffer).load()
-out = Path(job.out)
+import msgpack
+job = msgpack.unpackb(sys.stdin.buffer.read())  # plain data: without the host's imports, which take seconds
+out = Path(job["request"]["out"])
 out.mkdir(parents=True, exist_ok=True)
 with (out.parent / "runs.txt").open("a") as f:
-    f.write(job.name + "\\n")
-if job.name == "bad":
+    f.write(out.name + "\\n")
+if out.name == "bad":
     sys.exit("no row is recorded whole\\n  why: it is bad\\n  do: nothing")
-if job.name == "killed":
+if out.name == "killed":
     os.kill(os.getpid(), 9)
-if job.name == "slow":
+if out.name == "slow":
     time.sleep(600)
 for name in ("image.npz", "quality.json"):
     (out / name).write_text("{}")
-(out / ".finished.json").write_text(json.dumps({"made_with": job.made_with, "memory_gb": 0.5}))
+(out / ".finished.json").write_text(json.dumps({"made_with": job["made_with"], "memory_gb": 0.5}))
 """
 
 
@@ -54,10 +49,15 @@ def scans(folder, *names):
     return [folder / n for n in names]
 
 
+def request(data, out, **options):
+    text = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
+    return ProcessRequest(data=str(data), out=str(out / data.name), **text)
+
+
 def jobs(folder, *names, **options):
     found = scans_of([folder])
     assert sorted(p.name for p in found) == sorted(names)
-    return jobs_of(found, folder.parent / "out", Namespace(data=found, config=None, **options), lambda _: None)
+    return jobs_of([request(data, folder.parent / "out", **options) for data in found])
 
 
 def runs(folder):
@@ -68,7 +68,7 @@ def runs(folder):
 def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not_finished(tmp_path, capsys):
     names = ("a", "bad", "c", "killed")
     scans(tmp_path / "in", *names)
-    first = process_many(jobs(tmp_path / "in", *names, metal=None), tmp_path / "out", 2)
+    first = process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
     assert [o.name for o in first] == list(names)
     told = {o.name: o.message for o in first}
@@ -79,7 +79,7 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
     summary = json.loads((tmp_path / "out" / "processed.json").read_text())
     assert [s["status"] for s in summary["scans"]] == ["done", "failed", "done", "failed"]
 
-    again = process_many(jobs(tmp_path / "in", *names, metal=None), tmp_path / "out", 2)
+    again = process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert [o.status for o in again] == ["skipped", "failed", "skipped", "failed"]
     assert runs(tmp_path) == sorted([*names, "bad", "killed"])
     assert "2 finished before, 2 to process" in capsys.readouterr().err
@@ -93,13 +93,13 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
     rig.write_text("1")
 
     def job(config=rig, **changes):
-        options = {"metal": None, "library": library, **changes}
-        return jobs_of([folder], tmp_path / "out", Namespace(data=[folder], **options), lambda _: config)[0]
+        options = {"library": library, "config": config, **changes}
+        return jobs_of([request(folder, tmp_path / "out", **options)])[0]
 
     assert not finished(job())
     process_many([job()], tmp_path / "out", 1)
     assert finished(job())
-    assert not finished(job(metal=(0.0, 0.0, 1.0, 1.0)))
+    assert not finished(job(metal_box_mm=(0.0, 0.0, 1.0, 1.0)))
     assert not finished(job(library=None))
     assert not finished(job(config=None))
     library.write_bytes(b"2")
@@ -141,7 +141,7 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
     assert scans_of([raw, found[1]]) == [raw, found[1]]
     assert scans_of([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
     with pytest.raises(ConfigError, match="two scans are named s1"):
-        jobs_of([found[0], raw], tmp_path / "out", Namespace(data=[]), lambda _: None)
+        jobs_of([request(found[0], tmp_path / "out"), request(raw, tmp_path / "out")])
 
 
 def test_scans_at_a_time_follow_cores_and_memory():
@@ -206,8 +206,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 def test_real_scans_end_to_end(tmp_path, capsys):
     """A simulated scan and a damaged one by the real program; then the mark holds."""
     from polysight.shared.config import load_instrument
-    from polysight.simulators.scene import decode_scene
-    from polysight.simulators.simulate import simulate
+    from polysight.simulators.scene import decode_scene, simulate
 
     rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
     scene = {

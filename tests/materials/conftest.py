@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polysight.host.materials import TruthPlate, analyse
+from polysight.host.materials import TruthPlate
+from polysight.host.materials.analyse import FOUND, ImagePair, KnownScene, Optics, analyse
 
 THETA = np.radians(55.0)
 NINE = {
@@ -34,8 +35,13 @@ class Synthetic:
     plates: tuple[TruthPlate, ...]
     theta: float = THETA
 
-    def analyse(self, **more):
-        return analyse(self.h, self.v, self.x_m, self.y_m, theta_rad=self.theta, plates=self.plates, **more)
+    @property
+    def pair(self):
+        return ImagePair(self.h, self.v, self.x_m, self.y_m)
+
+    def analyse(self, leakage=(0.0, 0.0), metal=FOUND, segmentation=None, classifier=None, pair=None):
+        known = KnownScene(segmentation, self.plates)
+        return analyse(pair or self.pair, Optics(self.theta, leakage), metal, known, classifier)
 
 
 def smooth_field(rng, shape, correlation_px):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.materials import UNKNOWN, Classifier, Library, TrainingScan, entries_of, fit_library
 from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.patch_files import PATCHES, match_patches, pack_patches, read_patches

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.materials import Classifier, Entry, Library
 from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.discriminant import REJECTED, ErrorDiscriminant

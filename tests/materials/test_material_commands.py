@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.jobs.materials import parse_layer
 from polysight.host.materials import Entry, Library
 from polysight.host.materials.layers import Layer, Spectrum, predict

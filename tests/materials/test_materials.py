@@ -21,6 +21,7 @@ from polysight.host.materials import (
     pixel_accuracy,
     read_truth,
 )
+from polysight.host.materials.analyse import Optics
 from polysight.host.materials.knn import ratio_distance
 from polysight.host.materials.library import FORMAT
 from polysight.host.materials.samples import majority
@@ -244,7 +245,7 @@ def test_truth_is_carried_but_never_used(synthetic, library):
     scene = synthetic(4)
     classifier = Classifier(library)
     told = scene.analyse(classifier=classifier)
-    blind = analyse(scene.h, scene.v, scene.x_m, scene.y_m, theta_rad=THETA, classifier=classifier)
+    blind = analyse(scene.pair, Optics(THETA), classifier=classifier)
     assert [r.verdict for r in told.patches] == [r.verdict for r in blind.patches]
     assert all(r.truth is None for r in blind.patches)
     assert pixel_accuracy(blind) is None

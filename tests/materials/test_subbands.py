@@ -8,6 +8,7 @@ import pytest
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.images import SubBand
+from polysight.host.materials.analyse import MetalChoice
 from polysight.host.materials.layers import Bands, Layer, fit_layer
 from polysight.host.materials.sub_bands import band_rows, bands_of_row
 from polysight.host.polarimetry import fresnel, ratio_from_permittivity
@@ -80,7 +81,7 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found)
     cut = replace(scene, h=np.where(valid, scene.h, 0), v=np.where(valid, scene.v, 0))
     label = found.metal.label
     whole, part = (
-        s.analyse(segmentation=found.segmentation, metal_label=label, valid=at)
+        s.analyse(metal=MetalChoice(label=label), segmentation=found.segmentation, pair=s.pair.within(at))
         for s, at in ((scene, np.ones_like(valid)), (cut, valid))
     )
     for before, after in zip(whole.rows(), part.rows(), strict=True):

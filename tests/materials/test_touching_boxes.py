@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from polysight.host.materials.analyse import analyse, smooth_inside
+from polysight.host.materials.analyse import ImagePair, KnownScene, MetalChoice, Optics, analyse, smooth_inside
 from polysight.host.materials.patch_files import patches_from_labels, patches_from_plates
 from polysight.host.materials.truth import TruthPlate
 from polysight.host.polarimetry import fresnel
@@ -37,9 +37,8 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     valid = np.ones(h.shape, bool)
     valid[:, :12] = valid[:, 58:] = False
     h[~valid] = v[~valid] = 0  # as images have it
-    result = analyse(
-        h, v, X_M, Y_M, valid, theta_rad=THETA, metal_label=labels["metal"], segmentation=found, smooth_px=1.0
-    )
+    pair, optics = ImagePair(h, v, X_M, Y_M, valid), Optics(THETA, smooth_px=1.0)
+    result = analyse(pair, optics, MetalChoice(label=labels["metal"]), KnownScene(found))
     rows = {r["label"]: r for r in result.rows()}
     left, nowhere = rows[labels["left"]], rows[labels["nowhere"]]
     assert abs(left["amplitude_h"] - abs(complex(fresnel(LEFT, THETA)[0]))) < 1e-5

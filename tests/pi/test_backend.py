@@ -14,7 +14,7 @@ from polysight.pi_controller.lines_gpiomem import GpiomemLines
 from polysight.pi_controller.lines_wires import WireLines
 from polysight.pi_controller.service import Options, Service
 from polysight.shared import messages as m
-from polysight.shared.backends import is_simulated
+from polysight.shared.messages import is_simulated
 
 
 def test_lines_of_pins_are_hardware_and_all_others_are_simulated():

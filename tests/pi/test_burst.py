@@ -12,7 +12,7 @@ from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_
 from polysight.pi_controller.trigger_lines import Edge
 from polysight.pi_controller.trigger_loop import BurstSent, Counts, LoopFault, RowJob, TriggerLoop
 from polysight.shared.faults import PiFault
-from polysight.shared.sync_in import MIN_PERIOD_NS
+from polysight.shared.raster import MIN_PERIOD_NS
 
 PERIOD = 1_500_000
 SPEC = BurstSpec(16, PERIOD, 1000)

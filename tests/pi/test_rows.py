@@ -15,8 +15,7 @@ from polysight.pi_controller.rows import RefusedError, check_pulses, check_run
 from polysight.shared import messages as m
 from polysight.shared.config import Burst, load_instrument
 from polysight.shared.faults import PiFault
-from polysight.shared.raster import plan_raster
-from polysight.shared.sync_in import MIN_PERIOD_US, WIDTH_US
+from polysight.shared.raster import MIN_PERIOD_US, WIDTH_US, plan_raster
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 replace = msgspec.structs.replace

@@ -11,11 +11,10 @@ from typing import Any
 
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 REPO = Path(__file__).resolve().parents[2]
 COPPER = {"name": "copper", "centre_mm": [-40.0, 10.0], "size_mm": [50.0, 50.0], "metal": True}

@@ -8,7 +8,7 @@ import tomli_w
 
 from polysight.host.pipeline import Pipeline
 from polysight.host.process.request import Options
-from polysight.host.store.sources.published import open_scan
+from polysight.host.store.sources.open import open_source
 from polysight.shared.tables import to_builtins
 
 from .conftest import COPPER, PET, content, rig_of, scene_of, told_by
@@ -25,7 +25,7 @@ def scan(scan_of, tmp_path_factory):
 
 
 def test_sub_bands_lie_as_the_whole_band_s_image_does(scan, tmp_path):
-    source = open_scan(scan, RIG)
+    source = open_source(scan, RIG)
     pipeline = Pipeline(source, bands=BANDS)
     for row in source.rows():
         pipeline.add_row(row)

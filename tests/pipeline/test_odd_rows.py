@@ -9,7 +9,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.report.context import ReportContext
 from polysight.host.report.tables import masked_positions
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.sources.source import RowData
+from polysight.host.store.source import RowData
 
 from .conftest import EVERYWHERE, scene_of
 
@@ -21,10 +21,13 @@ GONE = {0: [0, 1, 4], 1: [0, 1, 4], 3: [6]}  # row to points, in the order they 
 class Cut:
     """A scan of which some positions are lost."""
 
+    mirrored = synchronised = False
+
     def __init__(self, scan: ScanFolder) -> None:
         self._scan = scan
         self.instrument, self.plan, self.path = scan.instrument, scan.plan, scan.path
         self.simulated, self.scan_id, self.rows = scan.simulated, scan.scan_id, scan.rows
+        self.recording_facts = scan.recording_facts
 
     def read_row(self, board: str, row: int) -> RowData:
         whole, size = self._scan.read_row(board, row), self.instrument.burst.pulses * self.instrument.frame_bytes
@@ -36,7 +39,7 @@ class Cut:
 def quality(scan_of, tmp_path_factory):
     scene = scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES)
     source = Cut(ScanFolder.load(scan_of(tmp_path_factory.mktemp("odd") / "scan", scene)))
-    pipeline = Pipeline(source)  # pyright: ignore[reportArgumentType]
+    pipeline = Pipeline(source)
     for row in source.rows():
         pipeline.add_row(row)
     return source, pipeline.quality.to_dict()

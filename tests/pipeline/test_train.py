@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.materials import Library
 from polysight.shared.tables import to_builtins
 

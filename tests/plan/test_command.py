@@ -8,7 +8,7 @@ import tomllib
 import pytest
 import tomli_w
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 
 from .conftest import REPO
 

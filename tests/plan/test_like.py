@@ -6,15 +6,14 @@ import json
 
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.plan import Changes
 from polysight.host.store import manifest
 from polysight.host.store.events import EventWriter
 from polysight.host.store.scan_folder import EVENTS, MANIFEST
 from polysight.shared.messages import Capture
 from polysight.shared.raster import plan_raster
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 from .conftest import REPO
 

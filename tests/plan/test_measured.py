@@ -19,8 +19,7 @@ from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.messages import Capture
 from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import decode_scene, simulate
 
 
 def small_scan(rig, folder, pulses, snr_db):
@@ -72,7 +71,7 @@ def scanned(rig, tmp_path_factory):
             scan = [
                 sys.executable,
                 "-m",
-                "polysight.host.cli",
+                "polysight.host",
                 "scan",
                 "--config",
                 ready.removeprefix("ready ").strip(),

@@ -14,8 +14,7 @@ from polysight.shared.config import Instrument
 from polysight.shared.raster import plan_raster
 from polysight.shared.stage_line import Command, Parameter
 from polysight.shared.wires import WireEdge
-from polysight.simulators.stage_motion import TICK_HZ
-from polysight.simulators.stage_python import PythonStage, Rig
+from polysight.simulators.stage import TICK_HZ, PythonStage, Rig
 
 
 class Stage:

@@ -16,8 +16,7 @@ from polysight.host.polarimetry import (
 )
 from polysight.host.polarimetry.leakage import PLATE
 from polysight.shared.errors import DataError, PolysightError
-from polysight.simulators.fresnel import strips
-from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene import decode_scene, strips
 
 THETA = np.radians(55.0)
 UPRIGHT, LYING = 0.0, np.pi / 2

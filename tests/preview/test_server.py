@@ -13,7 +13,7 @@ import pytest
 from looking import LIMIT_S, served, wait_for
 
 from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
-from polysight.host.cli import build_parser
+from polysight.host.cli.main import build_parser
 from polysight.host.page.server import STATIC, TOKEN_HEADER, is_loopback
 
 TOKEN = "the-right-token"

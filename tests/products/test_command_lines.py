@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.cli import build_parser, main
-from polysight.host.cli_options import joined
-from polysight.host.process.request import LIBRARY
+from polysight.host.cli.main import build_parser, main
+from polysight.host.cli.options import joined
+from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.report import write_json
 
 REPO = Path(__file__).resolve().parents[2]
@@ -37,8 +37,8 @@ def scan(tmp_path) -> Path:
     [
         (["train", "scans/a", "--authors", "data", "--out", "l.npz"], "DATA and --authors together"),
         (["train", "--simulate", "s", "--authors", "data", "--out", "l.npz"], "--simulate and --authors together"),
-        (["classify", str(LIBRARY), "--library", "l.npz"], "--library and --model would do nothing"),
-        (["classify", str(LIBRARY), "--model", "knn"], "--library and --model would do nothing"),
+        (["classify", str(SIMULATED_LIBRARY), "--library", "l.npz"], "--library and --model would do nothing"),
+        (["classify", str(SIMULATED_LIBRARY), "--model", "knn"], "--library and --model would do nothing"),
         (["permittivity", "out", "--bands", "3"], "--bands without --layer"),
         (["permittivity", "out", "--amplitude", "5"], "--amplitude without --layer"),
         (["process", "scan", "--out", "o", "--reference-by", "mean"], "--reference-by mean without --reference"),

@@ -10,15 +10,14 @@ from pathlib import Path
 import pytest
 import tomli_w
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.materials import Library
-from polysight.host.process.request import LIBRARY
+from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 
 REPO = Path(__file__).resolve().parents[2]
 RIG = REPO / "instrument.toml"
@@ -134,7 +133,7 @@ def test_products_whose_raw_rows_were_dropped_stay(made, capsys):
 @pytest.fixture
 def other_angle(made) -> Path:
     """The simulated library as if it had been trained two degrees off."""
-    library = Library.load(LIBRARY)
+    library = Library.load(SIMULATED_LIBRARY)
     moved = (replace(e, incidence_deg=e.incidence_deg + 2) for e in library.entries)
     Library(tuple(moved), library.fit, library.note).save(made / "other.npz")
     return made / "other.npz"

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from polysight.shared.config import Instrument, NativeRadar, Radar, load_instrument
-from polysight.simulators.radar_board import FUNCTIONAL, RadarBoard
+from polysight.simulators.radars import FUNCTIONAL, RadarBoard
 
 RIG_FILE = Path(__file__).resolve().parents[2] / "instrument.toml"
 

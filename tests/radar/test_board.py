@@ -11,8 +11,8 @@ from polysight.host.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameC
 from polysight.host.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight.host.radar.program import program
 from polysight.shared.errors import DeviceError
-from polysight.simulators import radar_board as simulated
-from polysight.simulators.radar_board import Fault
+from polysight.simulators.radars import Fault
+from polysight.simulators.radars import board as simulated
 
 FRAMES = 32
 PERIOD_S = 1.5e-3

@@ -12,8 +12,8 @@ from polysight.host.radar.commands import Chirp, LdoBypass, LowPower
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radar_board import Fault
-from polysight.simulators.radar_board import RadarBoard as Simulated
+from polysight.simulators.radars import Fault
+from polysight.simulators.radars import RadarBoard as Simulated
 
 from .conftest import BoardWords, VirtualClock, native_rig
 

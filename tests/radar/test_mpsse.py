@@ -10,8 +10,8 @@ from polysight.host.radar.board import RadarBoard, State
 from polysight.host.radar.program import program
 from polysight.host.radar.usb import UsbWords, read_words, set_up_spi, write_words
 from polysight.shared.errors import DeviceError
-from polysight.simulators import radar_board as simulated
-from polysight.simulators.radar_usb import UsbChip
+from polysight.simulators.radars import UsbChip
+from polysight.simulators.radars import board as simulated
 
 
 @pytest.fixture

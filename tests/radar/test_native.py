@@ -14,8 +14,7 @@ from polysight.host.store.manifest import decode_line, encode_line
 from polysight.shared.config import Instrument, NativeRadar, Radar
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.radar_board import RadarBoard
-from polysight.simulators.radar_usb import UsbChip
+from polysight.simulators.radars import RadarBoard, UsbChip
 from tests.radar.conftest import BoardWords
 
 PERIOD_S = 1.5e-3

@@ -7,7 +7,7 @@ import pytest
 from polysight.host.radar.interface import RadarState
 from polysight.host.radar.native import NativeRadars
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radar_board import RadarBoard
+from polysight.simulators.radars import RadarBoard
 from tests.radar.conftest import BoardWords
 
 FRAMES = 24

@@ -19,11 +19,10 @@ from polysight.host.radar.program import program
 from polysight.host.radar.spi import SystemClock
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.radar_board import RadarBoard as Simulated
-from polysight.simulators.radar_socket import RadarSocket
+from polysight.simulators.radars import RadarBoard as Simulated
+from polysight.simulators.radars import RadarSocket
 from polysight.simulators.rig import derive
-from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene import SimulatedRig, decode_scene
 
 from .conftest import RIG_FILE
 

@@ -10,7 +10,7 @@ from polysight.host.radar.messages import READY_TO_READ, decode
 from polysight.host.radar.program import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
 from polysight.host.radar.spi import ATTEMPTS, Link
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radar_board import Fault
+from polysight.simulators.radars import Fault
 
 
 def ignored(_):

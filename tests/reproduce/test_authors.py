@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.materials import Library, knn
 from polysight.host.polarimetry import ratio_from_permittivity
 from polysight.papers.sensys2026 import dataset_figures as authors_items
@@ -20,7 +20,7 @@ from polysight.papers.sensys2026.dataset_run import authors_recipe, text_of, wit
 from polysight.papers.sensys2026.item import Table
 from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.errors import DataError
-from polysight.simulators.authors_forms import Errors, Material, write_labels, write_material
+from polysight.simulators.scene import Errors, Material, write_labels, write_material
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
 ERRORS = Errors(0.004, 0.01, leakage=0.05)

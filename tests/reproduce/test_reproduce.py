@@ -7,7 +7,7 @@ import re
 import matplotlib.figure
 import pytest
 
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.papers.sensys2026 import run as catalogue
 from polysight.papers.sensys2026 import run as report
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure

@@ -10,10 +10,9 @@ import pytest
 from polysight.host.acquisition.missed_pulses import place_frames
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.sources.source import RowData
+from polysight.host.store.source import RowData
 from polysight.shared.config import load_instrument
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import simulate
+from polysight.simulators.scene import load_scene, simulate
 from tests.small_scene import small_scene
 
 from .arrival_model import PAYLOAD, Load, pulse_times, receive
@@ -25,6 +24,8 @@ SCENE = small_scene(24, 10, step_mm=(5.0, 10.0), pulses=6, pixels=24, pixel_mm=5
 class Missed:
     """The clean scan, of which every row of both boards misses pulses; `place` says whether its frames are placed."""
 
+    mirrored = synchronised = False
+
     def __init__(self, clean: ScanFolder, place: bool) -> None:
         self._clean, self._place = clean, place
         self.instrument, self.plan = clean.instrument, clean.plan
@@ -33,6 +34,9 @@ class Missed:
 
     def rows(self):
         return self._clean.rows()
+
+    def recording_facts(self):
+        return {}
 
     def read_row(self, board: str, row: int) -> RowData:
         whole, frame = self._clean.read_row(board, row), self.instrument.frame_bytes

@@ -19,8 +19,8 @@ from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument, Radar
 from polysight.shared.errors import ConfigError, DeviceError, ScanError
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.card_faults import Faults
-from polysight.simulators.line_server import LineServer
+from polysight.simulators.faults import Faults
+from polysight.simulators.radars import LineServer
 
 
 class Server:

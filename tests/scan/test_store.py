@@ -16,7 +16,7 @@ from polysight.host.store import manifest
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
 from polysight.host.store.scan_folder import ScanFolder, new_scan_id
-from polysight.host.store.sources.source import ScanSource
+from polysight.host.store.source import RawSource
 from polysight.host.store.validate import to_json, validate
 from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 from polysight.shared.messages import Fault, RunStarted
@@ -133,7 +133,7 @@ def whole(make_instrument, tmp_path) -> Path:
 
 def test_whole_scan_is_valid_and_reads_back(whole):
     assert validate(whole) == []
-    scan: ScanSource = ScanFolder.load(whole)
+    scan: RawSource = ScanFolder.load(whole)
     assert list(scan.rows()) == [0, 1, 2, 3]
     assert scan.simulated
     data = scan.read_row("RV", 1)

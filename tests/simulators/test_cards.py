@@ -21,11 +21,11 @@ import tomli_w
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.tables import to_builtins
 from polysight.shared.wires import WireClient, WireEdge, WireMotion
-from polysight.simulators.card_faults import Faults
-from polysight.simulators.card_sender import ReceiveQueue, bound_udp
-from polysight.simulators.fault_draws import NetworkFaults
+from polysight.simulators.cards.fault_draws import NetworkFaults
+from polysight.simulators.cards.sender import ReceiveQueue, bound_udp
+from polysight.simulators.faults import Faults
 from polysight.simulators.loopback import is_free, on_free_subnet, on_subnet
-from polysight.simulators.pattern import pattern_frames
+from polysight.simulators.scene import pattern_frames
 
 ROOT = Path(__file__).parents[2]
 TIME_SCALE = 20.0

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import socket
 import struct
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -12,110 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.errors import DeviceError
-from polysight.simulators.card_endpoint import CardEndpoint
-from polysight.simulators.card_faults import Faults, read_faults
-from polysight.simulators.card_sender import CardSender, Pace, bound_udp
-from polysight.simulators.dca1000 import Network
-from polysight.simulators.loopback import on_free_subnet
-from polysight.simulators.pattern import PatternSource, pattern_frames
-from polysight.simulators.simulated_card import SimulatedCard
-from polysight.simulators.sync_in import StageTrack
-
-ROOT = Path(__file__).parents[2]
-FRAME, PERIOD_NS = 4096, 1_500_000
-ALIVE, CONFIGURE, EEPROM, START, STOP = (
-    (0x09, b""),
-    (0x03, bytes.fromhex("01010102031e")),
-    0x04,
-    (0x05, b""),
-    (0x06, b""),
-)
-
-
-class Bench:
-    """One card and its host, in one process, on one clock."""
-
-    def __init__(self, rig: Instrument, sockets: ExitStack, seed: int = 1, **faults: Any) -> None:
-        self.now = 0.0
-        self.board = rig.by_name("RH")
-        self.index = rig.boards.index(self.board)
-        self.commands = sockets.enter_context(bound_udp(self.board.host_address, self.board.command_port))
-        self.data = sockets.enter_context(bound_udp(self.board.host_address, self.board.data_port))
-        self.data.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
-        for s in (self.commands, self.data):
-            s.setblocking(False)
-        self.track = StageTrack(rig)
-        settings = [f"{key}={value!r}" for key, value in faults.items()]  # as from the command line
-        table = read_faults(None, settings, ("RH",))["RH"]
-        self.card = SimulatedCard(rig, self.board, PatternSource(rig), table, seed, 1.0, lambda: self.now, Pace(False))
-        sockets.callback(self.card.close)
-        self.pulse = 0
-
-    def request(self, code: int, body: bytes = b"") -> list[bytes]:
-        """Send a request, and everything that the card has to say then."""
-        datagram = struct.pack("<HHH", 0xA55A, code, len(body)) + body + b"\xaa\xee"
-        network = self.card.card.network
-        self.commands.sendto(datagram, (network.card_address, network.command_port))
-        self.card.endpoint.serve_commands()
-        return self.messages()
-
-    def messages(self) -> list[bytes]:
-        while self.card.endpoint.flush() is not None:
-            if not self.card.endpoint.sender.queued_bytes:
-                break
-            self.now += 1e-3
-        return [m[2:6] for m in self._all(self.commands)]
-
-    def packets(self) -> list[bytes]:
-        self.messages()
-        return self._all(self.data)
-
-    def _all(self, s: socket.socket) -> list[bytes]:
-        got = []
-        while True:
-            try:
-                got.append(s.recv(4096))
-            except BlockingIOError:
-                return got
-
-    def pulses(self, n: int) -> None:
-        """n pulses 1.5 ms apart, in calls of different sizes."""
-        while n:
-            some = min(n, 1 + self.pulse % 7)
-            self.card.pulses([(self.pulse + i) * PERIOD_NS for i in range(some)], self.track)
-            self.pulse, n = self.pulse + some, n - some
-
-    def end(self) -> None:
-        self.now += 2.001
-        self.card.tick(False)
-
-    def pattern(self, first: int, n: int) -> bytes:
-        return pattern_frames(self.index, first, n, 256).tobytes()
-
-    @property
-    def counts(self) -> dict[str, int | None]:
-        return self.card.report()
-
-
-def reply(code: int, status: int = 0) -> bytes:
-    return struct.pack("<HH", code, status)
-
-
-def payload(packets: list[bytes]) -> bytes:
-    return b"".join(p[10:] for p in packets)
-
-
-@pytest.fixture
-def sockets() -> Iterator[ExitStack]:
-    with ExitStack() as stack:
-        yield stack
-
-
-@pytest.fixture
-def rig() -> Instrument:
-    return on_free_subnet(load_instrument(ROOT / "instrument.toml"))
+from polysight.shared.config import Instrument
+from polysight.simulators.faults import Faults, read_faults
+from tests.simulators.card_bench import ALIVE, CONFIGURE, FRAME, START, Bench, payload, reply
 
 
 @pytest.mark.parametrize("bit", range(12))
@@ -316,71 +213,6 @@ def test_a_record_that_ends_early_ends_whole(rig: Instrument, sockets: ExitStack
     assert (bench.counts["frames"], bench.counts["frames_not_recorded"]) == (7, 5)
 
 
-def test_the_eeproms_addresses_are_taken_over_the_network_after_a_power_cycle(
-    rig: Instrument, sockets: ExitStack
-) -> None:
-    bench = Bench(rig, sockets)
-    subnet = bench.board.card_address.rpartition(".")[0]
-    old, new = bench.board.card_address, f"{subnet}.199"
-    swapped = [bytes(map(int, a.split(".")))[::-1] for a in (bench.board.host_address, new)]
-    ports = struct.pack("<HH", bench.board.command_port, bench.board.data_port)
-    body = b"".join(swapped) + bytes.fromhex("129078563412") + ports
-    assert bench.request(EEPROM, body) == [reply(4)]
-    assert bench.request(*ALIVE) == [reply(9)]
-    bench.card.endpoint.power_cycle()
-    assert bench.card.card.network.card_address == new
-    bench.request(*START)
-    bench.pulses(2)
-    bench.card.endpoint.flush()
-    _, source = bench.data.recvfrom(4096)
-    assert source == (new, 1024)
-    with bound_udp(old, bench.board.command_port):
-        pass  # the old address is free again
-
-
-def test_single_packets_leave_no_faster_than_their_delay_and_one_by_one(rig: Instrument, sockets: ExitStack) -> None:
-    board, now, sent = rig.boards[0], [0.0], list[float]()
-    receiver = sockets.enter_context(bound_udp(board.host_address, board.data_port))
-    sender = CardSender(
-        (board.card_address, 1024), (board.host_address, 1), (board.host_address, board.data_port), Pace(False, True)
-    )
-    sockets.callback(sender.close)
-    receiver.setblocking(False)
-
-    def clock() -> float:
-        now[0] += 1e-6
-        try:
-            receiver.recv(2000)
-        except BlockingIOError:
-            return now[0]
-        sent.append(now[0])
-        return now[0]
-
-    sender.put_packets(np.zeros((60, 1466), np.uint8))
-    while sender.flush(clock, 25e-6) is not None:
-        pass
-    clock()
-    gaps = np.diff(sent)
-    assert len(sent) == 60
-    assert 59 * 25e-6 - 2e-6 < sent[-1] - sent[0] < 59 * 27e-6
-    assert gaps.min() > 24e-6
-
-
-def test_packets_in_calls_of_many_keep_the_delay_as_a_mean_also_after_a_pause(
-    rig: Instrument, sockets: ExitStack
-) -> None:
-    board, now = rig.boards[0], [0.0]
-    sender = CardSender((board.card_address, 1024), (board.host_address, 1), (board.host_address, 9), Pace(False))
-    sockets.callback(sender.close)
-    for pause in (0.0, 1.0, 0.003):
-        now[0] += pause
-        began = now[0]
-        sender.put_packets(np.zeros((1000, 1466), np.uint8))
-        while (wait := sender.flush(lambda: now[0], 25e-6)) is not None:
-            now[0] += wait + 1e-4  # woken a little late
-        assert 956 * 25e-6 <= now[0] - began <= 1000 * 25e-6 + 0.01
-
-
 def test_every_fault_of_the_table_can_be_written_in_toml(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text(
@@ -394,9 +226,3 @@ def test_every_fault_of_the_table_can_be_written_in_toml(tmp_path: Path) -> None
     )  # fmt: skip
     assert faults["RV"] == common
     assert (faults["RH"].reset_pulses, faults["RH"].boot_s, faults["RH"].deaf_ms) == ((5,), 1.0, 3.0)
-
-
-def test_an_endpoint_says_which_address_is_not_its_own() -> None:
-    network = Network("127.0.0.30", "203.0.113.5", bytes(6), 4096, 4098)
-    with pytest.raises(DeviceError, match=r"203\.0\.113\.5:4096"):
-        CardEndpoint("RH", network, Faults(), 0, 1.0, lambda: 0.0, Pace())

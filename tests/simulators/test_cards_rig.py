@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from polysight.shared.config import load_instrument
-from polysight.simulators.card_sender import bound_udp
+from polysight.simulators.cards import bound_udp
 from polysight.simulators.rig import card_groups, derive
 from polysight.simulators.scene import load_scene
 from tests.small_scene import small_scene

@@ -15,10 +15,8 @@ from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.raster import plan_raster
 from polysight.shared.wires import WireMotion
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import row_offsets_mm
-from polysight.simulators.sync_in import Pulse, StageTrack, SyncInput, sync_line
+from polysight.simulators.cards.sync_in import Pulse, StageTrack, SyncInput, sync_line
+from polysight.simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
 RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
 DEAD_NS = 278_500  # ramp end 128.5 us + 150 us

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from polysight.shared.errors import ConfigError
-from polysight.simulators.card_faults import Faults, read_faults
-from polysight.simulators.dca1000 import Status
-from polysight.simulators.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
-from polysight.simulators.sync_in import Pulse
+from polysight.simulators.cards.dca1000 import Status
+from polysight.simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
+from polysight.simulators.cards.sync_in import Pulse
+from polysight.simulators.faults import Faults, read_faults
 
 EVERYTHING = Faults(loss=0.1, duplicate=0.1, reorder=0.1, late=0.1, late_packets=7, truncate=0.1, lose_packets=(3, 50))
 

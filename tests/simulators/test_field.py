@@ -9,10 +9,10 @@ import pytest
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.field import ObjectField, build_field, node_matrix
-from polysight.simulators.optics import antennas, direct_factor, field_exact
-from polysight.simulators.radar import sample_frequencies_hz
 from polysight.simulators.scene import Scene, apply_scene, decode_scene
+from polysight.simulators.scene.field import ObjectField, build_field, node_matrix
+from polysight.simulators.scene.optics import antennas, direct_factor, field_exact
+from polysight.simulators.scene.radar import sample_frequencies_hz
 
 ROOT = Path(__file__).parents[2]
 GRID = {"columns": 29, "rows": 21, "step_x_mm": 10.0, "step_y_mm": 10.0}

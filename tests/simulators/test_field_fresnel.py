@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 
 from polysight.shared.config import load_instrument
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.fresnel import half_space, layered, plate_reflection, slab
-from polysight.simulators.optics import board_reflectivity
 from polysight.simulators.scene import Layer, Plate, Scene
+from polysight.simulators.scene.optics import board_reflectivity, half_space, layered, plate_reflection, slab
 
 permittivities = st.builds(lambda e, loss: complex(e, -loss), st.floats(1.1, 20.0), st.floats(0.0, 20.0))
 angles = st.floats(0.01, 1.5)

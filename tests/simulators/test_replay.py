@@ -20,13 +20,10 @@ import numpy as np
 import pytest
 
 from polysight.shared.config import load_instrument
-from polysight.simulators.card_endpoint import CardEndpoint
-from polysight.simulators.card_faults import Faults
-from polysight.simulators.card_sender import Pace, bound_udp
-from polysight.simulators.dca1000 import Network
+from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace, bound_udp
+from polysight.simulators.faults import Faults
 from polysight.simulators.loopback import on_free_subnet
 from polysight.simulators.replay import Player, Recording, scan_rows
-from polysight.simulators.simulated_card import MAC
 
 OK = {code: bytes.fromhex(f"5aa5{code:02x}000000aaee") for code in range(1, 15)}
 START, STOP = "5aa505000000aaee", "5aa506000000aaee"

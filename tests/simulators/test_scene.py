@@ -8,7 +8,7 @@ import pytest
 
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
-from polysight.simulators.scene import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
+from polysight.simulators.scene.scene_file import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
 
 ROOT = Path(__file__).parents[2]
 

@@ -14,9 +14,7 @@ from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.messages import Capture, RowFinished, RunStarted, RunStopped, unpack_event
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, plan_raster
 from polysight.simulators.__main__ import main
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import decode_scene
-from polysight.simulators.simulate import lost_bytes, row_offsets_mm, simulate
+from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, row_offsets_mm, simulate
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")

@@ -15,7 +15,7 @@ import pytest
 
 from polysight.shared.errors import DeviceError
 from polysight.shared.wires import WireEdge, WireMessage, WireMotion
-from polysight.simulators.stage import SKETCH_DIR, build, compiler
+from polysight.simulators.builds import SKETCH_DIR, build_sketch, sketch_compiler
 from polysight.simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
 
 
@@ -46,20 +46,20 @@ def motions(wires: list[WireMessage]) -> list[WireMotion]:
 @pytest.fixture(scope="session")
 def firmware_program() -> Path:
     """The sketch compiled for this machine."""
-    gxx = compiler()
+    gxx = sketch_compiler()
     if gxx is None:
         pytest.skip("no C++ compiler: `apt-get install g++` runs these tests too")
-    return build(gxx)
+    return build_sketch(gxx)
 
 
 @pytest.fixture(scope="session")
 def sanitized_program() -> Path:
     """The same with address and undefined-behaviour sanitizers; whatever they find ends the program."""
-    gxx = compiler()
+    gxx = sketch_compiler()
     if gxx is None:
         pytest.skip("no C++ compiler: `apt-get install g++` runs these tests too")
     try:
-        return build(gxx, ("-std=gnu++11", "-Wall", "-Wextra", "-fno-exceptions", *_SANITIZE))
+        return build_sketch(gxx, ("-std=gnu++11", "-Wall", "-Wextra", "-fno-exceptions", *_SANITIZE))
     except DeviceError as e:
         if "san" in str(e) and "cannot find" in str(e):
             pytest.skip(

@@ -13,8 +13,7 @@ import serial
 from polysight.shared.errors import ProtocolError
 from polysight.shared.stage_line import Command, Immediate, Reply
 from polysight.shared.wires import WireMessage, parse
-from polysight.simulators.stage_motion import NS_PER_TICK, TICK_HZ
-from polysight.simulators.stage_python import PythonStage, Rig
+from polysight.simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
 from polysight.simulators.uno import HZ, EmulatedUno
 
 LIMIT_S = 60.0

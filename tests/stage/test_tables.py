@@ -13,7 +13,9 @@ from polysight.shared import stage_line
 from polysight.shared.config import Stage
 from polysight.shared.faults import EXPLANATIONS, StageError, c_header
 from polysight.shared.stage_line import Immediate, Parameter, Reply
-from polysight.simulators import stage_logic, stage_motion, stage_python
+from polysight.simulators.stage import logic as stage_logic
+from polysight.simulators.stage import motion as stage_motion
+from polysight.simulators.stage import python_stage as stage_python
 
 ROOT = Path(__file__).parents[2]
 SKETCH = ROOT / "arduino_stage"

@@ -8,7 +8,7 @@ import random
 import pytest
 
 from polysight.shared.stage_line import Command, Immediate, Parameter
-from polysight.simulators.stage_logic import homing_zero
+from polysight.simulators.stage import homing_zero
 from polysight.simulators.uno import HZ
 
 US, MS = HZ // 1_000_000, HZ // 1000

@@ -30,9 +30,7 @@ from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.raster import plan_raster
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.radar import SimulatedRig
-from polysight.simulators.scene import load_scene
-from polysight.simulators.simulate import row_offsets_mm
+from polysight.simulators.scene import SimulatedRig, load_scene, row_offsets_mm
 from tests.small_scene import small_scene
 
 REPO = Path(__file__).resolve().parents[2]

@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.store.sources.published import AuthorsCube, AuthorsScan, open_scan
+from polysight.host.store.sources.open import open_source
+from polysight.host.store.sources.published import PublishedCubes, PublishedScan
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import rx_positions_m, tx_position_m
@@ -100,8 +101,8 @@ def _whole(row, truth, missing_bytes=()):
 
 def test_complete_rows_come_back_byte_for_byte(write, base):
     folder, truth = write()
-    scan = open_scan(folder, base)
-    assert isinstance(scan, AuthorsScan)
+    scan = open_source(folder, base)
+    assert isinstance(scan, PublishedScan)
     assert list(scan.rows()) == [0, 1, 2, 3]
     for (board, row), full in truth.items():
         _whole(scan.read_row(board, row), full)
@@ -112,14 +113,14 @@ def test_a_grid_wider_than_the_base_rigs_travel_had_room_there(write, base, colu
     folder, _ = write(total_x=columns)
     for file in folder.glob("R?/*_[1-9]*"):
         file.unlink()  # they begin where a narrower grid ends
-    rig = open_scan(folder, base).instrument
+    rig = open_source(folder, base).instrument
     assert rig.grid.columns == columns
     assert rig.stage.travel_x_mm > columns * 2
 
 
 def test_settings_make_the_rig(write, base):
     folder, _ = write(board_dist=1.6)
-    scan = open_scan(folder, base)
+    scan = open_source(folder, base)
     rig = scan.instrument
     assert (rig.grid.columns, rig.grid.rows, rig.grid.step_x_mm, rig.grid.step_y_mm) == (COLUMNS, ROWS, 2, 3)
     assert rig.burst.pulses == PULSES
@@ -149,8 +150,8 @@ ANGLES = {
 
 def test_the_published_angles_are_the_rig_files(write, base):
     folder, _ = write(**ANGLES)
-    assert open_scan(folder, base).instrument.boards == base.boards
-    assert open_scan(folder, base).notices == ()
+    assert open_source(folder, base).instrument.boards == base.boards
+    assert open_source(folder, base).notices == ()
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,7 @@ def test_the_published_angles_are_the_rig_files(write, base):
 )
 def test_each_mount_angle_of_the_scan_turns_its_boards(write, base, key, value, moved):
     folder, _ = write(**ANGLES | {key: value})
-    rig = open_scan(folder, base).instrument
+    rig = open_source(folder, base).instrument
     assert {b.name for b, old in zip(rig.boards, base.boards, strict=True) if b.mount != old.mount} == moved
     for name in moved:  # by hand: undo what comes after the turn, and turn by the difference
         old, new = base.by_name(name), rig.by_name(name)
@@ -186,16 +187,16 @@ def test_each_mount_angle_of_the_scan_turns_its_boards(write, base, key, value, 
 
 def test_a_board_never_looks_away_from_the_object(write, base):
     folder, _ = write(**ANGLES | {"rxboard_angle_y": 55.0, "txboard_angle_y": -44.0})
-    scan = open_scan(folder, base)
+    scan = open_source(folder, base)
     assert scan.instrument.boards == base.boards
     assert len(scan.notices) == 3
-    assert "away from the object" in scan.recording()["notices"][0]
+    assert "away from the object" in scan.recording_facts()["recording"]["notices"][0]
 
 
 def test_units_of_tis_tools_are_understood_too(write, base):
     chirp = {"f0": 76.01, "slope": 38.816929, "ramp_time": 128.5, "adc_start_time": 7, "num_adc": SAMPLES, "Fs": 2150}
     folder, _ = write(chirp_configs=[chirp])
-    got = open_scan(folder, base).instrument.chirp
+    got = open_source(folder, base).instrument.chirp
     for key in ("start_hz", "slope_hz_per_s", "ramp_end_us", "adc_start_us", "sample_rate_hz"):
         assert getattr(got, key) == pytest.approx(getattr(base.chirp, key))
 
@@ -208,7 +209,7 @@ def test_lost_packets_are_masked_where_they_were(write, base, zero_filling, firs
     packets = -(-COLUMNS * BURST // PACKET)
     assert packets == 79
     gaps = [(min(lost) * PACKET, min((max(lost) + 1) * PACKET, COLUMNS * BURST))]
-    scan = open_scan(folder, base)
+    scan = open_source(folder, base)
     _whole(scan.read_row("RV", 2), truth["RV", 2], gaps)
     _whole(scan.read_row("RH", 2), truth["RH", 2])
 
@@ -217,12 +218,12 @@ def test_lost_packets_are_masked_where_they_were(write, base, zero_filling, firs
 def test_a_position_without_a_burst_is_found_by_its_time(write, base, skipped):
     folder, truth = write(skipped={("RH", 1): skipped})
     gaps = [(i * BURST, (i + 1) * BURST) for i in sorted(skipped)]
-    _whole(open_scan(folder, base).read_row("RH", 1), truth["RH", 1], gaps)
+    _whole(open_source(folder, base).read_row("RH", 1), truth["RH", 1], gaps)
 
 
 def test_a_header_line_and_a_missing_log_are_put_up_with(write, base):
     folder, truth = write(header="seq,bytes,time")
-    scan = open_scan(folder, base)
+    scan = open_source(folder, base)
     _whole(scan.read_row("RH", 0), truth["RH", 0])
     (folder / "RH" / "0_0_log.csv").unlink()
     _whole(scan.read_row("RH", 0), truth["RH", 0])
@@ -231,7 +232,7 @@ def test_a_header_line_and_a_missing_log_are_put_up_with(write, base):
 def test_only_rows_that_both_boards_hold_count(write, base):
     folder, _ = write()
     (folder / "RV" / "6_3.bin").unlink()
-    scan = open_scan(folder, base)
+    scan = open_source(folder, base)
     assert list(scan.rows()) == [0, 1, 2]
     with pytest.raises(DataError, match="no row 3 of board RV"):
         scan.read_row("RV", 3)
@@ -242,26 +243,26 @@ def test_contradictions_are_refused(write, base):
     file = folder / "RH" / "0_0.bin"
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(DataError, match="packet log says"):
-        open_scan(folder, base).read_row("RH", 0)
+        open_source(folder, base).read_row("RH", 0)
     (folder / "RH" / "0_0_log.csv").write_text("1,1456,1.0\nnonsense\n")
     with pytest.raises(DataError, match="line 2 is not a packet"):
-        open_scan(folder, base).read_row("RH", 0)
+        open_source(folder, base).read_row("RH", 0)
     (folder / "RH" / "0_0.bin").rename(folder / "RH" / "6_0.bin")
     with pytest.raises(DataError, match="starts at column 6"):
-        open_scan(folder, base)
+        open_source(folder, base)
 
 
 def test_other_orders_and_other_folders_are_refused(write, base, tmp_path):
     with pytest.raises(DataError, match="not a scan"):
-        open_scan(tmp_path, base)
+        open_source(tmp_path, base)
     folder, _ = write(moving_direction="spiral")
     with pytest.raises(DataError, match="moving_direction 'spiral'"):
-        open_scan(folder, base)
+        open_source(folder, base)
     with pytest.raises(DataError, match="geometry"):
-        open_scan(folder)
+        open_source(folder)
     (folder / "data_collection_cfg.json").write_text("{")
     with pytest.raises(DataError, match="not JSON"):
-        open_scan(folder, base)
+        open_source(folder, base)
 
 
 def test_synchronised_cubes_are_read(tmp_path, base):
@@ -272,13 +273,13 @@ def test_synchronised_cubes_are_read(tmp_path, base):
     cube = (rng.standard_normal((4, ROWS, COLUMNS, SAMPLES)) * (1 + 1j)).astype(np.complex64)
     for board in ("RH", "RV"):
         np.save(folder / f"{board}_synced.npy", cube)
-    scan = open_scan(folder, base)
-    assert isinstance(scan, AuthorsCube)
+    scan = open_source(folder, base)
+    assert isinstance(scan, PublishedCubes)
     assert list(scan.rows()) == list(range(ROWS))
-    np.testing.assert_array_equal(scan.read_synced("RV", 2), cube[:, 2])
+    np.testing.assert_array_equal(scan.read_row("RV", 2).cube, cube[:, 2])
     np.save(folder / "RH_synced.npy", cube[:, :2])
     with pytest.raises(DataError, match="its settings say"):
-        scan.read_synced("RH", 0)
+        scan.read_row("RH", 0)
     np.save(folder / "RH_synced.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(DataError, match="not a cube"):
-        scan.read_synced("RH", 0)
+        scan.read_row("RH", 0)

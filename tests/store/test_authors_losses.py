@@ -6,12 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.store.sources.published import RowLosses, open_scan
+from polysight.host.store.sources.open import open_source
+from polysight.host.store.sources.published import RowLosses
 from polysight.host.store.sources.published_settings import mirrored
 from polysight.shared.config import Burst, Grid, load_instrument
 from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
 from polysight.shared.raster import plan_raster
-from polysight.simulators.authors_layout import AuthorsLayout
+from polysight.simulators.scene import AuthorsLayout
 
 ROOT = Path(__file__).parents[2]
 COLUMNS, ROWS, PULSES = 9, 4, 3
@@ -76,7 +77,7 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             numbers = np.flatnonzero(rng.random(left) < 0.03)
             lost[board, row.index] = packets(*numbers.tolist())
     folder, sent = record(tmp_path, skipped, lost, zero_filling, by_columns)
-    scan = open_scan(folder, BASE)
+    scan = open_source(folder, BASE)
     assert list(scan.rows()) == list(range(plan.rows))
     for row in plan:
         for board in ("RH", "RV"):
@@ -86,7 +87,7 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             assert mask.reshape(plan.columns, -1)[sorted(gone)].all()
             assert mask.sum() in (missing, mask.size)  # the transmitter's board was never missing: it tells all places
             assert mask.sum() == missing or len(gone) > plan.columns - 3
-    told = scan.recording()["boards"]
+    told = scan.recording_facts()["recording"]["boards"]
     for board in ("RH", "RV"):
         assert told[board]["positions_short"] == 0
         if not told[board]["rows_not_placed"]:
@@ -98,18 +99,18 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
 @pytest.mark.parametrize("gone", [{0}, {COLUMNS - 1}, {0, 1, 5}])
 def test_the_other_boards_tell_which_end_is_missing(tmp_path, gone):
     folder, sent = record(tmp_path, {("RH", 2): gone})
-    scan = open_scan(folder, BASE)
+    scan = open_source(folder, BASE)
     mask = check(scan.read_row("RH", 2), sent["RH", 2])
     np.testing.assert_array_equal(mask.reshape(COLUMNS, -1).all(axis=1), np.isin(range(COLUMNS), list(gone)))
-    assert scan.recording()["boards"]["RH"]["positions_missing"] == len(gone)
+    assert scan.recording_facts()["recording"]["boards"]["RH"]["positions_missing"] == len(gone)
 
 
 def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
     folder, sent = record(tmp_path, {(b.name, 2): {0} for b in RIG.boards})
-    scan = open_scan(folder, BASE)
+    scan = open_source(folder, BASE)
     for board in ("RH", "RV"):
         assert check(scan.read_row(board, 2), sent[board, 2]).all()
-        assert scan.recording()["boards"][board]["rows_not_placed"] == 1
+        assert scan.recording_facts()["recording"]["boards"][board]["rows_not_placed"] == 1
 
 
 @pytest.mark.parametrize("zero_filling", [True, False])
@@ -128,7 +129,7 @@ def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling):
         at = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
         lines.append(f"{k + 1},{end + 1 - start},{at:.6f}")
     log.write_text("\n".join(lines))
-    scan = open_scan(folder, BASE)
+    scan = open_source(folder, BASE)
     mask = check(scan.read_row("RH", 0), sent["RH", 0])
     np.testing.assert_array_equal(mask.reshape(COLUMNS, -1).all(axis=1), np.arange(COLUMNS) == short)
     assert mask.sum() == BURST
@@ -141,12 +142,12 @@ def test_without_a_log_zeros_are_lost_packets_and_a_short_row_is_masked(tmp_path
         log.unlink()
     short = folder / "RV" / "0_0.bin"
     short.write_bytes(short.read_bytes()[:-BURST])
-    scan = open_scan(folder, BASE)
+    scan = open_source(folder, BASE)
     mask = check(scan.read_row("RV", 1), sent["RV", 1])
     assert mask.sum() == 3 * PACKET
     assert check(scan.read_row("RV", 0), sent["RV", 0]).all()
     assert check(scan.read_row("RV", 2), sent["RV", 2]).sum() == 0
-    told = scan.recording()["boards"]["RV"]
+    told = scan.recording_facts()["recording"]["boards"]["RV"]
     assert (told["packets_lost"], told["rows_not_placed"], told["rows_absent"]) == (3, 1, 0)
 
 
@@ -154,9 +155,9 @@ def test_columns_are_rows_of_the_mirrored_rig(tmp_path):
     folder, _ = record(tmp_path, by_columns=True)
     assert (folder / "RH" / "0_0.bin").exists()
     assert (folder / "RH" / f"1_{ROWS - 1}.bin").exists()
-    scan = open_scan(folder, BASE)
+    scan = open_source(folder, BASE)
     assert (scan.plan.columns, scan.plan.rows) == (ROWS, COLUMNS)
-    assert scan.recording()["direction"] == "col"
+    assert scan.recording_facts()["recording"]["direction"] == "col"
     back = mirrored(scan.instrument)
     assert (back.grid.columns, back.grid.rows) == (COLUMNS, ROWS)
 

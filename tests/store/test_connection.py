@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 
 from polysight.host.acquisition.scan import resume_scan
-from polysight.host.cli import main
+from polysight.host.cli.main import main
 from polysight.host.page.story import Story
 from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, reconnected
 from polysight.shared.config import Instrument, load_instrument

@@ -1,1 +1,1 @@
-"""Where recorded rows come from: our scan folders, and the published data set read as one."""
+"""Where recorded rows come from: `open` recognises a folder, `published*` read the published data set as a `Source`."""

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.host.store.source import CubeRow, RowData
 from polysight.host.store.sources.published_packets import (
     Bursts,
     RowShape,
@@ -28,14 +28,13 @@ from polysight.host.store.sources.published_packets import (
     read_log,
     read_stream,
 )
-from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
-from polysight.host.store.sources.source import RowData
+from polysight.host.store.sources.published_settings import mirrored, read_settings, rig_of
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan, plan_raster
 
 _ROW_FILE = re.compile(r"(\d+)_(\d+)\.bin")
-_SYNCED = "_synced.npy"
+SYNCED = "_synced.npy"
 
 
 @dataclass(frozen=True)
@@ -60,48 +59,17 @@ class RowLosses:
     rows_not_placed: int = 0
 
 
-def open_scan(path: Path, base: Instrument | None = None) -> ScanFolder | AuthorsScan | AuthorsCube:
-    """Open recorded data of any layout, recognised by what the folder holds.
-
-    Parameters
-    ----------
-    path
-        A scan folder, or the authors' `unsynced/<scan>` or `raw/<scan>`.
-    base
-        Rig file whose geometry, stage and limits an authors' scan takes over: their files do not tell them.
-
-    Raises
-    ------
-    DataError
-        when it is none of them, or an authors' scan is opened without `base`.
-    """
-    if (path / MANIFEST).exists():
-        return ScanFolder.load(path)
-    cube = any(path.glob("*" + _SYNCED))
-    if not cube and not (path / COLLECTION).exists():
-        raise DataError(
-            f"{path}: not a scan: neither {MANIFEST} nor {COLLECTION} nor *{_SYNCED} is in it",
-            "the path is wrong, or the download is not complete",
-            "give a scan folder, or a folder unsynced/<scan> or raw/<scan> of the published data",
-        )
-    if base is None:
-        raise DataError(
-            f"{path}: the published data does not tell the rig's geometry",
-            "no rig file was given",
-            "give the instrument.toml of the published rig",
-        )
-    return AuthorsCube(path, base) if cube else AuthorsScan(path, base)
-
-
 class _Published:
     """What both of the authors' folders tell."""
+
+    synchronised = False
 
     def __init__(self, path: Path, base: Instrument) -> None:
         self.path = path
         self._settings = read_settings(path)
         rig, self.notices = rig_of(self._settings, base, path)
-        self.by_columns = self._settings.by_columns
-        self._instrument = mirrored(rig) if self.by_columns else rig
+        self.mirrored = self._settings.by_columns
+        self._instrument = mirrored(rig) if self.mirrored else rig
         self._plan = plan_raster(self._instrument.grid)
 
     @property
@@ -125,8 +93,8 @@ class _Published:
         return self.path.name
 
 
-class AuthorsScan(_Published):
-    """An `unsynced/<scan>` folder as a `ScanSource`.
+class PublishedScan(_Published):
+    """An `unsynced/<scan>` folder as a source.
 
     Raises
     ------
@@ -147,7 +115,7 @@ class AuthorsScan(_Published):
             match = _ROW_FILE.fullmatch(file.name)
             if match is None:
                 continue
-            start, row = (int(match[2 if self.by_columns else 1]), int(match[1 if self.by_columns else 2]))
+            start, row = (int(match[2 if self.mirrored else 1]), int(match[1 if self.mirrored else 2]))
             if row < self._plan.rows:
                 self._check_start(file, start, row)
                 found[row] = file
@@ -156,7 +124,7 @@ class AuthorsScan(_Published):
     def _check_start(self, file: Path, start: int, row: int) -> None:
         expected = self._plan.row(row).column(0)
         if start != expected:
-            row_name, column_name = ("column", "row") if self.by_columns else ("row", "column")
+            row_name, column_name = ("column", "row") if self.mirrored else ("row", "column")
             raise DataError(
                 f"{file}: {row_name} {row} starts at {column_name} {start}, a serpentine from {column_name} 0 has it"
                 f" start at {expected}",
@@ -227,14 +195,15 @@ class AuthorsScan(_Published):
     def _note(self, board_name: str, row: int, losses: RowLosses) -> None:
         self._losses.setdefault(board_name, {})[row] = losses
 
-    def recording(self) -> dict[str, Any]:
-        """What the rows read so far lacked, by board, and the rows that are absent, for quality.json."""
+    def recording_facts(self) -> dict[str, Any]:
+        """What the rows read so far lacked, by board, and the rows that are absent."""
         boards = {}
         for board in self._instrument.receivers:
             rows = [asdict(r) for r in self._losses[board.name].values()]
             total = {key: sum(r[key] for r in rows) for key in asdict(RowLosses())}
             boards[board.name] = {**total, "rows_absent": self._plan.rows - len(self._files[board.name])}
-        return {"direction": self._settings.moving_direction, "boards": boards, "notices": list(self.notices)}
+        how = {"direction": self._settings.moving_direction, "boards": boards, "notices": list(self.notices)}
+        return {"recording": how}
 
 
 def _place(
@@ -257,22 +226,24 @@ def _place(
     return payload, there, short
 
 
-class AuthorsCube(_Published):
+class PublishedCubes(_Published):
     """A `raw/<scan>` folder: cubes that the authors synchronised themselves."""
+
+    synchronised = True
 
     def rows(self) -> Iterator[int]:
         """All rows of the plan."""
         yield from range(self._plan.rows)
 
-    def read_synced(self, board_name: str, row: int) -> NDArray[np.complex64]:
-        """One board's row, complex64 [rx, column, sample], column 0 the smallest x (y), referenced as they left it.
+    def read_row(self, board_name: str, row: int) -> CubeRow:
+        """One board's row, referenced as they left it.
 
         Raises
         ------
         DataError
             when the cube is absent or has another shape than the scan's settings.
         """
-        file = self.path / f"{board_name}{_SYNCED}"
+        file = self.path / f"{board_name}{SYNCED}"
         try:
             cube = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as e:
@@ -281,8 +252,9 @@ class AuthorsCube(_Published):
         shape = (len(rig.antennas.rx_mm), s.total_y, s.total_x, rig.chirp.samples)
         if cube.shape != shape:
             raise DataError(f"{file}: shape {cube.shape}, its settings say {shape}", "not the settings of this scan")
-        return np.array(cube[:, :, row] if self.by_columns else cube[:, row], np.complex64)
+        ascending = cube[:, :, row] if self.mirrored else cube[:, row]  # from the smallest x (y) on
+        return CubeRow(np.array(ascending[:, :: self._plan.row(row).direction], np.complex64))
 
-    def recording(self) -> dict[str, Any]:
-        """What quality.json says of how it was recorded."""
-        return {"direction": self._settings.moving_direction, "notices": list(self.notices)}
+    def recording_facts(self) -> dict[str, Any]:
+        """In which direction, and what to know."""
+        return {"recording": {"direction": self._settings.moving_direction, "notices": list(self.notices)}}

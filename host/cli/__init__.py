@@ -1,0 +1,1 @@
+"""`polysight`: the command line. It parses, and calls `polysight.host.jobs`."""

@@ -1,0 +1,120 @@
+"""The commands that need no hardware: demo, simulate, reproduce."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from polysight.data import packaged
+from polysight.host.cli.options import RIG, Add, add_config_option, positive
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.demo import run_demo
+
+    return run_demo(args.scene, args.config, args.out, args.time_scale)
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.demo import run_simulator
+
+    command = ["simulate", str(args.scene), "--config", str(args.config), "--out", str(args.out)]
+    command += ["--layout", args.layout]
+    if args.seed is not None:
+        command += ["--seed", str(args.seed)]
+    return run_simulator(command)
+
+
+def _reproduce(args: argparse.Namespace) -> int:
+    if args.config != packaged(RIG):
+        load_instrument(args.config)  # a wrong one is told now, not with the first item that needs it
+    if args.authors is not None:
+        from polysight.papers.sensys2026.dataset_run import reproduce_authors
+
+        return reproduce_authors(args.authors, args.out, args.config, args.items, args.images, args.names)
+    if args.images is not None or args.names is not None:
+        raise ConfigError("--images and --names say how to read the published files", "no --authors was given")
+    from polysight.papers.sensys2026.item import Run
+    from polysight.papers.sensys2026.run import reproduce
+
+    return reproduce(args.out, args.items, Run(args.quick, args.config))
+
+
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    sub = add(
+        "demo",
+        _demo,
+        "scan a scene with the whole rig simulated, and make the report; no hardware is needed",
+        "polysight demo --out out/demo",
+    )
+    add_config_option(sub, shipped=True)
+    sub.add_argument(
+        "--scene",
+        type=Path,
+        default=packaged(Path("examples/nine-materials.toml")),
+        metavar="FILE",
+        help="what to scan (default: nine materials)",
+    )
+    sub.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/demo"),
+        metavar="DIR",
+        help="folder to make (default: out/demo); an earlier demo's is replaced",
+    )
+    sub.add_argument(
+        "--time-scale", type=positive, default=None, metavar="X", help="simulated seconds per second (default: 40)"
+    )
+
+    sub = add(
+        "simulate",
+        _simulate,
+        "make the raw data of a scene, with truth.json, in one step and without processes",
+        "polysight simulate examples/point-targets.toml --out out/points",
+    )
+    add_config_option(sub, shipped=True)
+    sub.add_argument("scene", type=Path, metavar="SCENE.toml", help="what to scan, e.g. examples/metal-plate.toml")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
+    sub.add_argument(
+        "--layout",
+        choices=["own", "authors"],
+        default="own",
+        help="a scan folder of this program (default), or unsynced/<scan> as the paper's authors publish it",
+    )
+    sub.add_argument("--seed", type=int, default=None, help="noise seed (default: the scene's)")
+    _add_reproduce(add)
+
+
+def _add_reproduce(add: Add) -> None:
+    sub = add(
+        "reproduce",
+        _reproduce,
+        "make the paper's tables and figures from simulation or from the published files, beside the published values",
+        "polysight reproduce --out out/reproduce fig18 fig20\n"
+        "  polysight reproduce --authors dataset --out out/authors",
+    )
+    sub.add_argument("items", nargs="*", metavar="ITEM", help="fig3, fig18, table2 ... (default: all there are)")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the page and the files")
+    add_config_option(sub, shipped=True)
+    sub.add_argument("--quick", action="store_true", help="fewer draws, models and placements")
+    sub.add_argument(
+        "--authors",
+        type=Path,
+        metavar="DIR",
+        help="the published data set (materials/, labels/): Table 2, Fig. 18, 20 and 21 from its files",
+    )
+    sub.add_argument(
+        "--images",
+        type=Path,
+        metavar="DIR",
+        help="with --authors: folder in which `polysight process` made images of its scans, judged as well",
+    )
+    sub.add_argument(
+        "--names",
+        type=Path,
+        metavar="FILE",
+        help='with --authors: JSON that says which row of Table 2 a name means, {"plexi 3": 3}',
+    )

@@ -1,0 +1,38 @@
+"""`python -m polysight.host.jobs.batch_worker`: process the job on standard input, and mark it as finished."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+
+import msgspec
+
+from polysight.host.jobs.batch import Job
+from polysight.host.jobs.process import process
+from polysight.host.products.files import FINISHED, write_json
+from polysight.shared.errors import PolysightError
+
+
+def main() -> int:
+    """Process one job; returns the exit status. What it says goes to stdout and stderr."""
+    job = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=Job)
+    began = time.monotonic()
+    try:
+        (job.out / FINISHED).unlink(missing_ok=True)
+        status = process(job.request)
+    except PolysightError as e:
+        sys.stderr.write(f"{e}\n")
+        return e.exit_status
+    except OSError as e:
+        sys.stderr.write(f"{e.filename or job.out}: {e.strerror or e}\n")
+        return 1
+    if status == 0:
+        used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        seconds = round(time.monotonic() - began, 1)
+        write_json(job.out / FINISHED, {"made_with": job.made_with, "seconds": seconds, "memory_gb": used / 1e9})
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,57 @@
+"""Open recorded data of any layout, recognised by what the folder holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from polysight.host.store.raw import require_raw
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.host.store.source import Source
+from polysight.host.store.sources.published import SYNCED, PublishedCubes, PublishedScan
+from polysight.host.store.sources.published_settings import COLLECTION
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import DataError
+
+
+def is_source(path: Path) -> bool:
+    """Whether a folder is a scan folder, or `unsynced/<scan>` or `raw/<scan>` of the published data."""
+    known = (MANIFEST, COLLECTION)
+    return path.is_dir() and (any((path / name).exists() for name in known) or any(path.glob("*" + SYNCED)))
+
+
+def open_source(path: Path, base: Instrument | Path | None = None) -> Source:
+    """Open a recorded scan.
+
+    Parameters
+    ----------
+    path
+        A scan folder, or the authors' `unsynced/<scan>` or `raw/<scan>`.
+    base
+        Rig whose geometry, stage and limits an authors' scan takes over, since their files do not tell them; a rig
+        file is read only where it is needed.
+
+    Raises
+    ------
+    DataError
+        when it is none of them, when its raw rows were dropped, or when an authors' scan is opened without `base`.
+    ConfigError
+        when the rig file is wrong.
+    """
+    if (path / MANIFEST).exists():
+        scan = ScanFolder.load(path)
+        require_raw(scan)
+        return scan
+    if not is_source(path):
+        raise DataError(
+            f"{path}: not a scan: neither {MANIFEST} nor {COLLECTION} nor *{SYNCED} is in it",
+            "the path is wrong, or the download is not complete",
+            "give a scan folder, or a folder unsynced/<scan> or raw/<scan> of the published data",
+        )
+    if base is None:
+        raise DataError(
+            f"{path}: the published data does not tell the rig's geometry",
+            "no rig file was given",
+            "give the instrument.toml of the published rig",
+        )
+    rig = load_instrument(base) if isinstance(base, Path) else base
+    return PublishedCubes(path, rig) if any(path.glob("*" + SYNCED)) else PublishedScan(path, rig)

@@ -1,0 +1,61 @@
+"""Recorded rows of a scan, synchronised: raw rows by the chain, rows of published cubes by bringing them to our form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from polysight.host.capture.decode import row_words
+from polysight.host.store.source import CubeRow, RowData, Source
+from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from polysight.host.sync.high_pass import HighPass
+from polysight.host.sync.synchronised import CubeForm, recognise
+from polysight.shared.config import Instrument
+
+_CUBE_ROWS = 7  # rows of a cube that tell its form
+
+
+class RowSynchroniser:
+    """Synchronises the rows of one scan.
+
+    Parameters
+    ----------
+    source
+        The scan.
+    rig
+        Its rig, calibrated.
+    filters
+        Board name to its receiver's measured high-pass filter; None: as the chirp profile programs it.
+    """
+
+    def __init__(self, source: Source, rig: Instrument, filters: Mapping[str, HighPass | None]) -> None:
+        self._source = source
+        self.setups = {b.name: BoardSetup.of(rig, b, model=filters.get(b.name)) for b in rig.receivers}
+        self._forms: dict[str, CubeForm] = {}
+
+    def synchronise(self, board: str, recorded: RowData | CubeRow) -> tuple[SyncedRow, int]:
+        """Return one board's row, synchronised, and how many of its frames are whole. Raises DataError."""
+        rig = self._source.instrument
+        if isinstance(recorded, CubeRow):
+            synced = self._form(board).synced(recorded.cube, rig.burst.pulses)
+            return synced, int(synced.valid.sum())
+        words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, rig.chirp.samples)
+        return synchronise_row(words, valid, self.setups[board]), int(valid.sum())
+
+    def recording_facts(self) -> dict[str, Any]:
+        """What quality.json says of how the scan was recorded, and of the form of its cubes."""
+        facts = self._source.recording_facts()
+        if self._forms:
+            facts["recording"]["cubes"] = {name: form.how for name, form in self._forms.items()}
+        return facts
+
+    def _form(self, board: str) -> CubeForm:
+        """The form of a board's cube, found from a few of its rows."""
+        if board not in self._forms:
+            rig, rows = self._source.instrument, self._source.plan.rows
+            some = sorted({int(r) for r in np.linspace(0, rows - 1, _CUBE_ROWS)})
+            cubes = [row.cube for r in some if isinstance(row := self._source.read_row(board, r), CubeRow)]
+            self._forms[board] = recognise(cubes, rig, rig.by_name(board))
+        return self._forms[board]

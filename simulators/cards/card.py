@@ -1,0 +1,373 @@
+"""One board of a simulated rig: its radar's SYNC_IN, its DCA1000 on the network, and what goes wrong in them.
+
+:class:`CardEndpoint` is the card alone: its state machine, its sockets, and the faults between it and the host.
+:class:`SimulatedCard` joins it to a radar that turns SYNC_IN pulses into frames.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+from polysight.shared.config import Board, Instrument
+from polysight.shared.errors import PolysightError
+from polysight.simulators.cards.dca1000 import (
+    SOURCE_PORT,
+    TAIL_S,
+    Card,
+    Code,
+    Message,
+    Network,
+    Output,
+    Packets,
+    message,
+    parse_request,
+)
+from polysight.simulators.cards.fault_draws import (
+    CommandFaults,
+    EventKind,
+    NetworkFaults,
+    OverflowFaults,
+    PulseEvents,
+    PulseFaults,
+)
+from polysight.simulators.cards.sender import CardSender, Pace, bound_udp
+from polysight.simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput, sync_line
+from polysight.simulators.faults import Faults
+from polysight.simulators.radars import RadarBoard
+
+NO_DATA_FLOOR_S = 10.0  # wall time: at many times real time the card's 30 s would be over before the stage has moved
+if TYPE_CHECKING:
+    from polysight.simulators.scene import SignalSource
+
+FRAMES_PER_CALL = 64  # bounds memory
+MAC = b"\x12\x34\x56\x78\x90\x12"
+Clock = Callable[[], float]
+
+
+class CardEndpoint:
+    """One card with its sockets.
+
+    Parameters
+    ----------
+    name
+        Of the board: keys the faults' random numbers.
+    network
+        Addresses in its EEPROM.
+    time_scale
+        Wire time over wall time.
+    clock_s
+        Wall clock.
+    lanes
+        LVDS lanes of the radar; None suits every configuration.
+
+    Raises
+    ------
+    DeviceError
+        when the card's addresses cannot be taken.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        network: Network,
+        faults: Faults,
+        seed: int,
+        time_scale: float,
+        clock_s: Clock,
+        pace: Pace,
+        lanes: int | None = 4,
+    ) -> None:
+        self.name = name
+        self.counts: Counter[str] = Counter()
+        self.card = Card(
+            network,
+            faults.first_sequence,
+            faults.first_byte_count,
+            no_data_floor_s=NO_DATA_FLOOR_S * time_scale,
+            stop_discards=faults.stop_discards,
+            lanes=lanes,
+        )
+        self._faults = faults
+        self._time_scale = time_scale
+        self._clock_s = clock_s
+        self._pace = pace
+        self._network_faults = NetworkFaults(faults, seed, name, self.counts)
+        self._command_faults = CommandFaults(faults, seed, name, self.counts)
+        self._deaf_until_s = self._link_up_s = float("-inf")
+        self.bindings = 0
+        self._bind(network)
+
+    def _bind(self, network: Network) -> None:
+        self._commands = bound_udp(network.card_address, network.command_port)
+        self._commands.setblocking(False)
+        try:
+            self.sender = CardSender(
+                (network.card_address, SOURCE_PORT),
+                (network.host_address, network.command_port),
+                (network.host_address, network.data_port),
+                self._pace,
+            )
+        except PolysightError:
+            self._commands.close()
+            raise
+        self.bindings += 1
+
+    def fileno(self) -> int:
+        """The command socket, for select. Another one when `bindings` has grown."""
+        return self._commands.fileno()
+
+    def wire_s(self) -> float:
+        """Wire time by the wall clock."""
+        return self._clock_s() * self._time_scale
+
+    def power_cycle(self) -> None:
+        """Switch the card off and on: the addresses in its EEPROM are taken.
+
+        Raises DeviceError when those are not addresses of this machine.
+        """
+        before = self.card.network
+        self.card.power_cycle()
+        self.counts["power_cycles"] += 1
+        self._deaf_until_s = self._clock_s() + self._faults.boot_s / self._time_scale
+        if self.card.network != before:
+            self.sender.send_now()
+            self._keep_sender_counts()
+            self.close()
+            self._bind(self.card.network)
+
+    def reset(self) -> None:
+        """Reset the FPGA, as command 0x01 does, by itself."""
+        self.counts["resets"] += 1
+        self.card.reset_fpga()
+
+    def take_link_down(self, seconds: float) -> None:
+        """Hear nothing, and send no messages, for so long from now, in wire time."""
+        self.counts["link_downs"] += 1
+        self._link_up_s = self._clock_s() + seconds / self._time_scale
+
+    @property
+    def link_is_down(self) -> bool:
+        """Whether requests cannot reach the card now."""
+        return self._clock_s() < self._link_up_s
+
+    def serve_commands(self) -> None:
+        """Answer the requests that have come."""
+        while True:
+            try:
+                datagram = self._commands.recv(2048)
+            except BlockingIOError:
+                return
+            self._serve(datagram)
+
+    def _serve(self, datagram: bytes) -> None:
+        request = parse_request(datagram)
+        if request is None:
+            self.counts["not_requests"] += 1
+            return
+        self.counts["requests"] += 1
+        if self._clock_s() < self._deaf_until_s or self.link_is_down:
+            self.counts["requests_unheard"] += 1
+            return
+        if not self._command_faults.heard():
+            return
+        code = request[0]
+        refused = self._command_faults.refused(code)
+        reply, *more = [message(code, 1)] if refused else self.card.command(datagram, self.wire_s())
+        if code == Code.CONFIGURE_FPGA:
+            self._deaf_until_s = self._clock_s() + self._faults.deaf_ms * 1e-3
+        if bits := self._command_faults.status_after(code):
+            more.append(message(Code.STATUS, bits))
+        if isinstance(reply, Message) and self._command_faults.reply_arrives():
+            self.counts["replies"] += 1
+            delay_s = self._faults.reply_delay_ms * 1e-3
+            self.sender.reply(reply.payload, self._clock_s() + delay_s if delay_s else None)
+        self.emit(more)
+
+    def emit(self, outputs: Sequence[Output], link_is_up: bool = True) -> None:
+        """Send what the card puts out, through the faults of the network."""
+        for output in outputs:
+            if isinstance(output, Message):
+                if not self.card.recording:
+                    for rows in self._network_faults.drain():
+                        self.sender.put_packets(rows)
+                if link_is_up:
+                    self.counts["statuses"] += 1
+                    self.sender.put_status(output.payload)
+                else:
+                    self.counts["link_down_statuses"] += 1
+            else:
+                self._emit_packets(output, link_is_up)
+
+    def _emit_packets(self, packets: Packets, link_is_up: bool) -> None:
+        n, payload_bytes = len(packets.rows), packets.payload_bytes
+        self.counts["packets_made"] += n
+        self.counts["bytes_made"] += payload_bytes
+        if link_is_up:
+            for rows in self._network_faults.carry(packets.rows):
+                self.sender.put_packets(rows)
+        else:
+            self._network_faults.skip(packets.rows)
+            self.counts["link_down_packets"] += n
+            self.counts["link_down_bytes"] += payload_bytes
+
+    @property
+    def due(self) -> bool:
+        """Whether the record ends now if nothing more comes."""
+        deadline_s = self.card.deadline_s
+        return deadline_s is not None and self.wire_s() >= deadline_s
+
+    def tick(self, link_is_up: bool = True) -> None:
+        """End the record when its time has come."""
+        self.emit(self.card.tick(self.wire_s()), link_is_up)
+
+    def flush(self) -> float | None:
+        """Send what may be sent now; seconds until there is more to do, None when all is sent."""
+        return self.sender.flush(self._clock_s, self.card.packet_delay_s / self._time_scale)
+
+    def _keep_sender_counts(self) -> None:
+        for key, value in self.sender.counts().items():
+            self.counts[key] += value
+
+    def report(self) -> dict[str, int | None]:
+        """Everything counted so far."""
+        report: dict[str, int | None] = dict(self.counts)
+        for key, value in self.sender.counts().items():
+            report[key] = self.counts[key] + value
+        report["records"] = self.card.records
+        report["dropped_by_receiver"] = self.sender.dropped_by_receiver()
+        return report
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._commands.close()
+        self.sender.close()
+
+
+def _runs(pulses: list[Pulse]) -> Iterator[list[Pulse]]:
+    """Runs of consecutive numbers, of at most FRAMES_PER_CALL."""
+    first = 0
+    for i in range(1, len(pulses) + 1):
+        if i == len(pulses) or i - first == FRAMES_PER_CALL or pulses[i].number != pulses[i - 1].number + 1:
+            yield pulses[first:i]
+            first = i
+
+
+class SimulatedCard:
+    """One board: its radar, its DCA1000.
+
+    Raises
+    ------
+    DeviceError
+        when the card's addresses cannot be taken.
+    """
+
+    def __init__(
+        self,
+        rig: Instrument,
+        board: Board,
+        source: SignalSource,
+        faults: Faults,
+        seed: int,
+        time_scale: float,
+        clock_s: Clock,
+        pace: Pace = Pace(),  # noqa: B008 - immutable
+    ) -> None:
+        self.board = board
+        self.line = sync_line(rig, board)
+        self._source = source
+        self._clock_s = clock_s
+        network = Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
+        self.endpoint = CardEndpoint(board.name, network, faults, seed, time_scale, clock_s, pace)
+        dead_s = (rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6  # pulses at a time scale are less regular than real ones
+        native = rig.radar.control == "native"
+        self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses) if native else None
+        self._sync = SyncInput(rig, self.radar)
+        self._events = PulseEvents(faults)
+        self._pulse_faults = PulseFaults(faults, seed, board.name)
+        self._overflow = OverflowFaults(faults, seed, board.name)
+        self._down_ns = (0, 0)  # the link is down from .. to, in the wire time of the pulses
+        self._last_pulse_ns = 0
+        self._pulses = 0
+        self.last_data_wall_s = 0.0
+
+    def rearm(self) -> None:
+        """Its control server has told the radar to wait for the pulses of a row."""
+        self._sync.arm()
+
+    @property
+    def card(self) -> Card:
+        """Its DCA1000."""
+        return self.endpoint.card
+
+    def pulses(self, rising_ns: list[int], track: StageTrack) -> None:
+        """SYNC_IN rose at these wire times."""
+        pulses = [Pulse(self._pulses + i, t) for i, t in enumerate(rising_ns)]
+        self._pulses += len(pulses)
+        for part in self._events.parts(pulses):
+            for kind, value in self._events.before(part[0]):
+                self._happen(kind, value, part[0])
+            self._frames(self._sync.frames(self._pulse_faults.seen(part)), track)
+            self._last_pulse_ns = part[-1].t_ns
+        self.last_data_wall_s = self._clock_s()
+
+    def _happen(self, kind: EventKind, value: float, pulse: Pulse) -> None:
+        if kind is EventKind.LINK_DOWN:
+            self._down_ns = (pulse.t_ns, pulse.t_ns + round(value * 1e9))
+            self.endpoint.take_link_down(value)
+        elif kind is EventKind.STATUS:
+            self.endpoint.emit([message(Code.STATUS, 1 << int(value))], self._link_is_up(pulse.t_ns))
+        elif kind is EventKind.END:
+            outputs = self.card.end_record()
+            self.endpoint.counts["records_ended_early"] += bool(outputs)
+            self.endpoint.emit(outputs, self._link_is_up(pulse.t_ns))
+        elif kind is EventKind.RESET:
+            self.endpoint.reset()
+        else:
+            self.endpoint.power_cycle()
+
+    def _link_is_up(self, t_ns: int) -> bool:
+        return not self._down_ns[0] <= t_ns < self._down_ns[1]
+
+    def _frames(self, started: list[Pulse], track: StageTrack) -> None:
+        if not self.card.recording:
+            self.endpoint.counts["frames_not_recorded"] += len(started)
+            return
+        for link_is_up, group in groupby(started, key=lambda p: self._link_is_up(p.t_ns)):
+            for run in _runs(track.places(list(group))):
+                self._run(run, track, link_is_up)
+
+    def _run(self, run: list[Pulse], track: StageTrack, link_is_up: bool) -> None:
+        counts = self.endpoint.counts
+        x_mm, y_mm = track.offsets_mm([p.t_ns for p in run])
+        frames = self._source.chirps(self.board.name, x_mm, y_mm, run[0].number)
+        counts["frames"] += len(frames)
+        for lvds in self._overflow.split(frames):
+            self.endpoint.emit(self.card.lvds(lvds.data, self.endpoint.wire_s()), link_is_up)
+            if lvds.status is not None:
+                counts["overflows"] += 1
+                counts["overflow_bytes"] += lvds.lost_bytes
+                self.endpoint.emit(self.card.overflow(lvds.status), link_is_up)
+
+    def tick(self, more_expected: bool) -> None:
+        """End the record when its time has come.
+
+        At many times real time 2 s are over in an instant, and a process that gets no CPU for that instant must not end
+        the record: while the stage moves, or has raised triggers that no pulse has followed yet, 2 s of wall time are
+        waited for. In real time both are the same.
+        """
+        if more_expected and self._clock_s() - self.last_data_wall_s < TAIL_S:
+            return
+        self.endpoint.tick(self._link_is_up(self._last_pulse_ns + round(TAIL_S * 1e9)))
+
+    def report(self) -> dict[str, int | None]:
+        """Everything counted so far: what really happened, for comparison with what a host found out."""
+        radar = {"pulses": self._pulses, "too_soon": self._sync.too_soon, "missed": self._pulse_faults.missed}
+        radar |= {"rearmed": self._sync.rearmed, "unarmed": self._sync.unarmed}
+        return {"frames": 0, **radar, **self.endpoint.report()}
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self.endpoint.close()

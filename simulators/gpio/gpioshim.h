@@ -1,0 +1,53 @@
+/* What gpioshim.c (the calls that are stood in for) and lines.c (levels, edges and their times) share. */
+#ifndef GPIOSHIM_H
+#define GPIOSHIM_H
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdatomic.h>
+#include <stdint.h>
+#include <time.h>
+#include <linux/gpio.h>
+
+#define MAX_LINES GPIO_V2_LINES_MAX
+#define RING 4096
+#define REAL(f) ({ static __typeof__(&f) real; if (!real) real = (__typeof__(&f))dlsym(RTLD_NEXT, #f); real; })
+
+#pragma GCC visibility push(hidden) /* the program may have the same names */
+
+struct request { /* lines had together, by their file descriptor: an eventfd that is readable while there are events */
+  int n;
+  uint32_t offsets[MAX_LINES], seqno, capacity, head, tail;
+  struct gpio_v2_line_event *events;
+};
+struct line {
+  struct request *owner;
+  int owner_fd, pending, pending_value;
+  uint64_t flags, debounce_ns, pending_wire_ns, pending_due_ns;
+  uint32_t seqno;
+  uint8_t driven, outside;
+  char consumer[GPIO_MAX_NAME_SIZE];
+};
+/* Shared with the second process, which outlives this one for a moment. */
+struct shared {
+  _Atomic uint32_t head, tail;
+  struct change { uint64_t ns; uint32_t line, value; } ring[RING];
+  _Atomic uint8_t high[MAX_LINES];
+};
+
+extern unsigned n_lines;
+extern int wires, wire_clock; /* the hub's socket, -1: none; whether edges carry their wire time */
+extern volatile sig_atomic_t gone;
+extern pthread_mutex_t mutex;
+extern struct line lines[MAX_LINES];
+extern struct shared *shared;
+extern __thread uint64_t thread_ns; /* of a thread that lives in wire time */
+
+int level(const struct line *line);
+void set_output(unsigned line, int value);
+void carry(int alive);
+void *listen_to_wires(void *unused);
+
+#pragma GCC visibility pop
+#endif

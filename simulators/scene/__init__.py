@@ -1,0 +1,59 @@
+"""From a scene file to what the radars send, and to whole scans on disk.
+
+`scene_file` declares what lies on the object plane. `optics` says how plates reflect and sums their echo exactly but
+slowly; `field` computes the same at every stage position fast; `receiver` adds what one board does to the signal;
+`radar` puts them together to frames for given stage offsets. `simulated_scan` writes a scan of these frames, in this
+project's scan folder (`layouts`) or in the published data set's forms (`published_layout`), and truth.json.
+"""
+
+from polysight.simulators.scene.layouts import OwnLayout
+from polysight.simulators.scene.optics import layered, strips
+from polysight.simulators.scene.published_layout import (
+    AuthorsLayout,
+    Errors,
+    Material,
+    write_cube,
+    write_labels,
+    write_material,
+)
+from polysight.simulators.scene.radar import PatternSource, SignalSource, SimulatedRig, pattern_frames, reference_cube
+from polysight.simulators.scene.scene_file import (
+    Disturbances,
+    Layer,
+    Plate,
+    Point,
+    Scene,
+    apply_scene,
+    decode_scene,
+    load_scene,
+)
+from polysight.simulators.scene.simulated_scan import lost_bytes, row_offsets_mm, simulate, truth
+
+__all__ = [
+    "AuthorsLayout",
+    "Disturbances",
+    "Errors",
+    "Layer",
+    "Material",
+    "OwnLayout",
+    "PatternSource",
+    "Plate",
+    "Point",
+    "Scene",
+    "SignalSource",
+    "SimulatedRig",
+    "apply_scene",
+    "decode_scene",
+    "layered",
+    "load_scene",
+    "lost_bytes",
+    "pattern_frames",
+    "reference_cube",
+    "row_offsets_mm",
+    "simulate",
+    "strips",
+    "truth",
+    "write_cube",
+    "write_labels",
+    "write_material",
+]

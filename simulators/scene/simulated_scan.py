@@ -1,0 +1,195 @@
+"""A whole scan of a scene without sockets: raw data in either layout, and truth.json beside it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from polysight.shared.config import Board, Grid, Instrument
+from polysight.shared.geometry import incidence_deg, specular_midpoint_m
+from polysight.shared.raster import RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
+from polysight.shared.tables import to_builtins
+from polysight.simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
+from polysight.simulators.scene.published_layout import AuthorsLayout, Skipped
+from polysight.simulators.scene.radar import SimulatedRig
+from polysight.simulators.scene.receiver import stream_key
+from polysight.simulators.scene.scene_file import Scene, apply_scene
+
+Progress = Callable[[int, int], None]
+
+
+def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
+    """What a simulated scan holds: plates and points with their true places and materials, scene, seed, versions.
+
+    `rig` has the scene applied. `centre_m` is in the rig frame; permittivity is [eps', eps''] or null (metal,
+    layers).
+    """
+    centre = specular_midpoint_m(rig, rig.by_role("receive_h"))
+    plates = [
+        {
+            "name": p.name,
+            "centre_mm": list(p.centre_mm),
+            "centre_m": [centre[0] + p.centre_mm[0] / 1e3, centre[1] + p.centre_mm[1] / 1e3, centre[2]],
+            "size_mm": list(p.size_mm),
+            "permittivity": None if p.permittivity is None else list(p.permittivity),
+            "metal": p.metal and p.strips_deg is None,
+            "strips_deg": p.strips_deg,
+            "thickness_mm": p.thickness_mm,
+            "layers": [msgspec.to_builtins(layer) for layer in p.layers],
+        }
+        for p in scene.plates
+    ]
+    points = [
+        {
+            "name": p.name,
+            "position_mm": list(p.position_mm),
+            "position_m": [centre[0] + p.position_mm[0] / 1e3, centre[1] + p.position_mm[1] / 1e3, centre[2]],
+            "amplitude": list(p.amplitude),
+        }
+        for p in scene.points
+    ]
+    return {
+        "simulated": True,
+        "seed": seed,
+        "versions": versions(),
+        "image_centre_m": list(centre),
+        "incidence_deg": {b.name: incidence_deg(rig, b) for b in rig.receivers},
+        "mean_burst_travel_mm": mean_burst_travel_mm(rig.burst, rig.stage),
+        "plates": plates,
+        "points": points,
+        "scene": {**to_builtins(scene), "disturbances": msgspec.to_builtins(scene.disturbances)},
+    }
+
+
+def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """True stage offsets of every chirp of a row in the order they happen: x_mm, y_mm, [points * pulses]."""
+    x = (np.array(row.x_mm)[:, None] + radar.burst_mm(row.direction)).ravel()
+    return x, np.full(len(x), row.y_mm)
+
+
+def lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> Gaps:
+    """Byte ranges of a row whose packets the network loses: sorted, touching ones joined."""
+    loss = radar.scene.disturbances.packet_loss
+    size = row.points * radar.rig.burst.pulses * radar.rig.frame_bytes
+    full = packet_payload_bytes(radar.rig)
+    if loss == 0.0:
+        return []
+    rng = np.random.default_rng([stream_key(radar.seed, "loss", board_name), row.index])
+    gaps: Gaps = []
+    for k in np.flatnonzero(rng.random(-(-size // full)) < loss):
+        start, stop = int(k) * full, min((int(k) + 1) * full, size)
+        if gaps and gaps[-1][1] == start:
+            gaps[-1] = (gaps[-1][0], stop)
+        else:
+            gaps.append((start, stop))
+    return gaps
+
+
+def simulate(
+    rig: Instrument,
+    scene: Scene,
+    out: Path,
+    layout: str = "own",
+    seed: int | None = None,
+    started_s: float | None = None,
+    zero_filling: bool = True,
+    cache_dir: Path | None = None,
+    progress: Progress | None = None,
+    by_columns: bool = False,
+    skipped: Skipped | None = None,
+) -> Path:
+    """Write a scan of a scene.
+
+    Parameters
+    ----------
+    rig, scene
+        Rig file and scene; the scene's overrides are applied.
+    out, layout
+        Folder to write, made when absent. "own": a scan folder at `out`. "authors": `out`/unsynced/<scan>, with the
+        transmitting board's data.
+    seed
+        None takes the scene's. The same seed gives the same raw bytes.
+    started_s
+        Unix time written as the scan's start; None is now.
+    cache_dir, progress
+        Where object fields are kept between runs (None keeps nothing); called with rows done and rows in all.
+    zero_filling, by_columns, skipped
+        Authors' layout only: see :class:`polysight.simulators.scene.published_layout.AuthorsLayout`.
+
+    Returns
+    -------
+    Folder to process: the scan folder, or unsynced/<scan>.
+
+    Raises
+    ------
+    ConfigError
+        when the scene does not fit the rig, or a burst does not end before the next point.
+    DataError
+        when the folder is not empty.
+    """
+    radar = SimulatedRig(rig, _wider(scene, rig) if by_columns else scene, seed, cache_dir)
+    rig = apply_scene(rig, scene)
+    plan = _plan(rig, by_columns)
+    started_s = time.time() if started_s is None else started_s
+    scan_id = "".join(c if c.isalnum() else "-" for c in scene.name).strip("-") or "scene"
+    if layout == "own":
+        stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
+        _write_rows(OwnLayout(out, rig, plan, scan_id, stamp), radar, plan, rig.recorded, by_columns, progress)
+        folder = out
+    else:
+        writer = AuthorsLayout(out, rig, scan_id, started_s, zero_filling, by_columns, skipped)
+        _write_rows(writer, radar, plan, rig.boards, by_columns, progress)
+        folder = writer.folder
+        # Their files tell neither geometry nor filter nor leakage; a scan folder's manifest does.
+        (folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
+    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
+    (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return folder
+
+
+def _plan(rig: Instrument, by_columns: bool) -> RasterPlan:
+    """The plan of the rig's grid. Raises ConfigError when a burst does not end before the next point."""
+    grid = _by_columns(rig.grid) if by_columns else rig.grid
+    check_burst_fits(grid, rig.burst, rig.stage)
+    return plan_raster(grid)
+
+
+def _write_rows(
+    writer: Layout,
+    radar: SimulatedRig,
+    plan: RasterPlan,
+    boards: Sequence[Board],
+    by_columns: bool,
+    progress: Progress | None,
+) -> None:
+    """Write every row of the plan, of these boards; `by_columns`: the stage runs along y."""
+    writer.start()
+    for row in plan:
+        x, y = row_offsets_mm(radar, row)
+        x, y = (y, x) if by_columns else (x, y)
+        first = row.index * len(x)
+        payloads = {b.name: radar.chirps(b.name, x, y, first) for b in boards}
+        writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
+        if progress is not None:
+            progress(row.index + 1, plan.rows)
+    writer.end()
+
+
+def _by_columns(grid: Grid) -> Grid:
+    """The grid whose rows are the columns."""
+    return Grid(columns=grid.rows, rows=grid.columns, step_x_mm=grid.step_y_mm, step_y_mm=grid.step_x_mm)
+
+
+def _wider(scene: Scene, rig: Instrument) -> Scene:
+    """The scene with a row more above and below, for bursts that travel along y."""
+    grid = to_builtins(apply_scene(rig, scene).grid)
+    return msgspec.structs.replace(scene, grid={**grid, "rows": grid["rows"] + 2})

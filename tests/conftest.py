@@ -1,4 +1,4 @@
-"""Options of the whole test suite."""
+"""Options of the whole test suite, and the one fixture that many folders share."""
 
 from __future__ import annotations
 
@@ -6,6 +6,12 @@ import signal
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from polysight.shared.config import Instrument
+
+pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
+
+from tests.support.rigs import published_rig  # noqa: E402
 
 # A shell that starts the tests in the background has Ctrl-C ignored, and so would every program the tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -30,3 +36,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--long"):
         settings.load_profile("searching")
+
+
+@pytest.fixture(scope="session")
+def rig() -> Instrument:
+    """The published rig. Folders whose tests need another one have a fixture of the same name."""
+    return published_rig()

@@ -10,22 +10,16 @@ from zlib import crc32
 
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.tables import decode, to_builtins
+from polysight.shared.config import Instrument
+from polysight.shared.tables import to_builtins
 from polysight.simulators.scene import decode_scene, simulate
-
-REPO = Path(__file__).resolve().parents[2]
-Change = Callable[[dict[str, Any]], None]
+from tests.support.rigs import Change, rig_with
 
 
-def rig_of(change: Change = lambda _table: None, **tables: dict[str, Any]) -> Instrument:
-    """The published rig, changed: whole tables, then by hand. Bursts are short."""
-    table = to_builtins(load_instrument(REPO / "instrument.toml"))
-    table["burst"] |= {"pulses": 4}
-    for name, more in tables.items():
-        table[name] |= more
-    change(table)
-    return decode(table, Instrument, "test")
+def rig_of(change: Change | None = None, **tables: dict[str, Any]) -> Instrument:
+    """The published rig with short bursts, changed: whole tables, then by hand."""
+    tables["burst"] = {"pulses": 4, **tables.get("burst", {})}
+    return rig_with(change, **tables)
 
 
 def believe(folder: Path, rig: Instrument) -> None:

@@ -1,96 +1,31 @@
-"""Simulated capture cards on a loopback subnet of their own, served by a thread of the test's process."""
+"""Simulated capture cards on a loopback subnet of their own."""
 
 from __future__ import annotations
 
-import select
-import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from itertools import repeat
 from pathlib import Path
 
 import pytest
 import tomli_w
 
-from polysight.shared.config import Board, Instrument, load_instrument
-from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace
+from polysight.shared.config import Board, Instrument
+from polysight.shared.tables import to_builtins
 from polysight.simulators.faults import Faults
 from polysight.simulators.loopback import on_free_subnet
-from polysight.simulators.replay import Player, Recording
-
-sys.path.insert(0, str(Path(__file__).parent))  # for recordings.py
-
-REPO = Path(__file__).resolve().parents[2]
-LIMIT_S = 60.0
+from tests.support.capture.cards import Cards
+from tests.support.rigs import rig_with
 
 
-class Cards:
-    """Simulated cards, all served by one thread; those with a recording stream it in every record."""
-
-    def __init__(self) -> None:
-        self.endpoints: dict[str, CardEndpoint] = {}
-        self._players: dict[str, Player] = {}
-        self._tasks: list[Callable[[], None]] = []
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._serve)
-
-    def add(self, name: str, network: Network, faults: Faults, recording: Path | None, time_scale: float) -> None:
-        endpoint = CardEndpoint(name, network, faults, 0, time_scale, time.monotonic, Pace())
-        self.endpoints[name] = endpoint
-        if recording is not None:
-            plays = (Recording(path) for path in repeat(recording))
-            self._players[name] = Player(endpoint, plays, 5e6, time.monotonic)  # bytes/s
-
-    @staticmethod
-    def network_of(board: Board) -> Network:
-        """What a board's card has in its EEPROM."""
-        return Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def power_cycle(self, name: str) -> None:
-        """Switch a card off and on; returns when it is done."""
-        done = threading.Event()
-        self._tasks.append(lambda: (self.endpoints[name].power_cycle(), done.set()))
-        assert done.wait(LIMIT_S)
-
-    def _serve(self) -> None:
-        while not self._end.is_set():
-            select.select(list(self.endpoints.values()), [], [], 0.005)
-            while self._tasks:
-                self._tasks.pop(0)()
-            for name, endpoint in self.endpoints.items():
-                if name in self._players:
-                    self._players[name].turn()
-                else:
-                    endpoint.serve_commands()
-                    endpoint.tick()
-                    endpoint.flush()
-
-    def close(self) -> None:
-        self._end.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        for endpoint in self.endpoints.values():
-            endpoint.close()
-
-
-def small(rig: Instrument) -> Instrument:
+def small_rig() -> Instrument:
     """A free subnet, a grid whose rows are small, and little patience."""
-    table = to_builtins(rig)
-    table["grid"] |= {"columns": 12, "rows": 2}
-    table["limits"] |= {"command_timeout_s": 1.5}
-    table["card"] |= {"receive_buffer_bytes": 1 << 20}
-    return on_free_subnet(decode(table, Instrument, "small"))
+    grid, card = {"columns": 12, "rows": 2}, {"receive_buffer_bytes": 1 << 20}
+    return on_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": 1.5}, card=card))
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Instrument:
-    made = small(load_instrument(REPO / "instrument.toml"))
+    made = small_rig()
     (tmp_path / "instrument.toml").write_text(tomli_w.dumps(to_builtins(made)))
     return made
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +15,8 @@ import tomli_w
 from polysight.shared.tables import to_builtins
 from polysight.simulators.cards import bound_udp
 from polysight.simulators.faults import Faults
+from tests.support.paths import POLYSIGHT
 
-POLYSIGHT = Path(sys.executable).parent / "polysight"
 LIMIT_S = 60.0
 NEW_MAC = "12:34:56:78:90:13"
 

@@ -22,6 +22,7 @@ from polysight.host.capture.network import (
 )
 from polysight.host.capture.receiver import RowCapture
 from polysight.shared.config import Board
+from tests.support.paths import REPO
 
 CARD = "192.168.33.180"
 BOARD = Board("RH", "receive_h", CARD, "192.168.33.30", 4096, 4098, ())
@@ -141,7 +142,7 @@ def test_real_interfaces_tell_the_hops_apart():
         check=False,
         timeout=60,
         env=os.environ | {"PYTHON": sys.executable},
-        cwd=Path(__file__).resolve().parents[2],
+        cwd=REPO,
     )
     assert done.returncode == 0, done.stderr
     said = {line.split(" | ")[0]: line for line in done.stdout.splitlines()}

@@ -6,20 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import real_row, row, write_pcap
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.inspect import Known, Report, Shape, inspect_bin
 from polysight.host.capture.inspect_pcap import inspect_pcap, read_pcap
 from polysight.host.jobs.scan_files import main_text, plot_profile
-from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
+from tests.support.capture.recordings import real_row, row, write_pcap
+from tests.support.paths import REAL_CAPTURES
+from tests.support.rigs import published_rig
 
-RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
-REAL = Path(__file__).resolve().parents[3] / "shared/data/dca1000-real"
 needs_real = pytest.mark.skipif(
-    not REAL.is_dir(), reason="the packet capture of a real card is not beside this repository (not ours to publish)"
+    not REAL_CAPTURES.is_dir(),
+    reason="the packet capture of a real card is not beside this repository (not ours to publish)",
 )
 
 
@@ -158,7 +158,7 @@ def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
 
 
 def test_shape_of_the_rig_file():
-    rig = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+    rig = published_rig()
     assert Shape.of_instrument(rig) == Shape(4, True, 256)
     assert Shape.of_instrument(rig).chirp_bytes == rig.frame_bytes
 
@@ -216,7 +216,7 @@ def test_truncated_pcap_is_refused(tmp_path, size):
 
 @needs_real
 def test_real_record():
-    r = inspect_pcap(REAL / "test_one_frame.pcap")
+    r = inspect_pcap(REAL_CAPTURES / "test_one_frame.pcap")
     assert (r.lanes, r.chirps * r.rx, r.samples, r.q_first) == (2, 16, 256, True)
     assert (r.peak_bin, round(r.peak_db)) == (59, 47)
     assert r.card is not None
@@ -231,7 +231,7 @@ def test_real_record():
 
 @needs_real
 def test_real_commands():
-    r = inspect_pcap(REAL / "test_cmd.pcap")
+    r = inspect_pcap(REAL_CAPTURES / "test_cmd.pcap")
     assert r.card is not None
     assert r.card.version == "2.8"
     names = [name for name, _ in r.card.replies]

@@ -5,21 +5,19 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from recordings import CARD, OTHER, row, write_pcap
 
 from polysight.host.capture import dca1000
-from tests.small_scene import small_scene
-
-RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
+from tests.support.capture.recordings import CARD, OTHER, row, write_pcap
+from tests.support.paths import POLYSIGHT, RIG_FILE
+from tests.support.scenes import small_scene
 
 
 @pytest.fixture
 def polysight(tmp_path):
     def run(*words: object) -> subprocess.CompletedProcess[str]:
-        command = [Path(sys.executable).parent / "polysight", "inspect", *map(str, words)]
+        command = [POLYSIGHT, "inspect", *map(str, words)]
         return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=60, check=False)
 
     return run
@@ -28,10 +26,10 @@ def polysight(tmp_path):
 def test_the_command_draws_and_says_what_the_rig_file_makes_of_it(polysight, tmp_path):
     row(4, False).tofile(tmp_path / "right.bin")
     row(2, False).tofile(tmp_path / "wrong.bin")
-    done = polysight("right.bin", "--config", RIG, "--plot", "right.png")
+    done = polysight("right.bin", "--config", RIG_FILE, "--plot", "right.png")
     assert (done.returncode, "guessed" in done.stdout, "note" in done.stdout) == (0, False, False), done
     assert (tmp_path / "right.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    done = polysight("wrong.bin", "--config", RIG)
+    done = polysight("wrong.bin", "--config", RIG_FILE)
     assert "the data look like 2-lane complex, 256 samples x 4 RX, not 4-lane complex" in done.stdout
     done = polysight("wrong.bin", "--json")
     found = json.loads(done.stdout)
@@ -48,7 +46,7 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
     done = polysight("both")
     assert done.returncode == 3
     assert "192.168.33.180 and 192.168.33.181" in done.stderr
-    done = polysight("both", "--card", "192.168.33.181", "--config", RIG, "--plot", "both.png")
+    done = polysight("both", "--card", "192.168.33.181", "--config", RIG_FILE, "--plot", "both.png")
     assert done.returncode == 0, done.stderr
     assert "32 chirps x 4 RX x 256 samples" in done.stdout
     assert (tmp_path / "both.png").exists()
@@ -57,7 +55,7 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
 
 def test_a_row_of_a_scan_brings_its_own_rig_file_and_says_that_it_is_simulated(polysight, tmp_path):
     (tmp_path / "scene.toml").write_text(small_scene(8, 2, metal=False))
-    simulate = [sys.executable, "-m", "polysight.simulators", "simulate", tmp_path / "scene.toml", "--config", RIG]
+    simulate = [sys.executable, "-m", "polysight.simulators", "simulate", tmp_path / "scene.toml", "--config", RIG_FILE]
     subprocess.run([*simulate, "--out", tmp_path / "scan"], check=True, capture_output=True)
     done = polysight("scan/raw/RV/0001.bin")
     assert done.returncode == 0, done.stderr

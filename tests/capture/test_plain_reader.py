@@ -18,10 +18,10 @@ from polysight.host.capture.segment import write_index
 from polysight.host.store.events import EventWriter
 from polysight.host.store.manifest import ManifestWriter
 from polysight.pi_controller.journal import Journal
-from polysight.shared.config import load_instrument
 from polysight.shared.messages import Capture, RunStopped, pack
 from polysight.simulators.scene import load_scene, simulate
-from tests.small_scene import small_scene
+from tests.support.rigs import published_rig
+from tests.support.scenes import small_scene
 
 FRAMES, SAMPLES = 96, 256
 
@@ -108,9 +108,8 @@ def test_index(tmp_path):
 
 def test_whole_scan(tmp_path):
     """A simulated scan folder, from its first file to its last, by the words of docs/spec alone."""
-    repo = Path(__file__).resolve().parents[2]
     (tmp_path / "scene.toml").write_text(small_scene(3, 2))
-    folder = simulate(load_instrument(repo / "instrument.toml"), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
+    folder = simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
     facts = [json.loads(line) for line in (folder / "manifest.jsonl").read_text("ascii").splitlines()]
     for fact in facts:
         crc = fact.pop("crc")

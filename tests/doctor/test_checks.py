@@ -6,7 +6,6 @@ from pathlib import Path
 import msgspec
 import pytest
 import tomli_w
-from doctor_case import QUICK, RIG, bench_of, rig_with
 
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
 from polysight.host.capture.network import route_interface
@@ -18,6 +17,8 @@ from polysight.host.doctor.check_host import check_config, check_disk, check_tim
 from polysight.host.doctor.walk import CHECKS, _try, walk
 from polysight.shared.messages import GPIOD, GPIOMEM, WIRES, HelloReply
 from polysight.shared.tables import to_builtins
+from tests.support.doctor.case import QUICK, RIG, bench_of
+from tests.support.rigs import programmed_rig
 
 # --- the command ---
 
@@ -47,7 +48,7 @@ def test_a_bad_rig_file_is_the_first_and_only_error(tmp_path, broken, capsys):
 
 def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text(tomli_w.dumps(to_builtins(rig_with(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
+    path.write_text(tomli_w.dumps(to_builtins(programmed_rig(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
     with Bench(Wanted(path), QUICK) as bench:
         found = {f.check: f for f in walk(bench)}
     assert found["config"].verdict == "error"
@@ -60,11 +61,11 @@ def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
 def test_calibration_files(tmp_path, backend, verdict):
     board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
     file = FilterFile(**head("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
-    bench = bench_of(rig_with(calibration={"hpf": str(write(file, tmp_path))}))
+    bench = bench_of(programmed_rig(calibration={"hpf": str(write(file, tmp_path))}))
     bench.hello = HelloReply(pi_release="", firmware="", backend=backend, state="homed", scan_id="", last_seq=0)
     found = walk_one(bench, "calibration")
     assert (found.verdict, "simulated" in found.found) == (verdict, verdict == "error")
-    assert walk_one(bench_of(rig_with(calibration={"hpf": "/nowhere.toml"})), "calibration").verdict == "error"
+    assert walk_one(bench_of(programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration").verdict == "error"
 
 
 def walk_one(bench, name):
@@ -90,14 +91,14 @@ def test_a_clock_that_was_lost(tmp_path):
 
 
 def test_a_disk_that_is_full_and_one_that_is_slow(tmp_path):
-    full = rig_with(limits={"free_disk_bytes": 1 << 60})
+    full = programmed_rig(limits={"free_disk_bytes": 1 << 60})
     assert "too full" in check_disk(bench_of(full, tmp_path)).why
-    needed = check_disk(bench_of(rig_with(limits={"free_disk_bytes": 0}, grid={"rows": 2}), tmp_path)).facts[
+    needed = check_disk(bench_of(programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2}), tmp_path)).facts[
         "scan_bytes_s"
     ]
     for factor, verdict in ((0.5, "error"), (1.5, "warning"), (3.0, "ok")):
         slow = System(write_speed=lambda _f, speed=factor * needed: speed)
-        small = rig_with(limits={"free_disk_bytes": 0}, grid={"rows": 2})
+        small = programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2})
         assert check_disk(bench_of(small, tmp_path / "not" / "yet", slow)).verdict == verdict
 
 

@@ -4,13 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from doctor_case import FRAMES, RIG, bench_of, frames_of, rig_with, signal_of
 
 from polysight.host.doctor import check_capture as check_direct_path
 from polysight.host.doctor import check_capture as check_skew
 from polysight.host.doctor.bench import Captured
 from polysight.host.doctor.check_capture import check_direct_path as direct_path_of
 from polysight.host.doctor.check_capture import check_level, check_radar
+from tests.support.doctor.case import FRAMES, RIG, bench_of, frames_of, signal_of
+from tests.support.rigs import programmed_rig
 
 
 def judged(board="RH", rig=RIG, **disturbances):
@@ -43,7 +44,7 @@ def test_no_direct_path():
 
 @pytest.mark.parametrize("offset_hz", [2.6e6, -900e3])
 def test_a_direct_path_beyond_the_band_is_called_an_alias_and_gets_an_offset(offset_hz):
-    rig = rig_with(offset_hz)
+    rig = programmed_rig(offset_hz)
     found = judged("RH", rig)
     assert found.verdict == "error"
     better = float(found.remedy.split("= ")[1].split(" ")[0])
@@ -53,7 +54,7 @@ def test_a_direct_path_beyond_the_band_is_called_an_alias_and_gets_an_offset(off
 def rig_offset_for_the_middle(name):
     from polysight.host.radar.constraints import direct_if_hz
 
-    return 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(rig_with(0.0), rig_with(0.0).by_name(name))
+    return 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(programmed_rig(0.0), programmed_rig(0.0).by_name(name))
 
 
 def test_a_direct_path_at_the_edge_of_the_band():
@@ -64,7 +65,7 @@ def test_a_direct_path_at_the_edge_of_the_band():
 
 def test_a_direct_path_that_the_rig_file_did_not_expect():
     """The board was programmed 490 kHz higher than the rig file says; its crystal's share is told apart."""
-    found = judged("RH", rig_with(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
+    found = judged("RH", programmed_rig(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
     assert found.verdict == "warning"
     assert float(found.remedy.split("= ")[1].split(" ")[0]) == pytest.approx(790e3, abs=5 * 2.1e-9 / 32**0.5 * 38.8e12)
 

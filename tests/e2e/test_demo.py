@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import signal
-from pathlib import Path
 
 import pytest
 
-REPO = Path(__file__).resolve().parents[2]
+from tests.support.paths import RIG_FILE
+
 pytestmark = pytest.mark.xdist_group("rig")
 
 
@@ -16,7 +16,7 @@ def test_stopped_while_scanning(bench, scene_file, number):
     """Ctrl-C reaches the process group, SIGTERM the demo alone; both end everything."""
     out = bench.folder / "demo"
     demo = bench.start(
-        "polysight", "demo", "--config", REPO / "instrument.toml", "--scene", scene_file, "--out", out,
+        "polysight", "demo", "--config", RIG_FILE, "--scene", scene_file, "--out", out,
         "--time-scale", "5",
     )  # fmt: skip
 

@@ -27,10 +27,11 @@ from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.messages import RowStarted
-from tests.small_scene import small_scene
+from tests.support.paths import REPO
+from tests.support.scenes import small_scene
 
 pytestmark = [pytest.mark.xdist_group("rig"), pytest.mark.slow]
-KILLED_AT = Path(__file__).with_name("killed_at.py")
+KILLED_AT = REPO / "tests/support/killed_at.py"
 SCENE = small_scene(6, 4, step_mm=(20.0, 20.0), pulses=4, seed=4)
 METAL = ["--metal", "0,0,50,50"]  # the aperture is too small for the plate to be found by itself
 ROWS, FILES = 4, 8

@@ -15,7 +15,7 @@ from urllib.request import Request, urlopen
 import pytest
 
 from polysight.host.store.validate import validate
-from tests.small_scene import small_scene
+from tests.support.scenes import small_scene
 
 LIMIT_S = 120.0
 ROWS = 40

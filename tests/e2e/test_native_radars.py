@@ -6,8 +6,7 @@ import pytest
 
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.validate import validate
-
-from .pattern_rig import COLUMNS, PULSES, ROWS, counts, small_table, start_rig
+from tests.support.pattern_rig import COLUMNS, PULSES, ROWS, counts, small_table, start_rig
 
 pytestmark = pytest.mark.xdist_group("rig")
 ROW_PULSES = COLUMNS * PULSES

@@ -15,11 +15,10 @@ import pytest
 import tomli_w
 
 from polysight.shared.tables import to_builtins
-from tests.small_scene import small_scene
+from tests.support.paths import REAL_CAPTURES, RIG_FILE
+from tests.support.scenes import small_scene
 
-REPO = Path(__file__).resolve().parents[2]
-RIG = REPO / "instrument.toml"
-CAPTURE = REPO.parent / "shared" / "data" / "dca1000-real" / "test_one_frame.pcap"
+CAPTURE = REAL_CAPTURES / "test_one_frame.pcap"
 SCENE = small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
 
 
@@ -39,7 +38,7 @@ def refused(ended, *words: str, status: int | None = None) -> None:
 
 
 def damaged_rig(folder: Path, old: str, new: str) -> Path:
-    text = RIG.read_text()
+    text = RIG_FILE.read_text()
     assert text.count(old) == 1
     path = folder / "wrong.toml"
     path.write_text(text.replace(old, new))
@@ -66,10 +65,12 @@ def test_rig_file(bench, program, old, new, words):
 def test_files_that_are_not_there(bench):
     refused(bench.polysight("scan", "--out", "s"), "instrument.toml: no such file", status=2)
     refused(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
-    refused(bench.polysight("simulate", "no.toml", "--config", RIG, "--out", "d"), "no.toml: no such file", status=2)
+    refused(
+        bench.polysight("simulate", "no.toml", "--config", RIG_FILE, "--out", "d"), "no.toml: no such file", status=2
+    )
     reproduce = ("reproduce", "--config", "no.toml", "--out", "r", "table1")
     refused(bench.polysight(*reproduce), "no.toml: no such file", status=2)
-    refused(bench.polysight("preview", RIG, "--port", "0"), "instrument.toml is a file", status=2)
+    refused(bench.polysight("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
     refused(bench.polysight("inspect", "no.bin"), "no.bin", status=3)
     refused(bench.polysight("inspect", "no.pcap"), "no.pcap", status=3)
 
@@ -93,7 +94,7 @@ def test_scene_file(bench, old, new, words):
     last.mkdir()
     (last / ".polysight-demo").touch()
     (last / "report.html").touch()
-    rig = ("--config", RIG)
+    rig = ("--config", RIG_FILE)
     refused(bench.polysight("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
     assert (last / "report.html").exists()
     refused(bench.polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
@@ -104,7 +105,7 @@ def test_scene_file(bench, old, new, words):
 
 def test_simulated_rig(bench):
     """What its processes would refuse, the rig refuses before it starts them."""
-    rig = ("python", "-m", "polysight.simulators.rig", "--config", RIG, "--pattern", "--dir", "rig")
+    rig = ("python", "-m", "polysight.simulators.rig", "--config", RIG_FILE, "--pattern", "--dir", "rig")
     refused(bench.run(*rig, "--faults", "no.toml"), "no.toml: no such file", status=2)
     refused(bench.run(*rig, "--fault", "RH.los=0.1"), "faults of RH", "los", status=2)
     refused(bench.run(*rig, "--time-scale", "0"), "--time-scale", status=2)
@@ -116,7 +117,7 @@ def test_rig_file_of_a_training(bench):
     (bench.folder / "scenes" / "a.toml").write_text(SCENE)
     train = ("train", "--simulate", "scenes")
     refused(bench.polysight(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
-    refused(bench.polysight(*train, "--config", RIG, "--out", "no/l.npz"), "no such folder no", status=2)
+    refused(bench.polysight(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
 
 
 # --- recorded data ----------------------------------------------------------------------------------------------------
@@ -127,7 +128,7 @@ def recorded(tmp_path_factory):
     """A simulated scan of nothing: no metal, no plates."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "scene.toml").write_text(SCENE)
-    command = [sys.executable, "-m", "polysight.simulators", "simulate", folder / "scene.toml", "--config", RIG]
+    command = [sys.executable, "-m", "polysight.simulators", "simulate", folder / "scene.toml", "--config", RIG_FILE]
     subprocess.run([*command, "--out", folder / "scan"], check=True, capture_output=True)
     return folder / "scan"
 
@@ -197,7 +198,7 @@ def test_library(bench, scan):
     for name in ("no.npz", "junk.npz", "scan"):
         refused(bench.polysight(*process, name), name, "polysight train", status=3)
     assert not (bench.folder / "out").exists(), "found out before anything is processed"
-    refused(bench.polysight("train", "--config", RIG, "--out", "l.npz"), "--simulate")
+    refused(bench.polysight("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
 
 
 def test_nothing_to_refer_to(bench, scan):
@@ -212,11 +213,11 @@ def test_out_is_taken(bench, scan):
     mine = bench.folder / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("precious")
-    for command in (["image", scan], ["demo", "--config", RIG], ["scan", "--config", RIG]):
+    for command in (["image", scan], ["demo", "--config", RIG_FILE], ["scan", "--config", RIG_FILE]):
         refused(bench.polysight(*command, "--out", mine), str(mine), "--out", status=2)
-    for command in (["image", scan], ["demo", "--config", RIG]):
+    for command in (["image", scan], ["demo", "--config", RIG_FILE]):
         refused(bench.polysight(*command, "--out", mine / "thesis.tex"), "thesis.tex", "--out", status=2)
-    refused(bench.polysight("scan", "--config", RIG, "--out", scan), f"polysight resume {scan}", status=2)
+    refused(bench.polysight("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
     assert (mine / "thesis.tex").read_text() == "precious"
     assert list(mine.iterdir()) == [mine / "thesis.tex"]
     assert bench.polysight("image", scan, "--out", "out").status == 0
@@ -320,7 +321,7 @@ def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
 def test_interrupted_while_simulating(bench):
     """Ctrl-C reaches both programs, and one of them says so."""
     (bench.folder / "scene.toml").write_text(small_scene(350, 200, step_mm=(1.0, 1.0)))
-    simulate = bench.start("polysight", "simulate", "scene.toml", "--config", RIG, "--out", "s")
+    simulate = bench.start("polysight", "simulate", "scene.toml", "--config", RIG_FILE, "--out", "s")
     bench.wait_for(lambda: (bench.folder / "s" / "manifest.jsonl").exists(), "the first row")
     simulate.interrupt()
     ended = simulate.wait()

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polysight.host.materials import Library
-from polysight.shared.config import load_instrument
 from polysight.simulators.scene import decode_scene, simulate
+from tests.support.paths import REPO
+from tests.support.rigs import published_rig
 
-REPO = Path(__file__).resolve().parents[2]
 SCRIPTS = REPO / "examples" / "scripts"
 LIMIT = 20  # lines from raw data to the image, imports included
 
@@ -40,7 +39,7 @@ def test_raw_to_image(folder):
     image = {"columns": 40, "rows": 40, "pixel_mm": 2.0}
     raw = {"name": "a point", "grid": grid, "burst": {"pulses": 2}, "image": image}
     scene = decode_scene({**raw, "points": [{"position_mm": [10.0, -6.0]}]}, "test")
-    simulate(load_instrument(REPO / "instrument.toml"), scene, folder / "out" / "points")
+    simulate(published_rig(), scene, folder / "out" / "points")
     images = run("raw_to_image")["images"]
     row, column = np.unravel_index(np.argmax(np.abs(images.h_raw)), images.h_raw.shape)
     centre = (images.x_m.mean(), images.y_m.mean())

@@ -87,7 +87,5 @@ def test_the_names_of_the_folders_are_the_names_of_the_package():
         "import host.imaging, host.polarimetry, polysight.host.imaging as i, polysight.host.polarimetry as p\n"
         "assert host.imaging.backproject is i.backproject and host.polarimetry.fresnel is p.fresnel"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")

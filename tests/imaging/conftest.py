@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -11,26 +10,19 @@ import pytest
 
 from polysight.host.imaging.geometry import Antennas, row_offsets_m
 from polysight.host.sync.chain import SyncedRow
-from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-ROOT = Path(__file__).parents[2]
-
 
 @pytest.fixture(scope="session")
-def published() -> Instrument:
-    return load_instrument(ROOT / "instrument.toml")
-
-
-@pytest.fixture(scope="session")
-def make_rig(published):
+def make_rig(rig):
     """The published rig with a small grid and image."""
 
     def make(columns=31, rows=31, step_x=4.0, step_y=4.0, pixels=(40, 40), pixel=2.0) -> Instrument:
-        grid = msgspec.structs.replace(published.grid, columns=columns, rows=rows, step_x_mm=step_x, step_y_mm=step_y)
-        image = msgspec.structs.replace(published.image, columns=pixels[0], rows=pixels[1], pixel_mm=pixel)
-        return msgspec.structs.replace(published, grid=grid, image=image)
+        grid = msgspec.structs.replace(rig.grid, columns=columns, rows=rows, step_x_mm=step_x, step_y_mm=step_y)
+        image = msgspec.structs.replace(rig.image, columns=pixels[0], rows=pixels[1], pixel_mm=pixel)
+        return msgspec.structs.replace(rig, grid=grid, image=image)
 
     return make
 

@@ -1,7 +1,6 @@
 """`polysight focus` on a small simulated scan: what it writes and what it says."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +8,9 @@ import pytest
 from polysight.host.cli.main import main
 from polysight.host.imaging.focus import Focus
 from polysight.host.jobs import process as offline
-from polysight.shared.config import load_instrument
 from polysight.simulators.scene import decode_scene, simulate
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
 SCENE = {
     "name": "one point",
     "grid": {"columns": 15, "rows": 9, "step_x_mm": 10.0, "step_y_mm": 6.0},
@@ -20,7 +18,7 @@ SCENE = {
     "burst": {"pulses": 2},
     "points": [{"position_mm": [0.0, 0.0], "amplitude": [0.8, 0.0]}],
 }
-RIG = load_instrument(ROOT / "instrument.toml")
+RIG = published_rig()
 
 
 def test_focus_writes_figure_and_numbers_and_says_when_a_scan_is_too_narrow(tmp_path, capsys):

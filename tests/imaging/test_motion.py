@@ -10,11 +10,11 @@ COUNT, MIDDLE = 61, slice(REACH, -REACH)
 
 
 @pytest.fixture(scope="module")
-def fast(published):
+def fast(rig):
     """A rig whose bursts fill nearly all of the way from point to point: 16 pulses at 100 mm/s in steps of 2.5 mm."""
-    grid = msgspec.structs.replace(published.grid, columns=100, rows=8, step_x_mm=2.5, step_y_mm=4.0)
-    stage = msgspec.structs.replace(published.stage, speed_mm_s=100.0)
-    return msgspec.structs.replace(published, grid=grid, stage=stage)
+    grid = msgspec.structs.replace(rig.grid, columns=100, rows=8, step_x_mm=2.5, step_y_mm=4.0)
+    stage = msgspec.structs.replace(rig.stage, speed_mm_s=100.0)
+    return msgspec.structs.replace(rig, grid=grid, stage=stage)
 
 
 def burst_mean(turns, rig):
@@ -37,8 +37,8 @@ def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
     assert turns == centre or abs(average[30]) < 1 - 1.2 * (turns - centre) ** 2
 
 
-def test_a_slow_stage_and_one_pulse_need_no_filter(published):
-    slow = msgspec.structs.replace(published, burst=msgspec.structs.replace(published.burst, pulses=1))
+def test_a_slow_stage_and_one_pulse_need_no_filter(rig):
+    slow = msgspec.structs.replace(rig, burst=msgspec.structs.replace(rig.burst, pulses=1))
     np.testing.assert_allclose(burst_filters(slow), np.eye(REACH + 1)[np.zeros(REACH + 1, int)], atol=1e-6)
 
 

@@ -17,8 +17,8 @@ def _sweep(chirp):
 
 
 @given(st.floats(*GATE), st.floats(*GATE))
-def test_few_samples_give_every_matched_filter_output_of_all(published, echo_m, pixel_m):
-    chirp = published.chirp
+def test_few_samples_give_every_matched_filter_output_of_all(rig, echo_m, pixel_m):
+    chirp = rig.chirp
     a, b = chirp.linear_samples
     gate = reduction(chirp, GATE)
     x = np.exp(2j * np.pi * _sweep(chirp) * echo_m / C)
@@ -29,8 +29,8 @@ def test_few_samples_give_every_matched_filter_output_of_all(published, echo_m, 
     assert len(gate.frequencies_hz) <= 10
 
 
-def test_without_the_direct_path_removal_the_error_is_below_1e_4_of_the_peak(published):
-    chirp = published.chirp
+def test_without_the_direct_path_removal_the_error_is_below_1e_4_of_the_peak(rig):
+    chirp = rig.chirp
     gate = reduction(chirp, GATE, extra=5)
     finer = reduction(chirp, GATE, extra=30)
     pixels = np.linspace(*GATE, 200)
@@ -40,19 +40,19 @@ def test_without_the_direct_path_removal_the_error_is_below_1e_4_of_the_peak(pub
 
 
 @given(st.floats(*GATE))
-def test_the_model_says_how_an_echo_comes_out(published, echo_m):
-    gate = reduction(published.chirp, GATE)
-    came_out = gate.matrix @ np.exp(2j * np.pi * _sweep(published.chirp) * echo_m / C)
+def test_the_model_says_how_an_echo_comes_out(rig, echo_m):
+    gate = reduction(rig.chirp, GATE)
+    came_out = gate.matrix @ np.exp(2j * np.pi * _sweep(rig.chirp) * echo_m / C)
     np.testing.assert_allclose(gate.model @ np.exp(2j * np.pi * gate.frequencies_hz * echo_m / C), came_out, atol=1e-4)
 
 
 @pytest.mark.parametrize("window", ["hann", "boxcar"])
-def test_the_direct_path_vanishes_and_is_measured(published, window):
-    gate = reduction(published.chirp, GATE, window)
+def test_the_direct_path_vanishes_and_is_measured(rig, window):
+    gate = reduction(rig.chirp, GATE, window)
     direct = np.full(256, 3.0 + 4.0j)
     np.testing.assert_allclose(gate.matrix @ direct, 0, atol=1e-9)
     assert gate.direct @ direct == pytest.approx(3 + 4j)
-    echo = np.exp(2j * np.pi * _sweep(published.chirp) * 0.35 / C)
+    echo = np.exp(2j * np.pi * _sweep(rig.chirp) * 0.35 / C)
     assert abs(gate.direct @ echo) < 2e-3
 
 

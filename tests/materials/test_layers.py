@@ -1,7 +1,6 @@
 """A layer within a stack: what was put in comes back, error bars tell the truth, ambiguity is said."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +9,13 @@ from hypothesis import strategies as st
 
 from polysight.host.materials.layers import Bands, Layer, LayerFit, Spectrum, fit_layer, predict
 from polysight.host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
-from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError, PolysightError
+from tests.support.rigs import published_rig
 
 THETA = np.radians(55.0)
 WATER = 9.37 - 18.0j
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)
-CHIRP = load_instrument(Path(__file__).parents[2] / "instrument.toml").chirp
+CHIRP = published_rig().chirp
 BANDS = Spectrum.of(CHIRP, 4)
 
 

@@ -11,9 +11,9 @@ from polysight.host.jobs.materials import parse_layer
 from polysight.host.materials import Entry, Library
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.materials.published import write_materials
-from polysight.shared.config import load_instrument
+from tests.support.paths import RIG_FILE
+from tests.support.rigs import published_rig
 
-RIG = Path(__file__).parents[2] / "instrument.toml"
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)
 
 
@@ -28,10 +28,11 @@ def products(folder: Path, inverse: complex, std: float = 0.005) -> Path:
 
 
 def test_water_behind_glass_as_typed(tmp_path, capsys):
-    spectrum = Spectrum.of(load_instrument(RIG).chirp)
+    spectrum = Spectrum.of(published_rig().chirp)
     inverse = complex(predict([GLASS, Layer("water", 9.37 - 18j)], spectrum, np.radians(55.0))[0][0])
     folder = products(tmp_path / "out", inverse)
-    arguments = ["permittivity", str(folder), "--config", str(RIG), "--layer", "glass,5.5,0.05,3", "--layer", "water,?"]
+    layers = ["--layer", "glass,5.5,0.05,3", "--layer", "water,?"]
+    arguments = ["permittivity", str(folder), "--config", str(RIG_FILE), *layers]
     assert main([*arguments, "--json"]) == 0
     layer = json.loads(capsys.readouterr().out)[0]["layer"]
     assert layer["permittivity"] == pytest.approx([9.37, 18.0], rel=1e-4)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,23 +10,19 @@ import msgspec
 import pytest
 import tomli_w
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from fake_stage import FakeStage
-from host_side import HostSide
-from mini_hub import MiniHub
-
 from polysight.pi_controller.service import Options, Service
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
-
-ROOT = Path(__file__).parents[2]
+from tests.support.pi.fake_stage import FakeStage
+from tests.support.pi.host_side import HostSide
+from tests.support.pi.mini_hub import MiniHub
+from tests.support.rigs import published_rig
 
 
 @pytest.fixture
 def instrument(tmp_path: Path) -> Instrument:
     """The published rig with a small grid, on ephemeral loopback ports."""
-    rig = load_instrument(ROOT / "instrument.toml")
+    rig = published_rig()
     replace = msgspec.structs.replace
     return replace(
         rig,

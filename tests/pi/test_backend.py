@@ -6,7 +6,6 @@ import threading
 
 import msgspec
 import pytest
-from host_side import HostSide
 
 from polysight.pi_controller import service
 from polysight.pi_controller.lines_gpiod import GpiodLines
@@ -15,6 +14,7 @@ from polysight.pi_controller.lines_wires import WireLines
 from polysight.pi_controller.service import Options, Service
 from polysight.shared import messages as m
 from polysight.shared.messages import is_simulated
+from tests.support.pi.host_side import HostSide
 
 
 def test_lines_of_pins_are_hardware_and_all_others_are_simulated():

@@ -4,7 +4,6 @@ import queue
 import threading
 
 import pytest
-from fake_lines import FakeLines, gone
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,6 +12,7 @@ from polysight.pi_controller.trigger_lines import Edge
 from polysight.pi_controller.trigger_loop import BurstSent, Counts, LoopFault, RowJob, TriggerLoop
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import MIN_PERIOD_NS
+from tests.support.pi.fake_lines import FakeLines, gone
 
 PERIOD = 1_500_000
 SPEC = BurstSpec(16, PERIOD, 1000)

@@ -12,12 +12,13 @@ from itertools import pairwise
 
 import msgspec
 import pytest
-from host_side import HostSide
-from processes import ROOT, Process
-from wires_log import WiresLog
 
 from polysight.shared import messages as m
 from polysight.simulators import gpio, uno
+from tests.support.paths import REPO
+from tests.support.pi.host_side import HostSide
+from tests.support.pi.program import Process
+from tests.support.pi.wires_log import WiresLog
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing() + uno.missing():
@@ -62,7 +63,7 @@ def board(rig, write_config, tmp_path):
         ],
     ):
         process = subprocess.Popen(
-            [sys.executable, "-m", *map(str, command)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-m", *map(str, command)], cwd=REPO, stdout=subprocess.PIPE, text=True
         )
         started.append(process)
         assert process.stdout is not None

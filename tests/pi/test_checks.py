@@ -10,12 +10,12 @@ from collections import namedtuple
 
 import msgspec
 import pytest
-from processes import run
 
 from polysight.pi_controller import checks
 from polysight.pi_controller.checks_lines import check_lines
 from polysight.pi_controller.keys import make_keys
 from polysight.simulators import gpio
+from tests.support.pi.program import run
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 replace = msgspec.structs.replace

@@ -6,15 +6,15 @@ import signal
 import socket
 
 import pytest
-from fake_lines import FakeLines
-from host_side import HostSide
-from processes import Process, run
 
 from polysight.pi_controller.burst import BurstRecord
 from polysight.pi_controller.cli import main
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.simulators.loopback import on_free_subnet
+from tests.support.pi.fake_lines import FakeLines
+from tests.support.pi.host_side import HostSide
+from tests.support.pi.program import Process, run
 
 
 def test_ready_row_and_a_clean_end_on_sigterm(config, hub, stage, instrument):

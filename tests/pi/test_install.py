@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from polysight.shared.config import load_instrument
+from tests.support.paths import REPO
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
-PI = ROOT / "pi_controller"
+PI = REPO / "pi_controller"
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
 # Stands for a command that would change this machine; what it was asked is kept.
 STUB = '#!/bin/sh\necho "$(basename "$0") $*" >> "$LOG"\n'
@@ -56,7 +56,7 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
     assert int(service["LimitRTPRIO"]) >= 50
     assert service["LimitMEMLOCK"] == "infinity"
     assert {"gpio", "dialout"} <= set(service["SupplementaryGroups"].split())
-    rig = load_instrument(ROOT / "instrument.toml")
+    rig = published_rig()
     assert Path(rig.pi.journal_dir).is_relative_to(service["ReadWritePaths"])
     assert Path(rig.pi.journal_dir).is_relative_to(Path("/var/lib") / service["StateDirectory"])
 
@@ -80,7 +80,7 @@ def bench(tmp_path):
     (tmp_path / "installed").touch()
     return {
         **os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}", "LOG": str(tmp_path / "log"),
-        "PIP": str(tmp_path / "bin/pip"), "ROOT": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
+        "PIP": str(tmp_path / "bin/pip"), "REPO": str(tmp_path / "root"), "PI_HOME": str(tmp_path / "home"),
     }  # fmt: skip
 
 
@@ -100,7 +100,7 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
         if rig_file:
             (root / "etc/polysight/instrument.toml").write_text(rig_file)
             log.unlink()
-        done = subprocess.run(make, cwd=ROOT, env=bench, capture_output=True, text=True, check=False)
+        done = subprocess.run(make, cwd=REPO, env=bench, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         asked = log.read_text()
         assert asked.count("-m venv") == (rig_file is None), "made once, and kept with its libraries"

@@ -18,8 +18,8 @@ from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.sockets import HOST_KEYS, requester
 from polysight.shared.tables import decode, to_builtins
+from tests.support.paths import REPO, RIG_FILE
 
-ROOT = Path(__file__).parents[2]
 ELSEWHERE = "tcp://192.0.2.1:5601"
 
 
@@ -77,16 +77,16 @@ def test_the_host_needs_what_it_is_told_to_copy_and_no_more(tmp_path):
     assert server._commands.poll(60_000)
     context.destroy(linger=0)
     server.close()
-    install = (ROOT / "docs/how-to/install.md").read_text(encoding="utf-8")
+    install = (REPO / "docs/how-to/install.md").read_text(encoding="utf-8")
     assert f"tar -c -C /etc/polysight/keys {' '.join(HOST_KEYS)} |" in install
-    for text in (install, COPY, (ROOT / "host/doctor/check_pi.py").read_text(encoding="utf-8")):
+    for text in (install, COPY, (REPO / "host/doctor/check_pi.py").read_text(encoding="utf-8")):
         assert "copy the folder" not in text
         assert "copy its folder" not in text
 
 
 def test_a_relative_key_dir_counts_from_the_rig_files_folder(tmp_path, monkeypatch):
     """Whatever the working folder is, also for who resumes a scan by its manifest."""
-    text = (ROOT / "instrument.toml").read_text(encoding="utf-8")
+    text = (RIG_FILE).read_text(encoding="utf-8")
     (tmp_path / "rig").mkdir()
     path = tmp_path / "rig" / "mine.toml"
     path.write_text(text.replace('key_dir = "/etc/polysight/keys"', 'key_dir = "keys"'))

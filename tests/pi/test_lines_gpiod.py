@@ -5,7 +5,6 @@ import pytest
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 
-from fake_gpiod import FakeChip
 from gpiod import line
 
 from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_burst
@@ -13,6 +12,7 @@ from polysight.pi_controller.lines_gpiod import EVENT_BUFFER, GpiodLines, find_c
 from polysight.pi_controller.trigger_loop import Counts, RowJob, TriggerLoop
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
+from tests.support.pi.fake_gpiod import FakeChip
 
 SPEC = BurstSpec(4, 1_500_000, 1000)
 

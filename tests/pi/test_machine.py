@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from fake_lines import FakeLines
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,42 +18,15 @@ from polysight.pi_controller.supervision import StatusWatch, TriggerWatch
 from polysight.pi_controller.trigger_lines import Edge
 from polysight.pi_controller.trigger_loop import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop
 from polysight.shared import messages as m
-from polysight.shared.config import Stage
 from polysight.shared.faults import PiFault, StageError
 from polysight.shared.raster import Row
 from polysight.shared.stage_line import Immediate, Reply
+from tests.support.pi.fake_driver import FakeDriver
+from tests.support.pi.fake_lines import FakeLines
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
 SAFE_WITHIN_S = 0.5
-
-
-class FakeDriver:
-    """Takes everything; what was sent is kept."""
-
-    def __init__(self) -> None:
-        self.config = Stage("none")
-        self.sent: list[Immediate] = []
-        self.x_mm = self.y_mm = 0.0
-        self.firmware = "fake"
-        self.number = 0
-
-    def connect(self) -> None: ...
-    def clear(self) -> None: ...
-    def at_rest(self) -> None: ...
-    def ask_how_it_ended(self) -> None: ...
-    def note_position(self, _: Reply) -> None: ...
-
-    def send(self, byte: Immediate) -> None:
-        self.sent.append(byte)
-
-    def home(self) -> int:
-        self.number += 1
-        return self.number
-
-    def row(self, _: Any) -> int:
-        self.number += 1
-        return self.number
 
 
 class FakeLedger:

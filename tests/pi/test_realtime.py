@@ -12,10 +12,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from processes import PROGRAM, ROOT, Process
 
 from polysight.pi_controller.realtime import OTHERS_PRIORITY, PRIORITY
 from polysight.simulators import gpio
+from tests.support.paths import REPO
+from tests.support.pi.program import PROGRAM, Process
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing():
@@ -70,7 +71,7 @@ def test_what_is_not_permitted_is_said_and_the_program_runs(arguments):
     args, environment = arguments
     command = [*PROGRAM, "run", "--config", *map(str, args)]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=without_rights,
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=REPO, preexec_fn=without_rights,
         env={**os.environ, **environment},
     )  # fmt: skip
     try:

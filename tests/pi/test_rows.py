@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -13,11 +12,12 @@ from hypothesis import strategies as st
 from polysight.host.plan.timing import row_motion_s
 from polysight.pi_controller.rows import RefusedError, check_pulses, check_run
 from polysight.shared import messages as m
-from polysight.shared.config import Burst, load_instrument
+from polysight.shared.config import Burst
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import MIN_PERIOD_US, WIDTH_US, plan_raster
+from tests.support.rigs import published_rig
 
-RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+RIG = published_rig()
 replace = msgspec.structs.replace
 
 

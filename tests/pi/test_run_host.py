@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fake_lines import FakeLines
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_machine import FakeDriver
 
 from polysight.pi_controller.executor import REPLAYED_IN_A_ROW, Executor, Request
 from polysight.pi_controller.journal import JournalFolder
@@ -22,6 +20,8 @@ from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import RasterPlan
 from polysight.shared.stage_line import Reply
+from tests.support.pi.fake_driver import FakeDriver
+from tests.support.pi.fake_lines import FakeLines
 
 HEARTBEAT_S = 0.1
 LIMIT_S = 4 * HEARTBEAT_S

@@ -4,7 +4,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import msgspec
 import pytest
-from host_side import HostSide
 
 from polysight.host.acquisition.pi_client import HostHeartbeat
 from polysight.pi_controller.service import Options, Service
@@ -13,6 +12,7 @@ from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault, StageError
 from polysight.shared.stage_line import Immediate
 from polysight.shared.wires import WireClient, WireEdge
+from tests.support.pi.host_side import HostSide
 
 
 def test_a_row_is_captured_completely_and_in_order(pi, hub, instrument):

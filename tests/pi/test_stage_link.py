@@ -3,12 +3,12 @@
 import queue
 
 import pytest
-from fake_stage import FakeStage
 
 from polysight.pi_controller.bringup import bench_stage
 from polysight.pi_controller.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
 from polysight.shared.faults import StageError
 from polysight.shared.stage_line import Command, Immediate, Reply
+from tests.support.pi.fake_stage import FakeStage
 
 
 @pytest.fixture

@@ -14,14 +14,15 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from host_side import HostSide
-from processes import ROOT, Process, run
-from wires_log import WiresLog
 
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.shared.wires import WireEdge
 from polysight.simulators import gpio
+from tests.support.paths import REPO
+from tests.support.pi.host_side import HostSide
+from tests.support.pi.program import Process, run
+from tests.support.pi.wires_log import WiresLog
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing():
@@ -239,7 +240,7 @@ def test_settings_reach_the_chip_and_glitches_do_not_reach_us(hub, wires, tmp_pa
     """Bias, debouncing, clock, consumer: read back from the chip. The label finds it, whatever its number."""
     environment = {**os.environ, **gpio.environment(tmp_path / "gpiochip0", hub)}
     process = subprocess.Popen(
-        [sys.executable, "-c", CHIP_PROGRAM], stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment
+        [sys.executable, "-c", CHIP_PROGRAM], stdout=subprocess.PIPE, text=True, cwd=REPO, env=environment
     )
     try:
         assert process.stdout is not None

@@ -9,14 +9,13 @@ import pytest
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 
-from fake_gpiod import FakeChip
-
 from polysight.pi_controller.burst import BurstSpec, send_burst
 from polysight.pi_controller.lines_gpiomem import GPCLR0, GPFSEL0, GPSET0, GpiomemLines, GpioRegisters
 from polysight.pi_controller.service import open_lines
 from polysight.pi_controller.wiring import check_wiring, pi_generation, read_model, skew_in_if_hz
 from polysight.shared.config import Pi
 from polysight.shared.errors import ConfigError, DeviceError
+from tests.support.pi.fake_gpiod import FakeChip
 
 PI_4, PI_5 = "Raspberry Pi 4 Model B Rev 1.4", "Raspberry Pi 5 Model B Rev 1.0"
 LINES = (22, 23, 24)

@@ -4,17 +4,16 @@ import subprocess
 import sys
 import threading
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
-from host_side import HostSide
 
 from polysight.pi_controller.service import Options, Service
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
+from tests.support.paths import REPO
+from tests.support.pi.host_side import HostSide
 
 pytest.importorskip("polysight.simulators.stage", reason="the simulated stage is not installed")
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -27,7 +26,7 @@ def simulated(tmp_path):
     processes = []
     for command in (wires, stage):
         process = subprocess.Popen(
-            [sys.executable, "-m", *map(str, command)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-m", *map(str, command)], cwd=REPO, stdout=subprocess.PIPE, text=True
         )
         processes.append(process)
         assert process.stdout is not None

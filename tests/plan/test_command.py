@@ -9,10 +9,9 @@ import pytest
 import tomli_w
 
 from polysight.host.cli.main import main
+from tests.support.paths import RIG_FILE
 
-from .conftest import REPO
-
-RIG = ["--config", str(REPO / "instrument.toml")]
+RIG = ["--config", str(RIG_FILE)]
 SMALL = ["--columns", "40", "--rows", "30"]
 
 
@@ -48,7 +47,7 @@ def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
     assert "Pi's rig file too" in lines
     assert main(["plan", *RIG, *asked, *minutes, "--json"]) == 0
     proposed = json.loads(capsys.readouterr().out)["plans"][0]
-    table = tomllib.loads((REPO / "instrument.toml").read_text())
+    table = tomllib.loads(RIG_FILE.read_text())
     changed = tomllib.loads(lines)
     for section, keys in changed.items():
         assert all(table[section].get(key) != value for key, value in keys.items())

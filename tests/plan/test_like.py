@@ -14,8 +14,7 @@ from polysight.host.store.scan_folder import EVENTS, MANIFEST
 from polysight.shared.messages import Capture
 from polysight.shared.raster import plan_raster
 from polysight.simulators.scene import decode_scene, simulate
-
-from .conftest import REPO
+from tests.support.paths import RIG_FILE
 
 PULSES, ROWS, COLUMNS, SNR_DB, GAP_S = 8, 2, 12, 12.0, 20.0
 
@@ -53,7 +52,7 @@ def taken_by_a_pi(scan, rig, gap_s: float) -> None:
 @pytest.fixture
 def planned(capsys):
     def plan(*more: object) -> dict:
-        arguments = ["plan", "--config", REPO / "instrument.toml", "--rows", "30", "--pulses", "16", "--json", *more]
+        arguments = ["plan", "--config", RIG_FILE, "--rows", "30", "--pulses", "16", "--json", *more]
         assert main(list(map(str, arguments))) == 0
         return json.loads(capsys.readouterr().out)
 

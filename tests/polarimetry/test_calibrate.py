@@ -1,7 +1,5 @@
 """Laws of calibration: metal is 1, common gains and phases do not matter, set leakage and gain are recovered."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,11 +17,10 @@ from polysight.host.polarimetry import (
     smooth,
     specular_incidence_rad,
 )
-from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError, PolysightError
 from polysight.shared.geometry import incidence_deg, specular_midpoint_m
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).resolve().parents[2]
 THETA = np.radians(55.0)
 SHAPE = (40, 60)
 METAL = np.zeros(SHAPE, bool)
@@ -155,7 +152,7 @@ def test_multilook_ratio_ignores_the_common_phase_and_noise_in_v():
 
 
 def test_incidence_is_that_of_the_specular_midpoint():
-    rig = load_instrument(ROOT / "instrument.toml")
+    rig = published_rig()
     assert np.degrees(specular_incidence_rad(rig)) == pytest.approx(
         np.mean([incidence_deg(rig, b) for b in rig.receivers]), abs=0.02
     )

@@ -18,9 +18,8 @@ from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
 from polysight.simulators.scene import load_scene, simulate
+from tests.support.paths import RIG_FILE
 
-REPO = Path(__file__).resolve().parents[2]
-RIG = REPO / "instrument.toml"
 SCENE = """name = "two plates"
 [grid]
 columns = 14
@@ -52,7 +51,7 @@ def recorded(tmp_path_factory) -> Path:
     """A simulated scan, and its products."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "scene.toml").write_text(SCENE)
-    simulate(load_instrument(RIG), load_scene(folder / "scene.toml"), folder / "scan")
+    simulate(load_instrument(RIG_FILE), load_scene(folder / "scene.toml"), folder / "scan")
     assert main(["process", str(folder / "scan"), "--out", str(folder / "out"), *METAL]) == 0
     return folder
 
@@ -118,7 +117,7 @@ def test_products_whose_raw_rows_were_dropped_stay(made, capsys):
     assert main(["drop-raw", str(made / "scan"), "--products", str(made / "out"), "--yes"]) == 0
     before = contents(made / "out")
     (made / "other.toml").write_text(SCENE.replace("two plates", "another"))
-    other = simulate(load_instrument(RIG), load_scene(made / "other.toml"), made / "other")
+    other = simulate(load_instrument(RIG_FILE), load_scene(made / "other.toml"), made / "other")
     for command in ("process", "image"):
         assert main([command, str(other), "--out", str(made / "out")]) == 2
         said = capsys.readouterr().err
@@ -158,7 +157,7 @@ def test_off_the_librarys_angle_there_is_a_report_without_names(made, other_angl
 @pytest.fixture
 def no_pi(made) -> Path:
     """A rig file where nobody answers."""
-    table = to_builtins(load_instrument(RIG))
+    table = to_builtins(load_instrument(RIG_FILE))
     table["pi"] |= {"command_address": "tcp://127.0.0.1:1", "event_address": "tcp://127.0.0.1:2"}
     table["limits"] |= {"command_timeout_s": 0.2}
     (made / "rig.toml").write_text(tomli_w.dumps(table))

@@ -14,8 +14,7 @@ from polysight.host.radar.spi import Link
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import Fault
 from polysight.simulators.radars import RadarBoard as Simulated
-
-from .conftest import BoardWords, VirtualClock, native_rig
+from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
 RIG = native_rig()
 LOST = st.sampled_from([Fault.NACK, Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])

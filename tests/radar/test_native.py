@@ -15,7 +15,7 @@ from polysight.shared.config import Instrument, NativeRadar, Radar
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.radars import RadarBoard, UsbChip
-from tests.radar.conftest import BoardWords
+from tests.support.radar.boards import BoardWords
 
 PERIOD_S = 1.5e-3
 FRAMES = 24

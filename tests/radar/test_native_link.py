@@ -8,7 +8,7 @@ from polysight.host.radar.interface import RadarState
 from polysight.host.radar.native import NativeRadars
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import RadarBoard
-from tests.radar.conftest import BoardWords
+from tests.support.radar.boards import BoardWords
 
 FRAMES = 24
 

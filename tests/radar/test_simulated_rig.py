@@ -17,20 +17,18 @@ from polysight.host.radar.constraints import constraints
 from polysight.host.radar.native import open_board
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import SystemClock
-from polysight.shared.config import load_instrument
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import RadarBoard as Simulated
 from polysight.simulators.radars import RadarSocket
 from polysight.simulators.rig import derive
 from polysight.simulators.scene import SimulatedRig, decode_scene
-
-from .conftest import RIG_FILE
+from tests.support.rigs import published_rig
 
 EMPTY = decode_scene({"name": "the direct path alone"}, "test")
 
 
 def test_the_derived_rig_breaks_no_constraint_and_reaches_every_board(tmp_path: Path):
-    rig = derive(load_instrument(RIG_FILE), EMPTY, tmp_path, native=True)
+    rig = derive(published_rig(), EMPTY, tmp_path, native=True)
     assert rig.radar.control == "native"
     assert [c for c in constraints(rig, 5600) if not c.holds] == []
     assert len({b.usb_serial for b in rig.radar.native.values()}) == 3
@@ -39,8 +37,8 @@ def test_the_derived_rig_breaks_no_constraint_and_reaches_every_board(tmp_path: 
 
 def test_programmed_offsets_make_the_signals_that_the_scene_s_offset_made(tmp_path: Path):
     """The same start frequencies by either way: the same samples."""
-    plain = derive(load_instrument(RIG_FILE), EMPTY, tmp_path)
-    native = derive(load_instrument(RIG_FILE), EMPTY, tmp_path, native=True)
+    plain = derive(published_rig(), EMPTY, tmp_path)
+    native = derive(published_rig(), EMPTY, tmp_path, native=True)
     at = np.zeros(2)
     a, b = (SimulatedRig(rig, EMPTY, 5).signals("RH", at, at) for rig in (plain, native))
     np.testing.assert_array_equal(a, b)

@@ -56,11 +56,43 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.text).split())
 
 
-@pytest.fixture(scope="module")
-def ctx():
-    """Two plates, one of them named wrong, and a third that was not found."""
+COMMON = {"votes": {}, "distance": 0.2, "pixels": 400, "interior_pixels": 100, "incidence_deg": 55.0}
+MATERIALS = [
+    {
+        **COMMON, "label": 1, "name": "copper", "confidence": 1.0, "metal_reference": True, "metal_like": True,
+        "box_mm": [-50, -20, -10, 20], "outline_mm": [[-50, -20], [-10, -20], [-10, 20]], "permittivity": None,
+        "ratio": {"real": 1.0, "imag": 0.0}, "truth": {"name": "copper", "metal": True, "permittivity": None},
+    },
+    {
+        **COMMON, "label": 2, "name": "PET <b>", "confidence": 0.62, "metal_reference": False, "metal_like": False,
+        "box_mm": [10, -20, 50, 20], "outline_mm": [],
+        "permittivity": {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]},
+        "ratio": {"real": 4.4, "imag": 0.6},
+        "truth": {"name": "acrylic", "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
+    },
+]  # fmt: skip
+TRUTH = [
+    {"name": "copper", "box_mm": (-50, -20, -10, 20), "permittivity": None},
+    {"name": "acrylic", "box_mm": (10, -20, 50, 20), "permittivity": 4 - 0.4j},
+    {"name": "cork", "box_mm": (-10, 30, 10, 50), "permittivity": 10.6 - 0j},
+]
+QUALITY = {
+    "boards": {
+        "RH": {
+            "frames_expected": 1000,
+            "frames_received": 998,
+            "frames_masked": 2,
+            "synchronisation": {"averaged": {"frequency_std_hz": 31.0, "phase_std_rad": 0.005}},
+        }
+    },
+    "rows_retaken": [3],
+    "seconds_per_stage": {"align": 2.0, "image": 0.5},
+}
+
+
+def two_plates():
+    """Images H, V and their ratio, complex64 [61, 61], of two plates in noise; int32 labels of their pixels."""
     rng = np.random.default_rng(0)
-    x = np.linspace(-0.06, 0.06, 61)
     h = 0.02 * (rng.standard_normal((61, 61)) + 1j * rng.standard_normal((61, 61)))
     v = 0.02 * (rng.standard_normal((61, 61)) + 1j * rng.standard_normal((61, 61)))
     segments = np.zeros((61, 61), np.int32)
@@ -70,55 +102,33 @@ def ctx():
     v[0, 0] = 0
     with np.errstate(divide="ignore"):
         p = (h / v).astype(np.complex64)
+    return h.astype(np.complex64), v.astype(np.complex64), p, segments
+
+
+@pytest.fixture(scope="module")
+def ctx():
+    """Two plates, one of them named wrong, and a third that was not found."""
+    h, v, p, segments = two_plates()
+    x = np.linspace(-0.06, 0.06, 61)
     interior = np.zeros((61, 61), bool)
     interior[25:35, 40:50] = True
-    common = {"votes": {}, "distance": 0.2, "pixels": 400, "interior_pixels": 100, "incidence_deg": 55.0}
-    rows = [
-        {
-            **common, "label": 1, "name": "copper", "confidence": 1.0, "metal_reference": True, "metal_like": True,
-            "box_mm": [-50, -20, -10, 20], "outline_mm": [[-50, -20], [-10, -20], [-10, 20]], "permittivity": None,
-            "ratio": {"real": 1.0, "imag": 0.0}, "truth": {"name": "copper", "metal": True, "permittivity": None},
-        },
-        {
-            **common, "label": 2, "name": "PET <b>", "confidence": 0.62, "metal_reference": False, "metal_like": False,
-            "box_mm": [10, -20, 50, 20], "outline_mm": [],
-            "permittivity": {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]},
-            "ratio": {"real": 4.4, "imag": 0.6},
-            "truth": {"name": "acrylic", "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
-        },
-    ]  # fmt: skip
     return ReportContext(
         title="Two <plates> & more",
         simulated=True,
         x_m=x,
         y_m=x + 0.1,
-        h=h.astype(np.complex64),
-        v=v.astype(np.complex64),
+        h=h,
+        v=v,
         p=p,
         valid=np.ones((61, 61), bool),
-        materials=rows,
+        materials=MATERIALS,
         segments=segments,
         pixel_names={2: (np.array(["PET <b>", "unknown"] * 50), interior)},
-        truth=[
-            {"name": "copper", "box_mm": (-50, -20, -10, 20), "permittivity": None},
-            {"name": "acrylic", "box_mm": (10, -20, 50, 20), "permittivity": 4 - 0.4j},
-            {"name": "cork", "box_mm": (-10, 30, 10, 50), "permittivity": 10.6 - 0j},
-        ],
+        truth=TRUTH,
         metal_how="given as patch 1",
         pixel_accuracy=0.5,
         library_note="a library.",
-        quality={
-            "boards": {
-                "RH": {
-                    "frames_expected": 1000,
-                    "frames_received": 998,
-                    "frames_masked": 2,
-                    "synchronisation": {"averaged": {"frequency_std_hz": 31.0, "phase_std_rad": 0.005}},
-                }
-            },
-            "rows_retaken": [3],
-            "seconds_per_stage": {"align": 2.0, "image": 0.5},
-        },
+        quality=QUALITY,
         config={"grid": "140 x 120"},
         provenance={"scan": "abc"},
         notes=["Never ran on hardware."],

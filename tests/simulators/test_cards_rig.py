@@ -17,7 +17,7 @@ from polysight.shared.config import load_instrument
 from polysight.simulators.cards import bound_udp
 from polysight.simulators.rig import card_groups, derive
 from polysight.simulators.scene import load_scene
-from tests.small_scene import small_scene
+from tests.support.scenes import small_scene
 
 ROOT = Path(__file__).parents[2]
 SCENE = small_scene(10, 4)

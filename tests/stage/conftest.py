@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -17,21 +16,11 @@ from polysight.shared.errors import DeviceError
 from polysight.shared.wires import WireEdge, WireMessage, WireMotion
 from polysight.simulators.builds import SKETCH_DIR, build_sketch, sketch_compiler
 from polysight.simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
+from tests.support.paths import REPO, RIG_FILE
+from tests.support.stage import conversation as conversations
+from tests.support.stage.drivers import Driver, FirmwareDriver, PortDriver, PythonDriver, UnoDriver
+from tests.support.stage.uno_host import Host
 
-
-def _module(name: str) -> ModuleType:
-    """A module beside this file, by its path: test folders are no packages here."""
-    spec = importlib.util.spec_from_file_location(f"stage_{name}", Path(__file__).with_name(f"{name}.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[f"stage_{name}"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-drivers, conversations, uno_hosts = _module("drivers"), _module("conversation"), _module("uno_host")
-Driver, FirmwareDriver, PythonDriver = drivers.Driver, drivers.FirmwareDriver, drivers.PythonDriver
-ROOT = Path(__file__).parents[2]
 _SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
 
 
@@ -103,9 +92,9 @@ def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., Emulated
 
 
 @pytest.fixture
-def host(make_uno: Callable[..., EmulatedUno]) -> object:
+def host(make_uno: Callable[..., EmulatedUno]) -> Host:
     """A host at the serial line of an emulated board; greeted, switched on and homed."""
-    return uno_hosts.Host(make_uno(start=(300, 250))).ready()
+    return Host(make_uno(start=(300, 250))).ready()
 
 
 @pytest.fixture
@@ -117,7 +106,7 @@ def conversation() -> ModuleType:
 @pytest.fixture
 def port_driver() -> type[Driver]:
     """What talks to a stage through a serial port, as --stage-port does."""
-    return drivers.PortDriver
+    return PortDriver
 
 
 @pytest.fixture(params=["pc", "sanitized", "python", "uno", "port"])
@@ -132,15 +121,15 @@ def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
     elif kind == "python":
         driver = PythonDriver()
     elif kind == "uno":
-        driver = drivers.UnoDriver(*request.getfixturevalue("uno_programs"), tmp_path)
+        driver = UnoDriver(*request.getfixturevalue("uno_programs"), tmp_path)
     else:
         real, dialogue = request.config.getoption("--stage-port"), request.node.callspec.params.get("path")
         if real:
-            driver = drivers.PortDriver(real)
+            driver = PortDriver(real)
         elif dialogue is not None or request.config.getoption("--long"):
             # Three times real time, but a heartbeat is one of the wall clock, however fast the motion runs.
             speed = 1.0 if dialogue is not None and dialogue.stem == "heartbeat" else 3.0
-            driver = drivers.PortDriver(request.getfixturevalue("simulated_port")(speed), speed)
+            driver = PortDriver(request.getfixturevalue("simulated_port")(speed), speed)
         else:
             pytest.skip("minutes at a port: --long, or a real stage: --stage-port /dev/ttyACM0 (it homes and moves)")
     yield driver
@@ -154,9 +143,9 @@ def simulated_port(tmp_path: Path) -> Iterator[Callable[[float], str]]:
 
         def start(time_scale: float) -> str:
             port = str(tmp_path / "ttySTAGE")
-            command = [sys.executable, "-m", "polysight.simulators.stage", "--config", str(ROOT / "instrument.toml")]
+            command = [sys.executable, "-m", "polysight.simulators.stage", "--config", str(RIG_FILE)]
             command += ["--link", port, "--time-scale", repr(time_scale)]
-            stage = started.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT))
+            stage = started.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPO))
             started.callback(stage.terminate)
             assert stage.stdout is not None
             assert stage.stdout.readline().startswith("ready")

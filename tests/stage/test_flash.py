@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
-SKETCH = Path(__file__).parents[2] / "arduino_stage"
+from tests.support.paths import REPO
+
+SKETCH = REPO / "arduino_stage"
 pytestmark = pytest.mark.xdist_group("firmware")  # built once
 SIGNATURE = bytes([0x1E, 0x95, 0x0F])  # ATmega328P
 IN_SYNC, OK, END = b"\x14", b"\x10", b"\x20"

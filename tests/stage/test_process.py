@@ -18,8 +18,8 @@ import serial
 
 from polysight.shared.stage_line import Command, Immediate, Reply
 from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
+from tests.support.paths import REPO, RIG_FILE
 
-ROOT = Path(__file__).parents[2]
 LIMIT_S = 60.0
 
 
@@ -94,11 +94,11 @@ class Simulator:
             "-m",
             "polysight.simulators.stage",
             "--config",
-            str(ROOT / "instrument.toml"),
+            str(RIG_FILE),
             "--wires",
         ]
         command += [str(folder / "wires"), "--link", str(self.link), "--time-scale", str(time_scale), *extra]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=REPO)
         assert self.process.stdout is not None
         try:
             self.wires.accept()
@@ -207,9 +207,9 @@ def test_dies_with_its_parent(tmp_path: Path):
         "p = subprocess.Popen(command, stdout=subprocess.PIPE)\n"
         "p.stdout.readline()\nprint(p.pid, flush=True)\ntime.sleep(600)\n"
     )
-    arguments = ["--config", str(ROOT / "instrument.toml"), "--wires", str(tmp_path / "wires"), "--link"]
+    arguments = ["--config", str(RIG_FILE), "--wires", str(tmp_path / "wires"), "--link"]
     parent = subprocess.Popen(
-        [sys.executable, "-c", program, *arguments, str(tmp_path / "tty")], stdout=subprocess.PIPE, text=True, cwd=ROOT
+        [sys.executable, "-c", program, *arguments, str(tmp_path / "tty")], stdout=subprocess.PIPE, text=True, cwd=REPO
     )
     assert parent.stdout is not None
     child = int(parent.stdout.readline())

@@ -16,11 +16,11 @@ from polysight.shared.stage_line import Immediate, Parameter, Reply
 from polysight.simulators.stage import logic as stage_logic
 from polysight.simulators.stage import motion as stage_motion
 from polysight.simulators.stage import python_stage as stage_python
+from tests.support.paths import REPO
 
-ROOT = Path(__file__).parents[2]
-SKETCH = ROOT / "arduino_stage"
+SKETCH = REPO / "arduino_stage"
 FIRMWARE = pytest.mark.xdist_group("firmware")  # built once
-PAGE = (ROOT / "docs" / "spec" / "stage-line.md").read_text(encoding="utf-8")
+PAGE = (REPO / "docs" / "spec" / "stage-line.md").read_text(encoding="utf-8")
 
 
 def constants(name: str) -> dict[str, int]:
@@ -40,7 +40,7 @@ def test_pinout():
     board = pins("\n".join(re.findall(r"PIN_.*", (SKETCH / "board.h").read_text(encoding="ascii"))))
     assert published.items() <= board.items()
     assert len(set(board.values())) == len(board)
-    emulated = pins(re.findall(r"enum (\{ TRIGGER.*?\});", (ROOT / "simulators/uno/rig.c").read_text(), re.DOTALL)[0])
+    emulated = pins(re.findall(r"enum (\{ TRIGGER.*?\});", (REPO / "simulators/uno/rig.c").read_text(), re.DOTALL)[0])
     names = {"DRIVERS_OFF": "ENABLE", "EMERGENCY_STOP": "EMERGENCY"}
     assert {names.get(k, k): v for k, v in emulated.items()} == board
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
+from tests.support.paths import REPO, RIG_FILE
 
-ROOT = Path(__file__).parents[2]
 SPEED = 4.0
 LIMIT_S = 60.0
 # x, y in um at the triggers of dialogues/row.txt
@@ -71,9 +71,9 @@ class Board:
             listener.bind(str(folder / "wires"))
             listener.listen()
             listener.settimeout(LIMIT_S)
-            command = [sys.executable, "-m", "polysight.simulators.uno", "--config", str(ROOT / "instrument.toml")]
+            command = [sys.executable, "-m", "polysight.simulators.uno", "--config", str(RIG_FILE)]
             command += ["--wires", str(folder / "wires"), "--link", str(self.port), "--time-scale", str(time_scale)]
-            self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+            self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPO)
             self._wires, _ = listener.accept()
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == f"ready {self.port}\n"
@@ -142,7 +142,7 @@ def test_a_row_at_real_time(board: Callable[[float], Board], port_driver, conver
     """Every trigger reaches the wires, and just before it, with the same time, where the stage is and how fast."""
     uno = board(SPEED)
     driver = port_driver(str(uno.port), SPEED)
-    conversation.play(driver, ROOT / "tests" / "stage" / "dialogues" / "row.txt")
+    conversation.play(driver, REPO / "tests" / "stage" / "dialogues" / "row.txt")
     driver.close()
     messages = uno.end()
     times = [m.t_ns for m in messages]
@@ -166,7 +166,7 @@ def test_the_peer_is_killed_in_the_middle_of_a_row(board: Callable[[float], Boar
     """The stage comes to rest with alarm 11 and gives no trigger any more. How soon: test_uno_timing.py."""
     uno = board(2.0)
     port = os.open(uno.port, os.O_RDWR | os.O_NOCTTY)  # resets the board; the peer's opening does not any more
-    with subprocess.Popen([sys.executable, "-c", PEER, str(uno.port)], stdout=subprocess.PIPE, cwd=ROOT) as peer:
+    with subprocess.Popen([sys.executable, "-c", PEER, str(uno.port)], stdout=subprocess.PIPE, cwd=REPO) as peer:
         try:
             assert peer.stdout is not None
             assert peer.stdout.readline() == b"row\n"

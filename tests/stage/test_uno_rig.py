@@ -13,16 +13,16 @@ import pytest
 import tomli_w
 
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.shared.config import load_instrument
 from polysight.shared.tables import to_builtins
+from tests.support.paths import POLYSIGHT, REPO, RIG_FILE
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
 LIMIT_S = 200
 SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm = [60.0, 60.0]\nmetal = true\n'
 
 
 def run(*command: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=ROOT)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=REPO)
     assert done.returncode == 0, done.stderr
 
 
@@ -30,7 +30,7 @@ def run(*command: str) -> None:
 @pytest.mark.xdist_group("rig")
 def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     """Every row is committed, and the radars saw the plate from where the plan has the stage, between triggers too."""
-    rig = load_instrument(ROOT / "instrument.toml")
+    rig = published_rig()
     replace = msgspec.structs.replace
     rig = replace(
         rig,
@@ -53,11 +53,11 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
         "--with-pi",
     ]
     command += ["--dir", str(tmp_path / "rig"), "--uno", "--time-scale", "2"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPO) as process:
         try:
             assert process.stdout is not None
             simulated = process.stdout.readline().removeprefix("ready ").strip()
-            program = str(Path(sys.executable).parent / "polysight")
+            program = str(POLYSIGHT)
             run(program, "scan", "--config", simulated, "--out", str(tmp_path / "scan"), "--no-process")
         finally:
             process.send_signal(signal.SIGTERM)
@@ -84,8 +84,8 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
 
 
 def test_a_time_scale_its_heartbeat_cannot_follow_is_refused(tmp_path: Path):
-    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(ROOT / "instrument.toml"), "--pattern"]
+    command = [sys.executable, "-m", "polysight.simulators.rig", "--config", str(RIG_FILE), "--pattern"]
     command += ["--dir", str(tmp_path / "rig"), "--uno", "--time-scale", "5"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=ROOT)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=REPO)
     assert done.returncode == 2
     assert "--time-scale 5" in done.stderr

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 
 from polysight.shared.stage_line import Immediate, Parameter
 from polysight.simulators.uno import HZ
+from tests.support.paths import REPO
 
-SKETCH = Path(__file__).parents[2] / "arduino_stage"
+SKETCH = REPO / "arduino_stage"
 US, MS = HZ // 1_000_000, HZ // 1000
 TRIGGER, X_PUL = 2, 5
 STEP_VECTOR = 11

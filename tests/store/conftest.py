@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import random
 import shutil
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from small_scan import Samples, SmallScan
+from tests.support.store.small_scan import Samples, SmallScan
 
 T = TypeVar("T")
 

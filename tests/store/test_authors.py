@@ -1,16 +1,14 @@
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polysight.host.store.sources.open import open_source
 from polysight.host.store.sources.published import PublishedCubes, PublishedScan
-from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import rx_positions_m, tx_position_m
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
 COLUMNS, ROWS, PULSES, SAMPLES = 7, 4, 4, 256
 BURST = PULSES * SAMPLES * 16
 PACKET = 1456
@@ -18,7 +16,7 @@ PACKET = 1456
 
 @pytest.fixture(scope="module")
 def base():
-    return load_instrument(ROOT / "instrument.toml")
+    return published_rig()
 
 
 def _settings(**changes):

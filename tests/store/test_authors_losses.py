@@ -1,7 +1,5 @@
 """What is missing in the published raw rows is masked and counted; what is not masked is what was sent."""
 
-from pathlib import Path
-
 import msgspec
 import numpy as np
 import pytest
@@ -9,14 +7,14 @@ import pytest
 from polysight.host.store.sources.open import open_source
 from polysight.host.store.sources.published import RowLosses
 from polysight.host.store.sources.published_settings import mirrored
-from polysight.shared.config import Burst, Grid, load_instrument
+from polysight.shared.config import Burst, Grid
 from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
 from polysight.shared.raster import plan_raster
 from polysight.simulators.scene import AuthorsLayout
+from tests.support.rigs import published_rig
 
-ROOT = Path(__file__).parents[2]
 COLUMNS, ROWS, PULSES = 9, 4, 3
-BASE = load_instrument(ROOT / "instrument.toml")
+BASE = published_rig()
 RIG = msgspec.structs.replace(
     BASE,
     grid=Grid(columns=COLUMNS, rows=ROWS, step_x_mm=2.0, step_y_mm=2.0),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,16 +13,15 @@ from polysight.host.acquisition.scan import resume_scan
 from polysight.host.cli.main import main
 from polysight.host.page.story import Story
 from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, reconnected
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, to_builtins
-
-REPO = Path(__file__).resolve().parents[2]
+from tests.support.rigs import rig_table
 
 
 @pytest.fixture(scope="module")
 def begun() -> Instrument:
-    table = to_builtins(load_instrument(REPO / "instrument.toml"))
+    table = rig_table()
     table["radar"] |= {"servers": {b["name"]: f"192.168.33.1:{70 + k}" for k, b in enumerate(table["boards"])}}
     return decode(table, Instrument, "begun")
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from small_scan import SmallScan
 
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import ScanFolder
@@ -18,6 +17,7 @@ from polysight.host.store.validate import validate
 from polysight.pi_controller.journal import records
 from polysight.shared.errors import DataError
 from polysight.shared.messages import RowStarted
+from tests.support.store.small_scan import SmallScan
 
 pytestmark = pytest.mark.timeout(3600)  # with --long
 PAGE = bytes(4096)

@@ -6,12 +6,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from faulty_disk import GROWS, FaultyDisk
-from small_scan import Samples, SmallScan
 
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import validate
 from polysight.shared.errors import PolysightError
+from tests.support.store.faulty_disk import GROWS, FaultyDisk
+from tests.support.store.small_scan import Samples, SmallScan
 
 
 def needs_space(samples: Samples, folder: Path, whose: str) -> list[int]:

@@ -9,11 +9,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from faulty_disk import FaultyDisk, Killed
-from small_scan import Samples, SmallScan
 
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validate import Finding, validate
+from tests.support.store.faulty_disk import FaultyDisk, Killed
+from tests.support.store.small_scan import Samples, SmallScan
 
 POWER_CUTS = 4  # draws of what is left, for each place
 pytestmark = [

@@ -19,15 +19,15 @@ from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validate import damaged_rows, validate
 from polysight.shared.errors import ConfigError, DataError, DeviceError, ScanError
-from tests.small_scene import small_scene
+from tests.support.paths import POLYSIGHT, RIG_FILE
+from tests.support.scenes import small_scene
 
-REPO = Path(__file__).resolve().parents[2]
 ROWS, BOARDS = 4, 2
 SCENE = small_scene(8, ROWS, metal=False)
 
 
 def polysight(*words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
-    command = [Path(sys.executable).parent / "polysight", *map(str, words)]
+    command = [POLYSIGHT, *map(str, words)]
     return subprocess.run(command, input=typed, capture_output=True, text=True, timeout=120, check=False)
 
 
@@ -37,7 +37,7 @@ def processed(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("processed")
     (folder / "scene.toml").write_text(SCENE)
     simulate = [sys.executable, "-m", "polysight.simulators", "simulate", folder / "scene.toml"]
-    config = ["--config", REPO / "instrument.toml", "--out", folder / "scan"]
+    config = ["--config", RIG_FILE, "--out", folder / "scan"]
     subprocess.run([*simulate, *config], check=True, capture_output=True)
     assert polysight("image", folder / "scan", "--out", folder / "scan" / "products").returncode == 0
     return folder / "scan"

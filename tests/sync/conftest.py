@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from polysight.host.capture.decode import raw_words
 from polysight.host.sync.align import AlignedRow, align_row
-from polysight.shared.config import Board, Instrument, load_instrument
+from polysight.shared.config import Board, Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-
-ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="session")
-def rig() -> Instrument:
-    return load_instrument(ROOT / "instrument.toml")
 
 
 def sweep_hz(rig: Instrument) -> np.ndarray:

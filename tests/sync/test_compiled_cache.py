@@ -4,12 +4,12 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from tests.support.paths import REPO
+
 pytest.importorskip("numba", reason="numba is not installed")
-ROOT = Path(__file__).parents[2]
 CALL = """
 import numpy as np
 from polysight.host.sync import compiled
@@ -35,7 +35,7 @@ def call(folder):
 
 def test_a_changed_kernel_is_compiled_anew_also_where_it_was_inlined(tmp_path):
     for package in ("host", "shared"):
-        shutil.copytree(ROOT / package, tmp_path / "polysight" / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(REPO / package, tmp_path / "polysight" / package, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "polysight" / "__init__.py").write_text("", encoding="utf-8")
     first, hits = call(tmp_path)
     assert (first, hits) == (pytest.approx(2**0.5), 0)

@@ -1,7 +1,7 @@
 """In the guest: emulated UNO -> pseudo terminal and trigger wire -> gpio-sim -> the Pi's program, as a Pi runs it.
 
 Carries out the one row of the rig file that is its argument, and prints `RESULT {...}`: what the Pi told, and what the
-kernel saw on the lines.
+kernel saw on the lines. The repository is on PYTHONPATH, which conftest.py hands over on the kernel's command line.
 """
 
 from __future__ import annotations
@@ -18,15 +18,11 @@ import threading
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
-sys.path += [str(Path(__file__).parent), str(ROOT / "tests" / "pi")]
-
-from gpio_sim import Change, SimChip  # noqa: E402
-from host_side import HostSide  # noqa: E402
-
-from polysight.shared import messages as m  # noqa: E402
-from polysight.shared.config import load_instrument  # noqa: E402
-from polysight.shared.wires import WireEdge, parse  # noqa: E402
+from polysight.shared import messages as m
+from polysight.shared.config import load_instrument
+from polysight.shared.wires import WireEdge, parse
+from tests.support.pi.host_side import HostSide
+from tests.uml.gpio_sim import Change, SimChip
 
 LINES = 28
 LIMIT_S = 600.0

@@ -15,12 +15,13 @@ import msgspec
 import pytest
 import tomli_w
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
 from polysight.simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
+from tests.support.paths import REPO
+from tests.support.rigs import published_rig
 
 HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
 LIMIT_S = 900
 
 
@@ -44,7 +45,12 @@ def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
     def run(points: int, *options: str, real_time: bool = False) -> dict[str, Any]:
         config = tmp_path / "instrument.toml"
         config.write_bytes(tomli_w.dumps(to_builtins(_rig(points, one_shot=real_time))).encode())
-        program = [f"PYTHON={sys.executable}", f"PROGRAM={HERE / 'chain.py'}", f"ARGUMENT={config}"]
+        program = [
+            f"PYTHON={sys.executable}",
+            f"PYTHONPATH={REPO}",
+            f"PROGRAM={HERE / 'chain.py'}",
+            f"ARGUMENT={config}",
+        ]
         root = ["root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro", "mem=256M", f"init={HERE / 'init.sh'}"]
         console = ["con=null", "con0=null,fd:1", "quiet"]
         done = subprocess.run(
@@ -75,7 +81,7 @@ def _rig(points: int, one_shot: bool) -> Instrument:
 
     In real time a system call takes some 10 us in user-mode Linux: there pulses are not short enough without one shot.
     """
-    rig = load_instrument(ROOT / "instrument.toml")
+    rig = published_rig()
     replace = msgspec.structs.replace
     width_mm = (points - 1) * rig.grid.step_x_mm
     return replace(

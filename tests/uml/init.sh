@@ -1,6 +1,6 @@
 #!/bin/bash
 # First process of user-mode Linux: mounts what a Linux has, runs $PROGRAM with $PYTHON, and halts.
-# Both come from the kernel's command line. The root is the host's, read-only; /run is the guest's own.
+# Both, and PYTHONPATH, come from the kernel's command line. The root is the host's, read-only; /run is the guest's own.
 export PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/run TMPDIR=/run LC_ALL=C.UTF-8 PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
 mount -t proc proc /proc
 mount -t sysfs sys /sys

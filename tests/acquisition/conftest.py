@@ -1,0 +1,26 @@
+"""A fake Pi with fake capture cards on a loopback subnet of their own."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.support.acquisition.fake_cards import payload_of
+from tests.support.acquisition.fake_rig import FakeRig, small_instrument
+
+
+@pytest.fixture
+def rig():
+    fake = FakeRig(small_instrument())
+    fake.start()
+    yield fake
+    fake.close()
+
+
+@pytest.fixture
+def payload():
+    return payload_of
+
+
+@pytest.fixture
+def make_instrument():
+    return small_instrument

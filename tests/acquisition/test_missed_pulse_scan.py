@@ -1,0 +1,98 @@
+"""A scan in which boards miss pulses: found, named, taken again; or kept, each frame at its pulse or masked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from polysight.host.acquisition.scan import run_scan
+from polysight.host.store.validate import validate
+
+POINTS, PULSES = 8, 6
+
+
+@pytest.fixture
+def paced(make_instrument):
+    """Rows of 8 points and 6 pulses, their frames sent at the times of their pulses."""
+    from tests.support.acquisition.fake_rig import FakeRig
+
+    made = make_instrument(row_retakes=1)
+    grid = msgspec.structs.replace(made.grid, columns=POINTS, rows=2)
+    burst = msgspec.structs.replace(made.burst, pulses=PULSES)
+    fake = FakeRig(msgspec.structs.replace(made, grid=grid, burst=burst))
+    fake.start()
+    fake.pi.paced = True
+    yield fake
+    fake.close()
+
+
+def test_missed_pulses_are_found_and_the_row_is_taken_again(paced, payload, tmp_path):
+    paced.cards["RH"].missed[0, 1] = {20}
+    paced.cards["RV"].missed[0, 1] = {0, 47}
+    result = run_scan(paced.instrument, tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    reasons = result.folder.facts("row_rejected")[0]["reasons"]
+    assert any(r.startswith("RH") and "SYNC_IN" in r for r in reasons)
+    assert any(r.startswith("RV") and "SYNC_IN" in r for r in reasons)
+    assert result.folder.read_row("RH", 0).payload.tobytes() == payload("RH", 0, paced.instrument.row_bytes)
+
+
+def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(paced, payload, tmp_path):
+    missed = {"RH": {20}, "RV": {0, 30, 31, 47}}
+    for name, slots in missed.items():
+        for take in (1, 2):
+            paced.cards[name].missed[0, take] = slots
+    told: set[str] = set()
+    for number in range(20):  # a machine too busy to tell masks the whole row
+        told |= _kept(paced, payload, tmp_path / str(number), missed)
+        if told == set(missed):
+            return
+    pytest.fail(f"only of {sorted(told)} were the frames told apart, in 20 scans")
+
+
+def _kept(paced, payload, folder: Path, missed: dict[str, set[int]]) -> set[str]:
+    """Scans, and checks row 0 of every board; those whose frames were told apart."""
+    paced.pi.rows_run.clear()  # the rows of the scan before
+    result, told = run_scan(paced.instrument, folder, keep_incomplete=True), set()
+    assert (result.exit_status, result.incomplete_rows) == ("success", [0])
+    assert [f for f in validate(folder) if f.severity == "error"] == []
+    frame = paced.instrument.frame_bytes
+    for name, slots in missed.items():
+        data = result.folder.read_row(name, 0)
+        want = np.frombuffer(payload(name, 0, paced.instrument.row_bytes), dtype=np.uint8)
+        assert data.mask is not None
+        assert data.mask.reshape(-1, frame)[sorted(slots)].all()
+        np.testing.assert_array_equal(data.payload[~data.mask], want[~data.mask])
+        if not data.mask.all():
+            assert not data.payload[data.mask].any()
+            told.add(name)
+        fact = result.folder.facts("row_committed")[0]["boards"][name]
+        assert fact["pulses_missed"] == len(slots)
+    return told
+
+
+def test_row_with_an_edge_that_nobody_sent_does_not_count_as_whole(paced, payload, tmp_path):
+    """A radar that counts its frames sees one edge too many: as many frames as pulses, all behind it one place off."""
+    for take in (1, 2):
+        paced.cards["RV"].extra[0, take] = 20
+    for number in range(20):  # a machine too busy to tell sees nothing
+        result = run_scan(paced.instrument, tmp_path / str(number), keep_incomplete=True)
+        assert result.exit_status == "success"
+        if result.incomplete_rows == [0]:
+            break
+    else:
+        pytest.fail("not noticed in 20 scans")
+    fact = result.folder.facts("row_rejected")[0]
+    assert [(f["kind"], f.get("board")) for f in fact["faults"]] == [("slipped", "RV")]
+    assert "edges on SYNC_IN that were not sent" in fact["reasons"][0]
+    data = result.folder.read_row("RV", 0)
+    want = np.frombuffer(payload("RV", 0, paced.instrument.row_bytes), dtype=np.uint8)
+    assert data.mask is not None
+    np.testing.assert_array_equal(data.payload[~data.mask], want[~data.mask])
+    assert not data.mask.reshape(POINTS * PULSES, -1)[:18].any(), "bursts before it"
+    assert data.mask.reshape(POINTS * PULSES, -1)[18:24].all(), "its own"
+    assert data.mask.mean() < 0.5
+    assert [f for f in validate(tmp_path / str(number)) if f.severity == "error"] == []

@@ -1,0 +1,79 @@
+"""docs/spec/row.md says what the code does: states, transitions, messages."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from polysight.host.acquisition.row import TRANSITIONS, RowState, RowTransaction
+from polysight.host.capture import receiver as receiver_words
+from polysight.host.capture.dca1000 import Code
+from polysight.host.radar.interface import RadarControl, RadarState
+from polysight.shared import messages
+from polysight.shared.config import Radar
+from polysight.shared.errors import ScanError
+from tests.support.paths import REPO
+
+SPEC = (REPO / "docs/spec/row.md").read_text(encoding="utf-8")
+
+
+def table(heading: str) -> list[list[str]]:
+    """Cells of the first table under a heading, without its head."""
+    section = SPEC.split(f"## {heading}\n")[1].split("\n## ")[0]
+    rows = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in row] for row in rows[2:]]
+
+
+def words(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_states_and_transitions():
+    described = {words(state)[0]: set(words(then)) for state, _, then in table("States of a take")}
+    assert described == {str(state): {str(s) for s in then} for state, then in TRANSITIONS.items()}
+    assert set(described) == {str(s) for s in RowState}
+
+
+def test_every_state_can_be_reached_and_left_or_is_an_end():
+    reached, todo = set(), [RowState.WAITING]
+    while todo:
+        state = todo.pop()
+        if state not in reached:
+            reached.add(state)
+            todo += TRANSITIONS[state]
+    assert reached == set(RowState)
+    ends = {s for s in RowState if not TRANSITIONS[s]}
+    assert ends == {RowState.COMMITTED, RowState.KEPT, RowState.REJECTED, RowState.STOPPED, RowState.FAILED}
+    assert all(RowState.FAILED in then for then in TRANSITIONS.values() if then)
+
+
+def test_messages_exist():
+    known = {
+        "Pi": vars(messages), "receivers": vars(receiver_words), "cards": Code.__members__, "radars": vars(RadarControl)
+    }  # fmt: skip
+    for state, party, said in table("Messages"):
+        assert words(state)[0] in set(RowState)
+        assert words(said)
+        for word in words(said):
+            assert word in known[party.split()[0]], (party, word)
+
+
+def test_radar_backends_and_states_are_described():
+    controls = Radar.__annotations__["control"]
+    assert [words(row[0])[0] for row in table("Radars")] == re.findall(r"\w+", controls)[1:]
+    assert all(f"`{state.name}`" in SPEC for state in RadarState)
+
+
+@pytest.mark.parametrize("state", list(RowState))
+def test_only_the_transitions_of_the_table_are_made(state):
+    for then in RowState:
+        told: list[RowState] = []
+        transaction = RowTransaction(told.append)
+        transaction.state = state
+        if then in TRANSITIONS[state]:
+            transaction.to(then)
+            assert told == [RowState.WAITING, then]
+        else:
+            with pytest.raises(ScanError, match=f"from {state} to {then}"):
+                transaction.to(then)

@@ -1,0 +1,284 @@
+"""However a scan ends, the rig is left at rest, nothing moves unasked, and the error says what is safe."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from types import SimpleNamespace
+
+import msgspec
+import pytest
+import tomli_w
+
+from polysight.host.acquisition import scan_loop as running
+from polysight.host.acquisition.control import StopRequest, hangups_pass
+from polysight.host.acquisition.pi_client import PiClient
+from polysight.host.acquisition.ready import make_ready
+from polysight.host.acquisition.scan import resume_scan, run_scan
+from polysight.host.jobs import live_scan as live
+from polysight.host.jobs import live_scan as progress
+from polysight.host.process.request import Options
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared import messages as m
+from polysight.shared.errors import DeviceError, PolysightError, ScanError, os_error
+from polysight.shared.faults import explain
+from polysight.shared.tables import to_builtins
+from tests.support.acquisition.receivers import receiver_of
+
+
+def commands(pi) -> list[type]:
+    return [type(c) for c in pi.commands if not isinstance(c, m.Status | m.Replay | m.Alive)]
+
+
+# --- what moves by itself ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", [102, 109])
+def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig, tmp_path, fault):
+    """The Pi ends row 1 with it and is in `fault` then, as after an emergency stop."""
+    rig.pi.fail_rows[1, 1], rig.pi.latched = fault, "stage alarm 14: the emergency stop is pressed"
+    phases = []
+    with pytest.raises(ScanError, match=explain(fault).what) as e:
+        run_scan(rig.instrument, tmp_path / "s", progress=lambda p: phases.append(p.phase))
+    assert "retake" not in phases
+    assert rig.pi.latched in e.value.what
+    assert e.value.remedy.startswith(explain(fault).remedy)
+    assert f"1 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
+    assert commands(rig.pi).count(m.Home) == 1, "the one at the start"
+    assert commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
+    ended = ScanFolder.load(tmp_path / "s").facts("scan_ended")[0]
+    assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
+
+
+@pytest.mark.parametrize(("fault", "homes"), [(102, 0), (109, 1)])
+def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp_path, fault, homes):
+    rig.pi.state, rig.pi.fault, rig.pi.latched = "fault", fault, "told"
+    if homes:
+        assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
+    else:
+        with pytest.raises(ScanError, match=explain(fault).what) as e:
+            run_scan(rig.instrument, tmp_path / "s")
+        assert "polysight-pi home" in e.value.remedy
+    assert commands(rig.pi).count(m.Home) == homes
+
+
+def test_fault_of_a_row_alone_is_retaken_without_homing(rig, tmp_path):
+    rig.pi.fail_rows[1, 1] = 108
+    assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
+    assert commands(rig.pi).count(m.Home) == 1
+
+
+def test_pi_started_anew_between_rows_ends_the_scan_at_once(rig, tmp_path):
+    def told(p) -> None:
+        if p.phase == "committed" and p.row == 1:
+            rig.pi.run, rig.pi.homed, rig.pi.state = None, False, "idle"
+
+    with pytest.raises(ScanError, match="started anew") as e:
+        run_scan(rig.instrument, tmp_path / "s", progress=told)
+    assert "2 of 4 rows are safe" in e.value.remedy
+    assert commands(rig.pi).count(m.Home) == 1
+    assert resume_scan(tmp_path / "s").exit_status == "success"
+    assert commands(rig.pi).count(m.Home) == 2, "somebody asked for it"
+
+
+def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
+    def told(p) -> None:
+        if p.phase == "committed" and p.row == 1:
+            rig.pi.run = msgspec.structs.replace(rig.pi.run, scan_id="another")
+
+    with pytest.raises(ScanError, match="another run meanwhile: another"):
+        run_scan(rig.instrument, tmp_path / "s", progress=told)
+    assert m.Abort not in commands(rig.pi)
+
+
+@pytest.mark.parametrize("state", ["idle", "homed"])
+def test_stage_that_is_not_ready_between_rows_is_not_homed(rig, tmp_path, state):
+    def told(p) -> None:
+        if p.phase == "committed" and p.row == 1:
+            rig.pi.homed, rig.pi.state = state == "homed", state
+
+    with pytest.raises(ScanError, match=f"'{state}' between two rows") as e:
+        run_scan(rig.instrument, tmp_path / "s", progress=told)
+    assert "polysight-pi home" in e.value.remedy
+    assert commands(rig.pi).count(m.Home) == 1
+
+
+def test_homing_that_somebody_else_began_is_waited_for():
+    states = iter(["homing", "homing", "ready"])
+    status = SimpleNamespace(scan_id="s", homed=True, fault=0, reason="")
+    socket = SimpleNamespace(poll=lambda _: None)
+
+    def asked():
+        return SimpleNamespace(**vars(status), state=next(states))
+
+    pi = SimpleNamespace(status=asked, event_socket=socket, events=list, home=None)
+    assert make_ready(pi, StopRequest(), lambda *_: None, "s", first=False)
+
+
+# --- what is left behind ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("board", ["RH", "RV"])
+def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, tmp_path, board):
+    """Whichever board it is of; the Pi is told, and rows that wait for processing come after the message."""
+    rig.pi.hang_at = {1}
+    told, said_at_end = [], []
+    release = threading.Event()
+
+    def progress(p) -> None:
+        told.append(p.phase)
+        if p.phase == "state" and (p.state, p.row) == ("running", 1):
+            os.kill(receiver_of(board), signal.SIGKILL)
+        if p.phase == "end":
+            said_at_end.append((release.is_set(), p.message))
+            release.set()
+
+    with pytest.raises(DeviceError, match=f"{board}: the receiving process ended") as e:
+        run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: release.wait(60) and None, progress=progress)
+    assert "1 of 4 rows are safe" in e.value.remedy
+    assert commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
+    assert rig.pi.hanging is None
+    scan = ScanFolder.load(tmp_path / "s")
+    assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
+    assert said_at_end == [(False, f"{e.value.what}; 1 rows wait to be processed")]
+
+
+def test_error_of_any_kind_says_what_is_safe(rig, tmp_path, monkeypatch):
+    def commit(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(running, "commit_row", commit)
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)) as e:
+        run_scan(rig.instrument, tmp_path / "s")
+    safe = f"0 of 4 rows are safe; `polysight resume {tmp_path / 's'}` goes on from there"
+    assert e.value.__notes__ == [safe]
+    assert os_error(e.value).remedy.endswith(safe)
+
+
+def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):
+    def told(p) -> None:
+        if p.phase == "committed" and p.row == 1:
+            rig.pi.lose_replies = 10_000
+
+    with pytest.raises(DeviceError, match="did not answer") as e:
+        run_scan(rig.instrument, tmp_path / "s", progress=told)
+    assert f"2 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
+
+
+# --- a display that fails ---------------------------------------------------------------------------------------------
+
+
+def test_progress_that_cannot_be_told_ends_no_scan(rig, tmp_path):
+    calls = []
+
+    def told(p) -> None:
+        calls.append(p)
+        if p.state == "running":
+            raise OSError(28, "No space left on device")
+
+    result = run_scan(rig.instrument, tmp_path / "s", progress=told)
+    assert result.exit_status == "success"
+    assert calls[-1].state == "running", "told no more"
+    assert [w for w in result.warnings if "No space left" in w]
+
+
+class FullDisk(io.StringIO):
+    """A log on a disk that is full from `break_off` on."""
+
+    def break_off(self) -> None:
+        self.write = self.refuse
+
+    def refuse(self, *_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class ClosedPipe(io.TextIOWrapper):
+    """A pipe whose reader ends at `break_off`."""
+
+    def __init__(self) -> None:
+        self._read, write = os.pipe()
+        super().__init__(io.FileIO(write, "w"), write_through=True)
+
+    def break_off(self) -> None:
+        os.close(self._read)
+
+
+@pytest.mark.parametrize("kind", [FullDisk, ClosedPipe])
+def test_scan_whose_messages_nobody_reads_is_made_and_processed(rig, tmp_path, monkeypatch, kind):
+    """In row 1 the terminal goes, and with it stdout and stderr."""
+    config = tmp_path / "rig.toml"
+    config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
+    made, streams = [], [kind(), kind()]
+    monkeypatch.setattr(live, "_check_options", lambda *_: None)
+    monkeypatch.setattr(live, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
+    monkeypatch.setattr(live, "make_products", lambda *given: made.append(given) or SimpleNamespace(summary=str))
+    update = progress.ScanBar.update
+
+    def updated(bar, p) -> None:
+        if (p.phase, p.state, p.row) == ("state", "running", 1):
+            os.kill(os.getpid(), signal.SIGHUP)
+            for stream in streams:
+                stream.break_off()
+        update(bar, p)
+
+    monkeypatch.setattr(progress.ScanBar, "update", updated)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", streams[0])
+        patch.setattr(sys, "stdout", streams[1])
+        with suppress(OSError):  # of the summary, which comes last
+            live.scan(config, tmp_path / "s", None, Options(), False, True)
+    for stream in streams:
+        stream.close()
+    assert validate(tmp_path / "s") == []
+    assert len(made) == 1
+
+
+def test_lost_terminal_is_ignored_and_then_as_before():
+    heard = []
+    before = signal.signal(signal.SIGHUP, lambda *_: heard.append(1))
+    try:
+        with hangups_pass():
+            os.kill(os.getpid(), signal.SIGHUP)
+            time.sleep(0.01)
+        assert heard == []
+        os.kill(os.getpid(), signal.SIGHUP)
+        time.sleep(0.01)
+        assert heard == [1]
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("error", [ValueError("oops"), ScanError("no images", "", "look")])
+def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_path, monkeypatch, capsys, error):
+    config = tmp_path / "rig.toml"
+    config.write_text(tomli_w.dumps(to_builtins(rig.instrument)))
+    monkeypatch.setattr(live, "_check_options", lambda *_: None)
+
+    def broken(*_: object, **__: object):
+        raise error
+
+    monkeypatch.setattr(live, "Pipeline", broken)
+    with pytest.raises(PolysightError, match=r"oops|no images") as e:
+        live.scan(config, tmp_path / "s", None, Options(), False, True)
+    assert "every row is committed" in capsys.readouterr().out
+    assert f"polysight process {tmp_path / 's'}" in e.value.remedy
+
+
+def test_a_whole_scan_does_not_fail_because_the_pi_could_not_be_told(rig, tmp_path, monkeypatch):
+    """Its disk is full, say: every row is committed, and what follows has all it needs."""
+
+    def refused(*_):
+        raise DeviceError("the Pi did not write it down", "its disk is full", "remove old journals")
+
+    monkeypatch.setattr(PiClient, "end_run", refused)
+    result = run_scan(rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.folder.complete) == ("success", True)
+    assert any("could not be told" in w for w in result.warnings)
+    assert [f["exit_status"] for f in result.folder.facts("scan_ended")] == ["success"]

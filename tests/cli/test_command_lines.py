@@ -1,0 +1,114 @@
+"""Command lines that would do less than they say are refused, and numbers are asked for in words."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from pathlib import Path
+
+import pytest
+
+from polysight.host.cli.main import build_parser, main
+from polysight.host.cli.options import joined
+from polysight.host.materials.library import SIMULATED_LIBRARY
+from polysight.host.report import write_json
+
+E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}
+SEGMENTS = [
+    {"label": 1, "name": "copper", "confidence": None, "metal_like": True, "permittivity": None},
+    {"label": 2, "name": "PET", "confidence": 0.62, "metal_reference": False, "permittivity": E},
+    {"label": 3, "name": None, "confidence": None, "metal_reference": False, "permittivity": E | {"real_std": None}},
+]
+
+
+@pytest.fixture
+def scan(tmp_path) -> Path:
+    """A folder as a scan that was processed, with what these commands read of it."""
+    products = tmp_path / "scan" / "products"
+    write_json(products / "materials.json", {"scan_id": "s7", "simulated": True, "segments": SEGMENTS})
+    (products / "report.html").write_text("<p>here</p>")
+    return tmp_path / "scan"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["train", "scans/a", "--authors", "data", "--out", "l.npz"], "DATA and --authors together"),
+        (["train", "--simulate", "s", "--authors", "data", "--out", "l.npz"], "--simulate and --authors together"),
+        (["classify", str(SIMULATED_LIBRARY), "--library", "l.npz"], "--library and --model would do nothing"),
+        (["classify", str(SIMULATED_LIBRARY), "--model", "knn"], "--library and --model would do nothing"),
+        (["permittivity", "out", "--bands", "3"], "--bands without --layer"),
+        (["permittivity", "out", "--amplitude", "5"], "--amplitude without --layer"),
+        (["process", "scan", "--out", "o", "--reference-by", "mean"], "--reference-by mean without --reference"),
+        (["scan", "--out", "o", "--no-process", "--metal", "0,0,9,9"], "--metal with --no-process"),
+        (["resume", "s", "--no-process", "--labels", "x", "--model", "knn"], "--labels and --model with --no-process"),
+        (["process", "scan", "--out", "o", "--library", "l.npz", "--model", "none"], "--library with --model none"),
+        (["process", "scan", "--out", "o", "--reference-by", "position"], "--reference-by position without"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(words, said, capsys):
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert "\n  why: " in told
+    assert "\n  do: " in told
+
+
+def refusal(*words: str) -> str:
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said), pytest.raises(SystemExit):
+        build_parser().parse_args(words)
+    return said.getvalue().splitlines()[-1]
+
+
+@pytest.mark.parametrize("text", ["many", "-1", "1e9", ""])
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        (["calibrate", "direct-path", "s", "--prior"], "a length above 0, at most 50 mm"),
+        (["doctor", "--bursts"], "a whole number from 1 to 16"),
+        (["card", "--listen"], "a number of seconds from 0 to 3600"),
+        (["permittivity", "o", "--amplitude"], "a percentage from 0 to 100"),
+        (["concentration", "l", "--confidence"], "a share from 0.5 to below 1"),
+    ],
+)
+def test_a_number_that_is_none_is_refused_in_words(words, rule, text):
+    assert refusal(*words[:-1], f"{words[-1]}={text}").endswith(f"{text} is not {rule}")
+
+
+@pytest.mark.parametrize(
+    ("words", "value"),
+    [(["--metal", "-45,0,40,40"], (-65, -20, -25, 20)), (["--metal", "45,-10,40,40"], (25, -30, 65, 10)),
+     (["--metal=-45,0,40,40"], (-65, -20, -25, 20)), (["--metal", "-.5,-1,1,2"], (-1, -2, 0, 0))],
+)  # fmt: skip
+def test_a_place_left_of_the_middle_needs_no_equals_sign(words, value):
+    given = joined(["process", "scan", *words, "--out", "o"])
+    assert build_parser().parse_args(given).metal == value
+
+
+def test_other_words_are_left_as_they_are():
+    words = ["process", "-x", "--out", "-o", "--json", "-1", "--a=b", "-1,2", "-1,2"]
+    assert joined(words) == words
+
+
+def test_materials_of_a_scan_or_of_its_products(scan, capsys):
+    assert main(["materials", str(scan), str(scan / "products")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{scan / 'products'}: simulated scan s7"
+    assert lines[:4] == lines[4:]
+    assert lines[1].split() == ["1", "copper", "metal-like"]
+    assert lines[2].split() == ["2", "PET", "62", "%", "4.50", "-", "j", "0.40", "+-", "0.07"]
+    assert lines[3].split() == ["3", "not", "named", "4.50", "-", "j", "0.40"]
+    assert main(["materials", str(scan), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["segments"] == SEGMENTS
+    (scan / "products" / "materials.json").unlink()
+    assert main(["materials", str(scan)]) == 3
+
+
+def test_where_the_report_is(scan, capsys):
+    for folder in (scan, scan / "products"):
+        assert main(["report", str(folder)]) == 0
+        assert capsys.readouterr().out == f"report:   {scan / 'products' / 'report.html'}\n"
+    (scan / "products" / "report.html").unlink()
+    assert main(["report", str(scan)]) == 3, "it is made again from the raw rows, and there are none"

@@ -1,0 +1,45 @@
+"""Sub-bands of the sweep: they cover it, overlap by half, and a mirror is as flat in each as in the whole."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from polysight.host.imaging.images import LEAST_SAMPLES, sub_bands
+from polysight.host.materials.layers import Spectrum
+from polysight.shared.errors import ConfigError
+from tests.support.rigs import published_rig
+
+CHIRP = published_rig().chirp
+
+
+@given(st.integers(1, 15))
+def test_they_cover_the_linear_samples_and_overlap_by_half(count):
+    bands = sub_bands(CHIRP, count)
+    first, last = CHIRP.linear_samples
+    assert len(bands) == count
+    assert (bands[0].samples[0], bands[-1].samples[1]) == (first, last)
+    length = 2 * (last - first) / (count + 1)
+    for band in bands:
+        a, b = band.samples
+        assert abs(b - a - length) <= 1
+        assert b - a >= LEAST_SAMPLES - 1
+        assert band.last_hz - band.first_hz == pytest.approx((b - a - 1) * CHIRP.hz_per_sample)
+    starts = [band.samples[0] for band in bands]
+    np.testing.assert_allclose(np.diff(starts), length / 2, atol=1)
+
+
+@given(st.integers(1, 15))
+def test_the_model_of_a_layer_averages_over_the_same_frequencies(count):
+    spectrum = Spectrum.of(CHIRP, count)
+    for band, hz, weight in zip(sub_bands(CHIRP, count), spectrum.frequency_hz, spectrum.weight, strict=True):
+        middle = (band.first_hz + band.last_hz) / 2
+        assert np.sum(hz * weight) == pytest.approx(middle, abs=2 * CHIRP.hz_per_sample)  # whole samples
+        assert band.first_hz - 2 * CHIRP.hz_per_sample <= hz.min()
+        assert hz.max() <= band.last_hz + 2 * CHIRP.hz_per_sample
+
+
+@pytest.mark.parametrize("count", [0, -1, 16, 1000])
+def test_too_many_are_refused(count):
+    with pytest.raises(ConfigError, match="sub-bands"):
+        sub_bands(CHIRP, count)

@@ -1,0 +1,235 @@
+"""Many scans at once: each on its own, finished ones passed over, a failing one alone, a table at the end."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.host.jobs import batch as many
+from polysight.host.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of, table
+from polysight.host.process.request import ProcessRequest
+from polysight.host.products.files import FINISHED
+from polysight.shared.errors import ConfigError
+from tests.support.rigs import published_rig
+
+WORKER = """
+import json, os, sys, time
+from pathlib import Path
+import msgpack
+job = msgpack.unpackb(sys.stdin.buffer.read())  # plain data: without the host's imports, which take seconds
+out = Path(job["request"]["out"])
+out.mkdir(parents=True, exist_ok=True)
+with (out.parent / "runs.txt").open("a") as f:
+    f.write(out.name + "\\n")
+if out.name == "bad":
+    sys.exit("no row is recorded whole\\n  why: it is bad\\n  do: nothing")
+if out.name == "killed":
+    os.kill(os.getpid(), 9)
+if out.name == "slow":
+    time.sleep(600)
+for name in ("image.npz", "quality.json"):
+    (out / name).write_text("{}")
+(out / ".finished.json").write_text(json.dumps({"made_with": job["made_with"], "memory_gb": 0.5}))
+"""
+
+
+@pytest.fixture
+def worker(tmp_path, monkeypatch):
+    """In place of the program that processes a scan: one that does as the scan's name says."""
+    file = tmp_path / "worker.py"
+    file.write_text(WORKER)
+    monkeypatch.setattr(many, "PROGRAM", (sys.executable, str(file)))
+
+
+def scans(folder, *names):
+    for name in names:
+        (folder / name).mkdir(parents=True)
+        (folder / name / "data_collection_cfg.json").write_text('{"total_x": 5, "total_y": 4}')
+    return [folder / n for n in names]
+
+
+def request(data, out, **options):
+    text = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
+    return ProcessRequest(data=str(data), out=str(out / data.name), **text)
+
+
+def jobs(folder, *names, **options):
+    found = scans_of([folder])
+    assert sorted(p.name for p in found) == sorted(names)
+    return jobs_of([request(data, folder.parent / "out", **options) for data in found])
+
+
+def runs(folder):
+    return sorted((folder / "out" / "runs.txt").read_text().split())
+
+
+@pytest.mark.usefixtures("worker")
+def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not_finished(tmp_path, capsys):
+    names = ("a", "bad", "c", "killed")
+    scans(tmp_path / "in", *names)
+    first = process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
+    assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
+    assert [o.name for o in first] == list(names)
+    told = {o.name: o.message for o in first}
+    assert told["bad"] == "no row is recorded whole"
+    assert "signal 9" in told["killed"]
+    assert first[0].memory_gb == 0.5
+    assert runs(tmp_path) == sorted(names)
+    summary = json.loads((tmp_path / "out" / "processed.json").read_text())
+    assert [s["status"] for s in summary["scans"]] == ["done", "failed", "done", "failed"]
+
+    again = process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
+    assert [o.status for o in again] == ["skipped", "failed", "skipped", "failed"]
+    assert runs(tmp_path) == sorted([*names, "bad", "killed"])
+    assert "2 finished before, 2 to process" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
+    (folder,) = scans(tmp_path / "in", "a")
+    library, rig = tmp_path / "library.npz", tmp_path / "rig.toml"
+    library.write_bytes(b"1")
+    rig.write_text("1")
+
+    def job(config=rig, **changes):
+        options = {"library": library, "config": config, **changes}
+        return jobs_of([request(folder, tmp_path / "out", **options)])[0]
+
+    assert not finished(job())
+    process_many([job()], tmp_path / "out", 1)
+    assert finished(job())
+    assert not finished(job(metal_box_mm=(0.0, 0.0, 1.0, 1.0)))
+    assert not finished(job(library=None))
+    assert not finished(job(config=None))
+    library.write_bytes(b"2")
+    assert not finished(job())
+    library.write_bytes(b"1")
+    assert finished(job())
+    rig.write_text("2")
+    assert not finished(job())
+    rig.write_text("1")
+    (folder / "0_0.bin").write_bytes(b"more")
+    assert not finished(job())
+    (folder / "0_0.bin").unlink()
+    assert finished(job())
+    (tmp_path / "out" / "a" / "image.npz").unlink()
+    assert not finished(job())
+    process_many([job()], tmp_path / "out", 1, again=True)
+    (tmp_path / "out" / "a" / FINISHED).write_text("[1]")
+    assert not finished(job())
+
+
+@pytest.mark.usefixtures("worker")
+def test_ended_early_its_programs_end_too(tmp_path):
+    scans(tmp_path / "in", "slow", "slow2")
+    todo = jobs(tmp_path / "in", "slow", "slow2")
+    results = many.run_here(todo, 2)
+    first = next(results)  # slow2, which is not slow
+    assert (first.name, first.status) == ("slow2", "done")
+    results.close()  # else this takes the 600 s that it sleeps, more than a test may
+    assert not finished(todo[0])
+
+
+def test_names_folders_and_what_is_a_scan(tmp_path):
+    found = scans(tmp_path / "unsynced", "s1", "s2")
+    (tmp_path / "unsynced" / "notes").mkdir()
+    raw = tmp_path / "raw" / "s1"
+    raw.mkdir(parents=True)
+    (raw / "RH_synced.npy").touch()
+    assert scans_of([tmp_path / "unsynced"]) == found
+    assert scans_of([raw, found[1]]) == [raw, found[1]]
+    assert scans_of([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
+    with pytest.raises(ConfigError, match="two scans are named s1"):
+        jobs_of([request(found[0], tmp_path / "out"), request(raw, tmp_path / "out")])
+
+
+def test_scans_at_a_time_follow_cores_and_memory():
+    need = memory_bytes(70_000)
+    assert at_once(70_000, cores=8, free_bytes=100 * need) == 8
+    assert at_once(70_000, cores=8, free_bytes=3 * need) == 2
+    assert at_once(70_000, cores=8, free_bytes=0) == 1
+    assert many.free_memory_bytes() > 0
+    assert many.cores() >= 1
+
+
+def test_the_table_names_every_scan_and_counts(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "quality.json").write_text('{"boards": {"RH": {"positions": 200, "positions_masked": 3}}}')
+    (tmp_path / "a" / "materials.json").write_text('{"segments": [1, 2]}')
+    text = table([Outcome("a", "done", 61.0, 0.54), Outcome("b", "failed", 2.0, 0.0, "broken")], tmp_path)
+    head, a, b, end = text.splitlines()
+    assert head.split() == ["scan", "result", "seconds", "memory", "masked", "patches"]
+    assert a.split() == ["a", "done", "61", "0.5", "GB", "1.5", "%", "2"]
+    assert b.split() == ["b", "failed", "2", "broken"]
+    assert "2 scans: 1 done, 1 failed" in end
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_wrong_folder_fails_and_the_status_says_so(tmp_path, capsys):
+    scans(tmp_path / "in", "a", "bad")
+    command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
+    assert main([*command, "--jobs", "1"]) == 1
+    assert "2 scans: 1 done, 1 failed" in capsys.readouterr().out
+    assert main([*command[:2], "--out", str(tmp_path / "one")]) != 0  # a single one as ever: no worker, its own error
+    assert "out/one" not in capsys.readouterr().out
+    (tmp_path / "file").touch()
+    assert main([*command[:3], "--out", str(tmp_path / "file")]) == 2
+
+
+def test_without_dask_the_line_that_installs_it_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "dask", None)
+    monkeypatch.setitem(sys.modules, "dask.distributed", None)
+    scans(tmp_path / "in", "a")
+    command = ["process", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--dask", "tcp://127.0.0.1:1"]
+    assert main(command) == 2
+    assert "pip install 'polysight[dask]'" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_dask_cluster_does_the_same(tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
+    scans(tmp_path / "in", "a", "bad", "c")
+    todo = jobs(tmp_path / "in", "a", "bad", "c")
+    # Threads of this process stand for the workers: the programs they start are their own all the same.
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, protocol="tcp"
+    ) as cluster:
+        outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
+    assert [o.status for o in outcomes] == ["done", "failed", "done"]
+    assert all(finished(j) == (j.name != "bad") for j in todo)
+    with pytest.raises(ConfigError, match="no Dask scheduler"):
+        list(many.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
+
+
+@pytest.mark.timeout(900)
+def test_real_scans_end_to_end(tmp_path, capsys):
+    """A simulated scan and a damaged one by the real program; then the mark holds."""
+    from polysight.simulators.scene import decode_scene, simulate
+
+    rig = published_rig()
+    scene = {
+        "name": "plate",
+        "grid": {"columns": 13, "rows": 15, "step_x_mm": 16.0, "step_y_mm": 8.0},
+        "burst": {"pulses": 2},
+        "image": {"columns": 30, "rows": 30, "pixel_mm": 4.0},
+        "plates": [{"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}],
+    }
+    simulate(rig, decode_scene(scene, "t"), tmp_path, layout="authors")
+    broken = tmp_path / "unsynced" / "broken"
+    broken.mkdir()
+    (broken / "data_collection_cfg.json").write_text("{")
+    command = ["process", str(tmp_path / "unsynced"), "--out", str(tmp_path / "out")]
+    assert main(command) == 1
+    told = capsys.readouterr().out
+    assert "broken  failed" in told
+    assert "not JSON" in told
+    assert "plate   done" in told
+    assert (tmp_path / "out" / "plate" / "report.html").exists()
+    mark = json.loads((tmp_path / "out" / "plate" / FINISHED).read_text())
+    assert {"versions", "products", "options", "data"} == set(mark["made_with"])
+    assert len(mark["made_with"]["options"]["config"]) == 64  # digest of the rig file
+    (broken / "data_collection_cfg.json").unlink()
+    assert main(command) == 0
+    assert "1 skipped" in capsys.readouterr().out

@@ -1,0 +1,126 @@
+"""Sub-bands of patches: only what an image shows counts, and what all bands share does not average out with them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polysight.host.imaging import ChannelImages
+from polysight.host.imaging.images import SubBand
+from polysight.host.materials.analyse import MetalChoice
+from polysight.host.materials.layers import Bands, Layer, fit_layer
+from polysight.host.materials.sub_bands import band_rows, bands_of_row
+from polysight.host.polarimetry import fresnel, ratio_from_permittivity
+from tests.support.rigs import published_rig
+
+THETA = np.radians(55.0)
+BAND = SubBand((0, 96), 76.3e9, 78.0e9)
+CHIRP = published_rig().chirp
+THICK = 4.0 - 0.4j
+INVERSE_STD = 0.01
+
+
+def channels(scene, valid) -> ChannelImages:
+    """Images as an image builder makes them: 0 where not valid."""
+    h, v = (np.where(valid, c, 0).astype(np.complex64) for c in (scene.h, scene.v))
+    ones = np.ones_like(h)
+    return ChannelImages(h, v, h, v, ones, ones, scene.x_m, scene.y_m, valid, {})
+
+
+@pytest.fixture(scope="module")
+def scene(synthetic):
+    return synthetic(3)
+
+
+@pytest.fixture(scope="module")
+def found(scene):
+    return scene.analyse()
+
+
+def half_of(mask):
+    """The left half of a region."""
+    columns = np.flatnonzero(mask.any(axis=0))
+    left = np.zeros_like(mask)
+    left[:, : int(np.median(columns))] = True
+    return mask & left
+
+
+def test_metal_that_a_sub_band_does_not_show_is_no_part_of_its_reference(scene, found):
+    everywhere = np.ones(scene.h.shape, bool)
+    without = everywhere & ~half_of(found.metal.mask)
+    whole, cut = (band_rows(found, [BAND], [channels(scene, at)], (0, 0), 1.5) for at in (everywhere, without))
+    for patch in found.patches:
+        (before,), (after,) = whole[patch.patch.label], cut[patch.patch.label]
+        assert after["amplitude_h"] == pytest.approx(before["amplitude_h"], rel=0.02)
+        assert complex(*after["ratio"].values()) == pytest.approx(complex(*before["ratio"].values()), rel=0.03)
+
+
+def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, found):
+    other = next(r for r in found.patches if r.patch.label != found.metal.label)
+    everywhere = np.ones(scene.h.shape, bool)
+    without = everywhere & ~half_of(other.patch.interior)
+    rows = [band_rows(found, [BAND], [channels(scene, at)], (0, 0), 1.5) for at in (everywhere, without)]
+    (before,), (after,) = (r[other.patch.label] for r in rows)
+    assert after["amplitude_h"] == pytest.approx(before["amplitude_h"], rel=0.02)
+
+
+def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, found):
+    everywhere = np.ones(scene.h.shape, bool)
+    images = [channels(scene, everywhere), channels(scene, everywhere & ~found.metal.mask)]
+    rows = band_rows(found, [BAND, BAND], images, (0, 0), 1.5)
+    for patch in found.patches:
+        there, gone = rows[patch.patch.label]
+        assert there["ratio"] is not None
+        assert (gone["ratio"], gone["inverse_ratio_std"], gone["amplitude_h"]) == (None, None, None)
+
+
+def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, found):
+    """The metal's box, and all others, are cut to the image."""
+    valid = ~half_of(found.metal.mask)
+    cut = replace(scene, h=np.where(valid, scene.h, 0), v=np.where(valid, scene.v, 0))
+    label = found.metal.label
+    whole, part = (
+        s.analyse(metal=MetalChoice(label=label), segmentation=found.segmentation, pair=s.pair.within(at))
+        for s, at in ((scene, np.ones_like(valid)), (cut, valid))
+    )
+    for before, after in zip(whole.rows(), part.rows(), strict=True):
+        assert after["amplitude_h"] == pytest.approx(before["amplitude_h"], rel=0.02)
+
+
+def row_of(ratio, parts):
+    """A segment of materials.json whose every part of the sweep says the same: a thick plate's."""
+    one = {
+        "ratio": {"real": ratio.real, "imag": ratio.imag},
+        "inverse_ratio_std": INVERSE_STD,
+        "amplitude_h": abs(fresnel(THICK, THETA)[0]),
+    }
+    return {"label": 1, **one, "bands": [one] * parts}
+
+
+def bands_of(ratio, parts) -> Bands:
+    found = bands_of_row(row_of(ratio, parts), CHIRP, parts)
+    assert found is not None
+    return found
+
+
+def test_errors_that_sub_bands_share_do_not_shrink_with_their_number():
+    """Metal, edges and size are off by the same in every band. A thick plate looks the same in all of them, so that
+    its permittivity has one error bar, however many they are."""
+    ratio = ratio_from_permittivity(THICK, THETA)
+    fits = [fit_layer(bands_of(ratio, parts), [Layer("plate")], THETA) for parts in (1, 2, 4, 8)]
+    for fit in fits[1:]:
+        assert fit.permittivity == pytest.approx(fits[0].permittivity, rel=1e-3)
+        assert fit.std_real == pytest.approx(fits[0].std_real, rel=0.05)
+        assert fit.std_loss == pytest.approx(fits[0].std_loss, rel=0.05)
+
+
+def test_error_bars_of_four_sub_bands_are_those_of_repeated_placements():
+    """Each placement has one error of V / H, the same in all of its sub-bands."""
+    rng, inverse = np.random.default_rng(4), 1 / ratio_from_permittivity(THICK, THETA)
+    fits = []
+    for _ in range(60):
+        error = INVERSE_STD * complex(*rng.standard_normal(2))
+        bands = replace(bands_of(1 / (inverse + error), 4), amplitude_h=None, sigma_h=None)
+        fits.append(fit_layer(bands, [Layer("plate")], THETA))
+    scatter = np.std([f.permittivity.real for f in fits])
+    assert scatter == pytest.approx(np.median([f.std_real for f in fits]), rel=0.3)

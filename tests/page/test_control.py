@@ -1,0 +1,156 @@
+"""Wishes from outside the scan's terminal: heard once, never by surprise later, and never at the scan's cost."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from polysight.host.acquisition import scan as host_run
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish, ask, last_sign_of_life
+from polysight.host.store import manifest
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.host.store.validate import validate
+from polysight.shared.errors import ScanError
+from tests.support.processes import wait_for
+from tests.support.store.small_scan import SmallScan
+
+
+@pytest.fixture
+def desk(tmp_path):
+    """A desk that is open for the folder of the test."""
+    stop = StopRequest()
+    with ControlDesk(tmp_path, stop) as made:
+        made.open()
+        wait_for((tmp_path / CONTROL / ALIVE).exists, "the first sign of life")
+        yield tmp_path, stop
+
+
+def test_wishes_are_heard_once(desk):
+    folder, stop = desk
+    ask(folder, Wish.PAUSE)
+    assert stop.paused
+    ask(folder, Wish.CONTINUE)
+    assert not stop.paused
+    assert not stop.after_row
+    ask(folder, Wish.STOP)
+    assert (stop.after_row, stop.now) == (True, False)
+    ask(folder, Wish.STOP)  # a double click, or two phones
+    assert (stop.after_row, stop.now) == (True, False)
+    ask(folder, Wish.ABORT)
+    assert stop.now
+
+
+def test_abort_is_now(desk):
+    folder, stop = desk
+    ask(folder, Wish.ABORT)
+    assert stop.now
+
+
+def test_a_shell_s_touch_is_a_wish(desk):
+    folder, stop = desk
+    (folder / CONTROL / "pause").touch()
+    wait_for(lambda: stop.paused, "the pause")
+
+
+def test_signs_of_life_go_on_and_the_folder_goes_with_the_desk(tmp_path):
+    assert last_sign_of_life(tmp_path) is None
+    with ControlDesk(tmp_path, StopRequest()) as desk:
+        desk.open()
+        desk.open()
+        wait_for(lambda: last_sign_of_life(tmp_path), "the first sign")
+        first = last_sign_of_life(tmp_path)
+        wait_for(lambda: last_sign_of_life(tmp_path) != first, "the next sign")
+    assert not (tmp_path / CONTROL).exists()
+
+
+def test_what_was_asked_of_an_earlier_scan_is_forgotten(tmp_path):
+    (tmp_path / CONTROL).mkdir()
+    for wish in Wish:
+        (tmp_path / CONTROL / wish).touch()
+    stop = StopRequest()
+    with ControlDesk(tmp_path, stop) as desk:
+        desk.open()
+        wait_for(lambda: last_sign_of_life(tmp_path), "the first sign")
+        ask(tmp_path, Wish.CONTINUE)
+    assert (stop.after_row, stop.paused) == (False, False)
+
+
+def test_a_desk_that_was_not_opened_touches_nothing(tmp_path):
+    with ControlDesk(tmp_path, StopRequest()):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nobody_there_is_said(tmp_path):
+    with pytest.raises(ScanError, match="nobody can be asked to pause"):
+        ask(tmp_path, Wish.PAUSE)
+
+
+def test_a_wish_that_is_not_heard_is_withdrawn(tmp_path):
+    (tmp_path / CONTROL).mkdir()
+    with pytest.raises(ScanError, match="did not hear abort"):
+        ask(tmp_path, Wish.ABORT, limit_s=0.2)
+    assert list((tmp_path / CONTROL).iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
+    with ControlDesk(tmp_path / "not" / "there", StopRequest()) as desk:
+        desk.open()
+        with pytest.raises(ScanError):
+            ask(tmp_path / "not" / "there", Wish.PAUSE)
+
+
+def facts(path: Path) -> list[str]:
+    return [f["fact"] for f in manifest.read(path / MANIFEST).facts]
+
+
+def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
+    """A scan with its stop request; `at_row_1` is called when row 0 is committed."""
+    scan = SmallScan(samples, folder)
+
+    def told(progress) -> None:
+        if progress.phase == "committed" and progress.row == 0:
+            at_row_1()
+
+    with scan._connected():
+        host_run.run_scan(samples.instrument, scan.path, stop=stop, progress=told)
+    return scan
+
+
+def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, tmp_path):
+    stop = StopRequest()
+
+    def pause() -> None:
+        stop.paused = True
+        threading.Thread(target=go_on).start()
+
+    def go_on() -> None:
+        wait_for(lambda: "scan_paused" in facts(tmp_path / "scan"), "the pause in the manifest")
+        stop.paused = False
+
+    scan = scan_with(samples, tmp_path, stop, pause)
+    told = [f for f in facts(scan.path) if f != "radars"]
+    assert told[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
+    assert told[4:] == ["row_committed", "row_committed", "scan_ended"]
+    assert validate(scan.path) == []
+    rows, others = ScanFolder.load(scan.path).committed(), ScanFolder.load(finished).committed()
+    assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in others.items()}
+
+
+def test_a_paused_scan_can_be_stopped(samples, tmp_path):
+    stop = StopRequest()
+
+    def pause() -> None:
+        stop.paused = True
+        threading.Thread(target=end).start()
+
+    def end() -> None:
+        wait_for(lambda: "scan_paused" in facts(tmp_path / "scan"), "the pause in the manifest")
+        stop.request()
+
+    scan = scan_with(samples, tmp_path, stop, pause)
+    assert facts(scan.path)[-1] == "scan_ended"
+    assert list(ScanFolder.load(scan.path).committed()) == [0]
+    assert scan.run().exit_status == "success"

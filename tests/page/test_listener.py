@@ -1,0 +1,152 @@
+"""The Pi is heard and never asked."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import msgspec
+import pytest
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from polysight.host.page.listener import PiListener
+from polysight.shared import messages as m
+from polysight.shared.raster import plan_raster
+from polysight.shared.sockets import EVENT_TOPIC, publisher
+from tests.support.paths import REPO
+from tests.support.processes import wait_for
+from tests.support.rigs import published_rig
+
+RIG = published_rig()
+OF = {"scan_id": "mine", "t_mono_ns": 1}
+
+
+@pytest.fixture
+def pi(tmp_path):
+    """The events' end of a Pi, and who listens to it."""
+    context = zmq.Context()
+    events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
+    address = events.getsockopt_string(zmq.LAST_ENDPOINT)
+    addresses = {"event_address": address, "command_address": "tcp://127.0.0.1:1"}  # nobody could answer there
+    instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **addresses))
+    listener = PiListener(instrument, "mine")
+
+    def tell(*told: m.AnyEvent) -> None:
+        for event in told:
+            events.send_multipart([EVENT_TOPIC, m.pack(event)])
+
+    def beat() -> float:
+        tell(m.Heartbeat(**OF, seq=0, state="ready", period_ms=100))
+        return listener.heard.heard_s
+
+    wait_for(beat, "the first event")
+    yield tell, listener
+    listener.close()
+    context.destroy(linger=0)
+
+
+def capture(point: int, scan: str = "mine") -> m.Capture:
+    return m.Capture(
+        **OF | {"scan_id": scan}, seq=3, row_index=7, take=2, point=point, column=point, edge_ns=0, first_pulse_ns=0,
+        last_pulse_ns=0, pulses=1, width_max_ns=0, jitter_ns=0,
+    )  # fmt: skip
+
+
+def finished(status: m.RowStatus) -> m.RowFinished:
+    return m.RowFinished(**OF, seq=9, row_index=7, take=2, status=status, points=1, edges=1, bursts=1, pulses=1)
+
+
+def test_where_the_stage_is_in_the_rig_frame(pi):
+    tell, listener = pi
+    tell(m.StageStatus(**OF, seq=1, state="run", x_mm=RIG.stage.centre_x_mm - 3, y_mm=RIG.stage.centre_y_mm + 5))
+    wait_for(lambda: listener.heard.x_mm is not None, "the stage")
+    assert (listener.heard.x_mm, listener.heard.y_mm) == (-3.0, 5.0)
+
+
+def test_a_row_as_it_runs_and_nobody_else_s(pi):
+    tell, listener = pi
+    tell(m.RowStarted(**OF, seq=2, row=plan_raster(RIG.grid).row(7), take=2), capture(0), capture(1, "another"))
+    wait_for(lambda: listener.heard.point, "a point")
+    tell(capture(4))
+    wait_for(lambda: listener.heard.point == 5, "the newest point")
+    assert (listener.heard.row, listener.heard.take, listener.heard.state) == (7, 2, "running")
+    tell(finished("done"))
+    wait_for(lambda: listener.heard.row == -1, "the row's end")
+
+
+def test_faults_stay_until_a_row_ends_well(pi):
+    tell, listener = pi
+    tell(m.Fault(**OF, seq=4, number=101, what="the stage does not answer"))
+    wait_for(lambda: listener.heard.faults, "the fault")
+    tell(finished("fault"), m.Heartbeat(**OF, seq=9, state="fault", period_ms=100))
+    wait_for(lambda: listener.heard.state == "fault", "the state")
+    assert listener.heard.faults[0].level == "bad"
+    tell(finished("done"))
+    wait_for(lambda: not listener.heard.faults, "that it is over")
+
+
+def test_words_of_strangers_are_named_and_survived(pi):
+    tell, listener = pi
+    before = listener.heard
+    listener._take(b"\xc1 no message")
+    assert listener.heard.deaf is not None
+    assert listener.heard.deaf.do or listener.heard.deaf.why
+    assert (listener.heard.row, listener.heard.state) == (before.row, before.state)
+    tell(m.Heartbeat(**OF, seq=0, state="idle", period_ms=100))
+    wait_for(lambda: listener.heard.state == "idle", "the next event")
+    assert listener.heard.deaf is None
+
+
+def test_without_keys_the_view_is_deaf_and_says_so(tmp_path):
+    elsewhere = {"event_address": "tcp://192.0.2.1:5602", "key_dir": str(tmp_path)}
+    instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **elsewhere))
+    listener = PiListener(instrument, "mine")
+    wait_for(lambda: listener.heard.deaf, "why nothing is heard")
+    assert str(tmp_path) in listener.heard.deaf.do, "where they belong"
+    listener.close()
+
+
+LOOKER = """
+import sys, zmq
+from pathlib import Path
+from polysight.shared.sockets import observer
+socket = observer(zmq.Context(), sys.argv[1], Path())
+while True:
+    socket.recv_multipart()
+"""
+
+
+def test_the_pi_forgets_a_view_that_hangs(tmp_path):
+    """Its queue for that subscriber does not grow for ever."""
+    context = zmq.Context()
+    events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
+    monitor = events.get_monitor_socket()
+    address = events.getsockopt_string(zmq.LAST_ENDPOINT)
+    looker = subprocess.Popen([sys.executable, "-c", LOOKER, address], cwd=REPO)
+
+    def happened(kind: zmq.Event) -> bool:
+        events.send_multipart([EVENT_TOPIC, b"x"])
+        return bool(monitor.poll(0)) and recv_monitor_message(monitor)["event"] == kind
+
+    try:
+        wait_for(lambda: happened(zmq.Event.HANDSHAKE_SUCCEEDED), "the subscriber")
+        for go_s in (3, 10, 30):  # it may hang before its first sign of life; then nothing is known of it yet
+            time.sleep(go_s)
+            os.kill(looker.pid, signal.SIGSTOP)
+            with suppress(AssertionError):
+                wait_for(lambda: happened(zmq.Event.DISCONNECTED), "that it is forgotten", 15)
+                break
+            os.kill(looker.pid, signal.SIGCONT)
+        else:
+            pytest.fail("it is not forgotten")
+    finally:
+        looker.kill()
+        looker.wait()
+        events.disable_monitor()
+        monitor.close()
+        context.destroy(linger=0)

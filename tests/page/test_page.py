@@ -1,0 +1,130 @@
+"""The page in a real browser, at a desk's width and at a phone's."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest
+from polysight.simulators.loopback import on_free_subnet
+from tests.support.page.chromium import DESK, PHONE, Browser
+from tests.support.page.live_view import GrowingScan, served
+from tests.support.paths import REPO
+from tests.support.processes import LIMIT_S, wait_for
+from tests.support.rigs import published_rig
+
+TOKEN = "0123456789"
+PICTURES = "[...document.querySelectorAll('.view img')]"
+pytestmark = pytest.mark.xdist_group("browser")
+
+
+def opened(browser: Browser, view, size=DESK, token: str = "") -> None:
+    """The page, told what there is."""
+    browser.size(*size)
+    browser.open("about:blank")  # a page that differs by its fragment only is not loaded anew
+    browser.wait("location.href == 'about:blank'", "that the page before is gone")
+    browser.errors.clear()
+    browser.requests.clear()
+    browser.open(view.address + (f"/#token={token}" if token else "/"))
+    browser.wait("document.title.length > 9", "the first state")
+
+
+@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size):
+    watch = watching(finished)
+    assert watch.wait_for(lambda s: s["pictures"]["rows"] == 3, LIMIT_S)
+    with served(watch) as view:
+        opened(browser, view, size)
+        browser.wait(f"{PICTURES}.length == 6 && {PICTURES}.every(i => i.naturalWidth == 12)", "six pictures")
+        assert browser.text("headline") == "The scan is finished"
+        assert browser.text("count") == "3 of 3 rows"
+        assert "✓ whole" in browser.text("board-table")
+        assert "direct path" in browser.text("profile") or browser.value(
+            "document.getElementById('profile').textContent.includes('direct path')"
+        )
+        assert browser.value("document.querySelectorAll('#sync path').length") == 2
+        assert browser.value("getComputedStyle(document.getElementById('buttons')).display") == "none"
+        # Nothing sticks out to the side, and the headline is on the first screen.
+        assert browser.value("document.documentElement.scrollWidth <= innerWidth")
+        assert browser.value("document.getElementById('progress').getBoundingClientRect().bottom < innerHeight / 2")
+        browser.screenshot(tmp_path / "page.png")
+        assert (tmp_path / "page.png").stat().st_size > 20_000
+        assert browser.errors == []
+        assert all(url.startswith((view.address, "about:")) for url in browser.requests), browser.requests
+
+
+def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watching):
+    watch = watching(growing.path, lapse_s=1e6)
+    with served(watch) as view:
+        opened(browser, view)
+        assert browser.text("headline") == "No scan here yet"
+        growing.live()
+        for row in range(3):
+            growing.grow_to("row_committed")
+            browser.wait(f"document.getElementById('count').innerText == '{row + 1} of 3 rows'", "the row's count")
+            browser.wait(f"document.getElementById('images-note').innerText.startsWith('{row + 1} rows')", "its image")
+            browser.wait(f"{PICTURES}.every(i => i.complete && i.naturalWidth == 12)", "the pictures")
+        assert browser.errors == []
+
+
+def test_buttons_reach_the_scan(browser, growing, watching):
+    growing.grow_to("row_committed")
+    stop = StopRequest()
+    with ControlDesk(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
+        desk.open()
+        wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
+        opened(browser, view, token=TOKEN)
+        browser.wait("!document.getElementById('buttons').hidden", "buttons")
+        assert TOKEN not in browser.value("location.href")
+        browser.value("document.getElementById('pause').click()")
+        wait_for(lambda: stop.paused, "the pause")
+        browser.wait("document.getElementById('headline').innerText == 'Pausing after this row'", "that it is said")
+        browser.value("document.getElementById('continue').click()")
+        wait_for(lambda: not stop.paused, "the end of the pause")
+        browser.wait("!document.getElementById('pause').hidden", "the button again")
+        browser.value("document.getElementById('abort').click()")
+        assert browser.value("document.getElementById('confirm').open")
+        browser.value("document.querySelector('#confirm button[value=no]').click()")
+        browser.wait("!document.getElementById('confirm').open", "the question is gone")
+        assert not stop.after_row
+        browser.value("document.getElementById('abort').click()")
+        browser.value("document.querySelector('#confirm button[value=yes]').click()")
+        wait_for(lambda: stop.now, "the abort")
+        assert browser.errors == []
+
+
+def test_a_wrong_token_is_said(browser, growing, watching):
+    growing.grow_to("row_committed")
+    stop = StopRequest()
+    with ControlDesk(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
+        desk.open()
+        wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
+        opened(browser, view, token="guessed")
+        browser.wait("!document.getElementById('buttons').hidden", "buttons")
+        browser.value("document.getElementById('stop').click()")
+        browser.wait("document.getElementById('answer').innerText.includes('token is wrong')", "the refusal")
+        assert not stop.after_row
+
+
+def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, watching):
+    """At an address of its own: a port of 127.0.0.1 that was free for a while may be somebody else's by then."""
+    rig = on_free_subnet(published_rig())
+    host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
+    watch = watching(finished)
+    with served(watch, host=host, port=int(port)) as view:
+        opened(browser, view)
+    browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
+    assert "lost" in browser.text("headline")
+    time.sleep(0.5)  # some of its attempts to come back fail
+    with served(watch, host=host, port=int(port)):
+        browser.wait("!document.body.classList.contains('lost')", "the way back")
+        browser.wait("document.getElementById('headline').innerText == 'The scan is finished'", "the state")
+
+
+def test_how_to_shows_pictures_that_are_there():
+    docs = REPO / "docs"
+    page = (docs / "how-to/live-view.md").read_text(encoding="utf-8")
+    assert "../images/preview.png" in page
+    assert (docs / "images/preview.png").exists()
+    assert (docs / "images/preview-phone.png").exists()

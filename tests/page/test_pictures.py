@@ -1,0 +1,87 @@
+"""Pictures and range profiles show what is in the data."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from polysight.host.imaging import ChannelImages
+from polysight.host.page.images import PHASE, colour_bar, draw, range_profile_db
+from polysight.host.sync.chain import SyncedRow
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from tests.support.rigs import published_rig
+
+NY, NX = 8, 11
+
+
+def pixels(png: bytes) -> np.ndarray:
+    return imread(io.BytesIO(png), format="png")
+
+
+@pytest.fixture
+def images() -> ChannelImages:
+    one = np.full((NY, NX), 0.01, np.complex64)
+    one[0, -1] = 1.0  # smallest y, largest x
+    axes = (np.arange(NX, dtype=float), np.arange(NY, dtype=float))
+    return ChannelImages(one, one.copy(), one, one, one, one, *axes, np.ones((NY, NX), bool), {})
+
+
+def test_smallest_y_is_at_the_bottom(images):
+    picture = pixels(draw(images)["h_amplitude"].png)
+    assert picture.shape == (NY, NX, 4)
+    light = picture[..., :3].sum(axis=-1)
+    assert np.unravel_index(light.argmax(), light.shape) == (NY - 1, NX - 1)
+
+
+def test_what_no_row_has_lit_is_transparent(images):
+    seen = np.ones((NY, NX), bool)
+    seen[:3] = False
+    for picture in draw(replace(images, valid=seen)).values():
+        assert (pixels(picture.png)[-3:, :, 3] == 0).all()
+    assert (pixels(draw(replace(images, valid=seen))["h_amplitude"].png)[:-3, :, 3] == 1).all()
+
+
+def test_nothing_lit_is_drawn_all_the_same(images):
+    nothing = replace(images, valid=np.zeros((NY, NX), bool))
+    assert all((pixels(p.png)[..., 3] == 0).all() for p in draw(nothing).values())
+
+
+def test_phase_is_cyclic_and_comes_round(images):
+    angles = np.linspace(-np.pi, np.pi, NX, dtype=np.float32)
+    turned = np.tile(np.exp(1j * angles).astype(np.complex64), (NY, 1))
+    row = pixels(draw(replace(images, h=turned))["h_phase"].png)[0, :, :3]
+    assert np.abs(row[0] - row[-1]).max() < 0.02
+    assert np.abs(row[0] - row[NX // 2]).max() > 0.3
+    ends = pixels(colour_bar(PHASE))[0]
+    assert np.abs(ends[0] - ends[-1]).max() < 0.02
+
+
+def test_phase_of_p_is_the_difference(images):
+    h = images.h * np.exp(1j).astype(np.complex64)
+    v = images.v * np.exp(0.25j).astype(np.complex64)
+    p = draw(replace(images, h=h, v=v))["p_phase"].png
+    same = draw(replace(images, h=images.h * np.exp(0.75j).astype(np.complex64)))["p_phase"].png
+    assert np.allclose(pixels(p), pixels(same), atol=0.01)
+
+
+@pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
+def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
+    chirp = published_rig().chirp
+    f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    echo = 1 + 0.3 * np.exp(2j * np.pi * f * path_m / SPEED_OF_LIGHT_M_S)
+    samples = np.tile(echo.astype(np.complex64), (4, 5, 1))
+    zeros = np.zeros(5)
+    row = SyncedRow(samples, np.ones(5, bool), np.ones(5, int), zeros, zeros, zeros, zeros)
+    where = np.linspace(-0.2, 1.0, 601)
+    level = range_profile_db(row, chirp, where)
+    assert abs(where[level.argmax()]) < 0.01
+    assert level.max() == pytest.approx(0.0, abs=0.05)
+    beyond = np.where(np.abs(where) < 0.2, -200.0, level)
+    assert where[beyond.argmax()] == pytest.approx(path_m, abs=0.01)
+    assert beyond.max() == pytest.approx(20 * np.log10(0.3), abs=0.5)
+    none = replace(row, valid=np.zeros(5, bool))
+    assert np.ptp(range_profile_db(none, chirp, where)) == 0

@@ -1,0 +1,207 @@
+"""The server: who may ask, who may look, and that a page can be as slow as it likes."""
+
+from __future__ import annotations
+
+import hmac
+import http.client
+import json
+import re
+import socket
+
+import pytest
+
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
+from polysight.host.cli.main import build_parser
+from polysight.host.page.server import STATIC, TOKEN_HEADER, is_loopback
+from tests.support.page.live_view import served
+from tests.support.paths import REPO
+from tests.support.processes import LIMIT_S, wait_for
+
+TOKEN = "the-right-token"
+
+
+def ask(view, path: str, method: str = "GET", **headers: str) -> tuple[int, bytes, dict[str, str]]:
+    connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+    try:
+        connection.request(method, path, headers={k.replace("_", "-"): v for k, v in headers.items()})
+        reply = connection.getresponse()
+        return reply.status, reply.read(), dict(reply.getheaders())
+    finally:
+        connection.close()
+
+
+class Page:
+    """A page's event stream."""
+
+    def __init__(self, view) -> None:
+        self._connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+        self._connection.request("GET", "/api/events")
+        self._reply = self._connection.getresponse()
+
+    def next(self, kind: str) -> bytes:
+        """The data of the next event of a kind."""
+        while True:
+            lines = {}
+            while (line := self._reply.readline().rstrip(b"\n")) != b"":
+                name, _, value = line.partition(b": ")
+                lines[name] = value
+            if lines.get(b"event") == kind.encode():
+                return lines[b"data"]
+
+    def close(self) -> None:
+        self._reply.close()
+        self._connection.close()
+
+
+@pytest.fixture
+def desk(growing):
+    """A running scan of which nothing has come yet: its folder and what hears of wishes."""
+    growing.grow_to("scan_started")
+    stop = StopRequest()
+    with ControlDesk(growing.path, stop) as made:
+        made.open()
+        wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
+        yield growing.path, stop
+
+
+@pytest.mark.parametrize("given", [{}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN + "s"}, {TOKEN_HEADER: TOKEN[:-1]}])
+def test_without_the_token_nothing_is_asked(desk, watching, given):
+    folder, stop = desk
+    with served(watching(folder, control=True), TOKEN) as view:
+        for wish in Wish:
+            status, body, _ = ask(view, f"/api/control/{wish}?token={TOKEN}", "POST", **given)
+            assert status == 403
+            assert "token" in json.loads(body)["what"]
+    assert not stop.after_row
+    assert not stop.paused
+
+
+def test_with_the_token_the_scan_hears(desk, watching):
+    folder, stop = desk
+    with served(watching(folder, control=True), TOKEN) as view:
+        for wish, holds in ((Wish.PAUSE, True), (Wish.CONTINUE, False)):
+            assert ask(view, f"/api/control/{wish}", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
+            assert stop.paused is holds
+        assert ask(view, "/api/control/abort", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
+        assert stop.now
+        assert ask(view, "/api/control/destroy", "POST", **{TOKEN_HEADER: TOKEN})[0] == 404
+
+
+def test_only_post_asks(desk, watching):
+    folder, stop = desk
+    with served(watching(folder, control=True), TOKEN) as view:
+        for method in ("GET", "HEAD", "PUT", "DELETE", "OPTIONS"):
+            assert ask(view, "/api/control/abort", method, **{TOKEN_HEADER: TOKEN})[0] == 405
+    assert not stop.after_row
+
+
+def test_a_view_is_read_only_unless_told_otherwise(desk, watching):
+    folder, stop = desk
+    watch = watching(folder)
+    with served(watch) as view:
+        for given in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN}):
+            status, body, _ = ask(view, "/api/control/abort", "POST", **given)
+            assert status == 403
+            assert "read-only" in json.loads(body)["what"]
+    assert json.loads(watch.state.data)["control"]["enabled"] is False
+    assert not stop.after_row
+
+
+def test_tokens_are_compared_in_constant_time(desk, watching, monkeypatch):
+    compared = []
+    monkeypatch.setattr(hmac, "compare_digest", lambda a, b: compared.append((a, b)) or False)
+    with served(watching(desk[0], control=True), TOKEN) as view:
+        assert ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})[0] == 403
+    assert compared == [(TOKEN.encode(), TOKEN.encode())]
+
+
+def test_nobody_to_ask_is_said(finished, watching):
+    with served(watching(finished, control=True), TOKEN) as view:
+        status, body, _ = ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})
+    assert status == 409
+    assert "polysight resume" in json.loads(body)["do"]
+
+
+def test_loopback_is_the_default(finished, watching):
+    args = build_parser().parse_args(["preview", "scans/one"])
+    assert (args.host, args.port, args.control) == ("127.0.0.1", 8080, False)
+    assert is_loopback(args.host)
+    assert [is_loopback(h) for h in ("localhost", "::1", "127.3.2.1")] == [True] * 3
+    assert [is_loopback(h) for h in ("0.0.0.0", "::", "192.168.33.30", "pi.lab")] == [False] * 4
+    with served(watching(finished)) as view:
+        assert ask(view, "/api/state")[0] == 200
+        assert ask(view, "/api/state", Host="localhost:8080")[0] == 200
+        assert ask(view, "/api/state", Host="evil.example")[0] == 400  # a name made to point here
+
+
+def test_other_sites_get_no_permission(finished, watching):
+    with served(watching(finished)) as view:
+        for path in ("/", "/api/state", "/api/bar/phase"):
+            status, _, headers = ask(view, path, Origin="https://evil.example")
+            assert status == 200
+            assert not [h for h in headers if h.lower().startswith("access-control")]
+            policy = {k.lower(): v for k, v in headers.items()}["content-security-policy"]
+            assert "default-src 'self'" in policy
+            assert "unsafe" not in policy
+
+
+def test_the_page_needs_nothing_from_elsewhere():
+    for path in STATIC.iterdir():
+        found = set(re.findall(r"https?://[^\s\"'<)]+", path.read_text(encoding="utf-8")))
+        assert found <= {"http://www.w3.org/2000/svg"}, path
+    assert 'src="' in (STATIC / "index.html").read_text()
+
+
+def test_late_pages_are_told_what_early_ones_are(growing, watching):
+    watch = watching(growing.path, lapse_s=1e6)
+    growing.live()
+    with served(watch) as view:
+        early = Page(view)
+        heard = early.next("state")
+        for fact in ("scan_started", "row_committed", "row_committed"):
+            growing.grow_to(fact)
+        assert watch.wait_for(lambda s: (s.get("pictures") or {}).get("rows") == 2, LIMIT_S)
+        while (json.loads(heard).get("pictures") or {}).get("rows") != 2:
+            heard = early.next("state")
+        late = Page(view)
+        wait_for(lambda: watch.state.version == watch.state.version, "quiet")
+        assert json.loads(late.next("state")) == json.loads(ask(view, "/api/state")[1])
+        assert {k: v for k, v in json.loads(heard).items() if k != "status"} == {
+            k: v for k, v in json.loads(ask(view, "/api/state")[1]).items() if k != "status"
+        }
+        early.close()
+        late.close()
+
+
+def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
+    watch = watching(growing.path, lapse_s=1e6)
+    growing.live()
+    with served(watch) as view:
+        deaf = []
+        for _ in range(8):
+            one = socket.socket()
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            one.connect(("127.0.0.1", view.port))
+            one.sendall(b"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            deaf.append(one)
+        for rows in range(3):
+            growing.grow_to("row_committed")
+            assert watch.wait_for(lambda s, n=rows + 1: (s.get("pictures") or {}).get("rows") == n, LIMIT_S)
+            assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
+        for one in deaf:
+            one.close()
+
+
+def test_pictures_are_served_as_they_are_shown(finished, watching):
+    watch = watching(finished)
+    assert watch.wait_for(lambda s: s["pictures"]["rows"] == 3, LIMIT_S)
+    with served(watch) as view:
+        for name, picture in watch.shown.pictures.items():
+            assert ask(view, f"/api/picture/{name}")[1] == picture.png
+        assert ask(view, "/api/picture/../../etc/passwd")[0] == 404
+        assert ask(view, "/api/picture/nothing")[0] == 404
+
+
+def test_the_how_to_names_every_wish():
+    page = (REPO / "docs/how-to/live-view.md").read_text(encoding="utf-8")
+    assert all(f"control/{wish}" in page for wish in Wish)

@@ -1,0 +1,157 @@
+"""What a page is told is what the folder holds, as it grows, for early and late lookers alike."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from polysight.host.page.images import draw
+from polysight.host.page.watch import Watch
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scan_folder import ScanFolder
+from tests.support.page.live_view import GrowingScan
+from tests.support.processes import LIMIT_S, wait_for
+
+
+def told(watch: Watch) -> dict:
+    return json.loads(watch.state.data)
+
+
+def shows(rows: int):
+    return lambda state: (state.get("pictures") or {}).get("rows") == rows
+
+
+def without_revision(state: dict) -> dict:
+    return state | {"pictures": {k: v for k, v in state["pictures"].items() if k != "revision"}}
+
+
+@pytest.fixture(scope="module")
+def truth(finished):
+    """Pictures of the finished folder, by the instrument's own pipeline."""
+    scan = ScanFolder.load(finished)
+    pipeline = Pipeline(scan, live=True)
+    for row in scan.rows():
+        pipeline.add_row(row)
+    return scan, pipeline, draw(pipeline.images.current())
+
+
+def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):
+    scan, pipeline, pictures = truth
+    watch = watching(finished)
+    assert watch.wait_for(shows(scan.plan.rows), LIMIT_S)
+    state = told(watch)
+    assert (state["status"]["level"], state["marks"]) == ("done", "ccc")
+    assert state["progress"] == {"rows": 3, "committed": 3}
+    assert state["scan"]["simulated"] is True
+    for board in state["boards"]:
+        summary = pipeline.quality.boards[board["name"]].summary()
+        assert board["frames_expected"] - board["frames_lost"] == summary["frames_received"]
+        assert board["masked"] == summary["positions_masked"]
+    assert {name: p.png for name, p in watch.shown.pictures.items()} == {n: p.png for n, p in pictures.items()}
+    assert set(state["pictures"]["items"]) == {f"{c}_{k}" for c in "hvp" for k in ("amplitude", "phase")}
+    assert state["profile"]["row"] == 2
+    for board in state["sync"]["boards"].values():
+        assert board["rows"] == [0, 1, 2]
+    assert state["notices"] == []
+
+
+def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
+    watch = watching(growing.path, lapse_s=1e6)
+    assert told(watch)["scan"] is None
+    growing.live()
+    growing.grow_to("scan_started")
+    assert watch.wait_for(lambda s: s["scan"] is not None, LIMIT_S)
+    assert told(watch)["marks"] == "..."
+    revision = 0
+    for row in range(3):
+        growing.grow_to("row_committed")
+        assert watch.wait_for(shows(row + 1), LIMIT_S)
+        state = told(watch)
+        assert state["marks"] == "c" * (row + 1) + "." * (2 - row)
+        assert state["pictures"]["revision"] > revision
+        assert state["profile"]["row"] == row
+        revision = state["pictures"]["revision"]
+    assert told(watch)["status"]["level"] == "good"
+    growing.grow_to("scan_ended")
+    assert watch.wait_for(lambda s: s["status"]["level"] == "done", LIMIT_S)
+
+
+def test_who_comes_late_is_told_the_same(growing, watching):
+    early = watching(growing.path, lapse_s=1e6)
+    growing.live()
+    for fact in ("scan_started", "row_committed", "row_committed"):
+        growing.grow_to(fact)
+        assert early.wait_for(lambda s: s.get("scan") is not None, LIMIT_S)
+    assert early.wait_for(shows(2), LIMIT_S)
+    late = watching(growing.path, lapse_s=1e6)
+    assert late.wait_for(shows(2), LIMIT_S)
+    wait_for(lambda: without_revision(told(early)) == without_revision(told(late)), "both tell the same")
+    assert {n: p.png for n, p in early.shown.pictures.items()} == {n: p.png for n, p in late.shown.pictures.items()}
+
+
+def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
+    watch = watching(growing.path, lapse_s=2.0)
+    growing.grow_to("row_committed")
+
+    def lives() -> bool:
+        growing.live()
+        state = told(watch)
+        return state["status"]["level"] == "good" and state["control"]["running"]
+
+    wait_for(lives, "that it lives")
+    assert watch.wait_for(lambda s: s["status"]["headline"] == "The scan program is gone", LIMIT_S)
+    state = told(watch)
+    assert not state["control"]["running"]
+    assert "polysight resume" in state["status"]["do"]
+    assert json.loads(watch.motion.data)["left_s"] is None
+    wait_for(lives, "that it lives again")
+
+
+def test_an_unfinished_folder_without_a_program_is_said_to_be_at_once(growing, watching):
+    growing.grow_to("row_committed")
+    assert told(watching(growing.path))["status"]["headline"] == "The scan program is gone"
+
+
+def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
+    raw = next((growing.path / "raw" / "RV").glob("0001.bin"))
+    raw.write_bytes(raw.read_bytes()[:-1] + b"\x55")
+    while growing.grow():
+        pass
+    watch = watching(growing.path)
+    assert watch.wait_for(shows(2), LIMIT_S)
+    assert watch.wait_for(lambda s: len(s["notices"]) == 1, LIMIT_S)
+    assert "0001.bin" in told(watch)["notices"][0]["what"]
+
+
+def test_another_scan_in_the_same_place_begins_afresh(growing, finished, watching):
+    growing.grow_to("row_committed")
+    watch = watching(growing.path, lapse_s=1e6)
+    assert watch.wait_for(shows(1), LIMIT_S)
+    shutil.rmtree(growing.path)
+    shutil.copytree(finished, growing.path)
+    assert watch.wait_for(shows(3), LIMIT_S)
+    assert told(watch)["status"]["level"] == "done"
+
+
+def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+
+    def content():
+        return {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.rglob("*"))}
+
+    before = content()
+    watch = watching(folder, control=True)
+    assert watch.wait_for(shows(3), LIMIT_S)
+    watch.close()
+    assert content() == before
+
+
+def test_a_manifest_of_another_release_is_not_taken_for_none(growing, watching):
+    growing.write({"fact": "scan_started", "scan_id": "s", "simulated": True, "instrument": {"new": 1}})
+    watch = watching(growing.path)
+    status = told(watch)["status"]
+    assert (status["level"], status["headline"]) == ("bad", "This scan cannot be shown")
+    assert "polysight validate" in status["do"]

@@ -1,0 +1,235 @@
+"""`polysight reproduce --authors` on files of the published form that the simulator made."""
+
+import json
+import os
+import pickle
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.host.materials import Library, knn
+from polysight.host.polarimetry import ratio_from_permittivity
+from polysight.papers.sensys2026 import dataset_figures as authors_items
+from polysight.papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, read_authors, read_names, row_of
+from polysight.papers.sensys2026.dataset_figures import Judgements, authors_fig20, paired, repeated, task_samples
+from polysight.papers.sensys2026.dataset_run import authors_recipe, text_of, without_leakage
+from polysight.papers.sensys2026.item import Table
+from polysight.papers.sensys2026.table2 import table2
+from polysight.shared.errors import DataError
+from polysight.simulators.scene import Errors, Material, write_labels, write_material
+from tests.support.paths import RIG_FILE
+
+CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
+ERRORS = Errors(0.004, 0.01, leakage=0.05)
+ROWS = {m.number: m for m in table2()}
+
+
+def material(number):
+    m = ROWS[number]
+    return Material(m.name, None if number == 1 else m.permittivity, m.thickness_mm)
+
+
+def angles(number):
+    return (60, 55) if number <= 23 else (55,) if number <= 32 else (60,)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """materials/ with three sets, labels/ with two scans, and a stranger among the names."""
+    folder, seed = tmp_path_factory.mktemp("authors") / "dataset", 0
+    for k in range(3):
+        for number in CHOSEN:
+            for angle in angles(number):
+                seed += 1
+                write_material(folder / "materials", material(number), angle, f"set{k}_{angle}", 60, ERRORS, seed)
+    write_material(folder / "materials", Material("unobtainium", 3.0 - 0.1j), 60, "set0_60", 60, ERRORS, 999)
+    boxes = {"copper": (10, 10, 40, 40), "Acrylic (3 mm)": (60, 10, 90, 40), "ceramic": (10, 60, 40, 90)}
+    named = {"copper": material(1), "Acrylic (3 mm)": material(3), "ceramic": material(12)}
+    for k in range(2):
+        write_labels(folder / "labels", f"scan{k}", boxes, named, 60, ERRORS, 500 + k, upside_down=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def out(dataset, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(authors_items, "ALL", 240)  # pixels of a task, and weights tried: it is the page that is tested
+        patch.setattr(knn, "GRID", (1.0,))
+        assert main(["reproduce", "--authors", str(dataset), "--out", str(folder)]) == 0
+    return folder
+
+
+def test_table_2_is_recovered_from_both_kinds_of_files(out):
+    content = json.loads((out / "table2.json").read_text())
+    assert content["simulated"] is True
+    found = {(r["source"], r["number"]): r for r in content["materials"]}
+    assert {n for s, n in found if s == MATERIALS} == set(CHOSEN)
+    assert {n for s, n in found if s == LABELS} == {1, 3, 12}
+    for (_, number), row in found.items():
+        assert row["metal_like"] == (number == 1)
+        if number == 1:
+            continue
+        true, seen = ROWS[number].permittivity, complex(*row["without_leakage"].values())
+        assert abs(seen - true) < 0.08 * abs(true)
+        assert abs(complex(*row["as_is"].values()) - true) > abs(seen - true)  # the files hold leakage
+
+
+def test_the_figures_stand_beside_the_published_values(out):
+    solids = json.loads((out / "fig18.json").read_text())["solids, materials/"]
+    assert solids["published_percent"] == 95.74
+    assert solids["scores"][0]["split"] == "by pixel (optimistic)"
+    assert solids["scores"][1]["split"] == "whole scans left out, 3 scans"
+    assert solids["scores"][1]["pixels"] > 0.9
+    assert solids["judged_with_scans_left_out"] == 4
+    labels = json.loads((out / "fig18.json").read_text())["solids, labels/"]
+    assert labels["scores"][1] is None  # two scans are too few to leave one out
+    channels = json.loads((out / "fig20.json").read_text())
+    assert channels["H, materials/"]["by_pixel"] < channels["H+V+P, materials/"]["by_pixel"]
+    sugar = json.loads((out / "fig21.json").read_text())[MATERIALS]
+    assert sugar["published_median_error_percent"] == 1.548
+    assert 0 < sugar["median_error_percent"] < 3
+    assert len(sugar["left_out"]) == 12
+
+
+def test_the_page_says_that_the_files_were_simulated_and_what_was_left_out(out, dataset):
+    page = (out / "reproduce.html").read_text(encoding="utf-8")
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+    assert "SIMULATED FILES" in page
+    assert "unobtainium" in page
+    assert "y from the last row" in page
+    assert "Fig. 18" in page
+    assert "“copper” = 1" in page
+    assert "How the noise was set" not in page
+    assert (out / "fig20.csv").read_text().startswith("simulated files: ")
+    assert not read_authors(dataset, _rig()).sources[MATERIALS].names.count("unobtainium")
+
+
+def _rig():
+    return RIG_FILE
+
+
+def test_what_a_name_means_can_be_said(dataset, tmp_path):
+    names = tmp_path / "names.json"
+    names.write_text('{"unobtainium": 20}')
+    data = read_authors(dataset, _rig(), names=names)
+    assert ROWS[20].name in data.sources[MATERIALS].names
+    names.write_text('{"unobtainium": 99}')
+    with pytest.raises(DataError, match="no row 99"):
+        read_names(names)
+
+
+def test_every_row_of_table_2_means_itself_and_a_stranger_none():
+    for m in table2():
+        assert row_of(m.name, m.thickness_mm) == m.number
+    assert row_of("copper_plate") == 1
+    assert row_of("PET", 0.5) == 5
+    assert row_of("pet_1mm") == 6
+    assert row_of("Cane Sugar (3.8%, \\w glass)") == 29
+    assert row_of("unobtainium") is None
+    assert row_of("PLA") is None  # two rows
+
+
+def test_images_made_here_are_turned_to_lie_as_the_authors_own(dataset, tmp_path):
+    h = np.load(dataset / "labels" / "scan0" / "sar_h.npy")
+    v = np.load(dataset / "labels" / "scan0" / "sar_v.npy")
+    folder = tmp_path / "scan0"
+    folder.mkdir()
+    ours = {"h": np.rot90(h, 1), "v": np.rot90(v, 1), "valid": np.ones(h.shape, bool)}
+    np.savez(folder / "image.npz", **ours)
+    data = read_authors(dataset, _rig(), images=tmp_path)
+    theirs = {(e.name, e.scan): e for e in data.sources[LABELS].entries}
+    for e in data.sources[IMAGES].entries:
+        assert e.scan == "scan0"
+        np.testing.assert_allclose(e.p, theirs[e.name, e.scan].p, rtol=1e-4)
+    assert any("scan1: no image made here" in n for n in data.notices)
+
+
+class Hostile:
+    def __init__(self, target):
+        self.target = target
+
+    def __reduce__(self):
+        return os.system, (f"touch {self.target}",)
+
+
+def test_a_hostile_or_damaged_file_is_refused_and_named_and_stops_no_other(dataset, tmp_path):
+    shutil.copytree(dataset, tmp_path / "dataset")
+    target = tmp_path / "ran"
+    (tmp_path / "dataset" / "materials" / "evil_60.pkl").write_bytes(pickle.dumps({"name": Hostile(target)}))
+    (tmp_path / "dataset" / "labels" / "scan1" / "sar_v.npy").write_bytes(b"cut")
+    data = read_authors(tmp_path / "dataset", _rig())
+    assert not target.exists()
+    assert any("evil_60.pkl: refused" in n and "system" in n for n in data.notices)
+    assert any("sar_v.npy" in n for n in data.notices)
+    assert data.sources[LABELS].scans == ("scan0",)
+    assert len(data.sources[MATERIALS].entries) == len(read_authors(dataset, _rig()).sources[MATERIALS].entries)
+
+
+def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
+    data = read_authors(dataset, _rig())
+    first, second = (data.at(MATERIALS, range(1, 24), a) for a in (60.0, 55.0))
+    a, b = paired(first, second)
+    assert a.scans == b.scans
+    assert len(a.scans) == 3
+    samples = task_samples(data, MATERIALS, "solids, two angles")
+    assert samples is not None
+    assert samples.x.shape[1] == 8
+    held = repeated(samples)
+    assert held is not None
+    one = Library(tuple(e for e in first.entries if e.scan == first.scans[0]))
+    assert paired(one, second)[0].scans == (f"{first.scans[0]} and {second.scans[0]}",)
+
+
+def test_what_is_judged_is_kept(dataset):
+    judge = Judgements(read_authors(dataset, _rig()))
+    judge.data.sources.pop(LABELS)
+    a = judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H")
+    assert judge.judged(MATERIALS, "powders", "weighted KNN (paper)", "H") is a
+    with pytest.raises(DataError, match="nothing to classify"):
+        authors_fig20(Judgements(type(judge.data)(judge.data.folder, judge.data.base, {}, {}, ())))
+
+
+def test_leakage_is_taken_out_exactly_and_the_recipe_undoes_its_own_constants():
+    t = np.array([1.0, 3 - 1j, 8 + 2j])
+    np.testing.assert_allclose(without_leakage((t + 0.05) / (1 + 0.05 * t), 0.05), t)
+    eps = 4.0 - 0.5j
+    p = complex(ratio_from_permittivity(eps, np.radians(60.0))) * 0.8
+    seen = np.full(9, (p + 0.05) / (1 + 0.05 * p))
+    assert authors_recipe(seen, 60.0) == pytest.approx(eps, rel=1e-6)
+
+
+def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(knn, "GRID", (1.0,))
+    out = tmp_path / "library.npz"
+    assert main(["train", "--authors", str(dataset), "--out", str(out)]) == 0
+    library = Library.load(out)
+    assert library.simulated
+    assert library.names == tuple(sorted(ROWS[n].name for n in CHOSEN))
+    assert "scan1" in library.scans
+    assert set(library.fit["angles"]) == {"55", "60"}
+    for e in library.entries:
+        eps = next(m for m in ROWS.values() if m.name == e.name).permittivity
+        true = 1 if e.name == "Metal" else complex(ratio_from_permittivity(eps, np.radians(e.incidence_deg)))
+        assert np.median(e.p.real) + 1j * np.median(e.p.imag) == pytest.approx(true, rel=0.08)
+        np.testing.assert_allclose(abs(e.p), e.h / e.v, rtol=1e-5)
+    assert "unobtainium" in capsys.readouterr().err
+
+
+def test_refusals(dataset, tmp_path, capsys):
+    assert main(["reproduce", "--authors", str(dataset), "--out", str(tmp_path / "a"), "fig3"]) == 2
+    assert "cannot be made from the published files" in capsys.readouterr().err
+    assert main(["reproduce", "--authors", str(tmp_path), "--out", str(tmp_path / "a")]) == 3
+    assert "neither materials/" in capsys.readouterr().err
+    assert main(["reproduce", "--names", "x.json", "--out", str(tmp_path / "a")]) == 2
+
+
+def test_a_table_for_the_terminal_keeps_every_cell():
+    text = text_of(Table("numbers", ("what", "a long heading of many words"), (("one", "1"), ("three", "22.5 %"))))
+    assert text.splitlines()[0] == "numbers"
+    assert "three" in text
+    assert "22.5 %" in text
+    assert "heading" in text

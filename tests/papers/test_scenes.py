@@ -1,0 +1,88 @@
+"""Scenes, rig files and estimators behind the figures that come from images."""
+
+import numpy as np
+import pytest
+
+from polysight.host.polarimetry import specular_incidence_rad
+from polysight.papers.sensys2026 import run as catalogue
+from polysight.papers.sensys2026.images import FIG13_DISTANCE_MM, PLACES_MM, front_on
+from polysight.papers.sensys2026.item import Run
+from polysight.papers.sensys2026.permittivities import APART_MM, REACH_MM, places
+from polysight.papers.sensys2026.scenes import plate, scanned
+from polysight.papers.sensys2026.synchronisation import tones
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ScanError
+from tests.support.paths import RIG_FILE
+from tests.support.rigs import published_rig
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_places_never_overlap_and_stay_on_the_plane(seed):
+    at = places(seed)
+    assert all(abs(c) <= REACH_MM for xy in at for c in xy)
+    for i, a in enumerate(at):
+        assert all(max(abs(a[0] - b[0]), abs(a[1] - b[1])) >= APART_MM for b in at[:i])
+
+
+def test_placements_differ_and_come_again():
+    assert places(1) == places(1)
+    assert places(1) != places(2)
+
+
+def test_nine_places_are_nine():
+    assert len(set(PLACES_MM)) == 9
+
+
+def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
+    steep, near = published_rig(), load_instrument(front_on(RIG_FILE, tmp_path))
+    assert np.degrees(specular_incidence_rad(steep)) == pytest.approx(55, abs=0.2)
+    assert np.degrees(specular_incidence_rad(near)) < 2
+    assert near.chirp == steep.chirp
+
+
+def test_the_plane_of_fig13_is_seen_under_50_degrees():
+    import msgspec
+
+    rig = published_rig()
+    rig = msgspec.structs.replace(
+        rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=FIG13_DISTANCE_MM)
+    )
+    assert np.degrees(specular_incidence_rad(rig)) == pytest.approx(50, abs=0.4)
+
+
+@pytest.mark.parametrize("if_hz", [210e3, 870e3, 1.81e6])
+def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
+    chirp = published_rig().chirp
+    t = np.arange(chirp.samples) / chirp.sample_rate_hz
+    gains = np.array([1.0, 1j, -0.5, 0.25])[:, None, None]
+    found, amplitude = tones((gains * 40 * np.exp(2j * np.pi * if_hz * t)).astype(np.complex64), chirp)
+    assert found[0] == pytest.approx(if_hz, abs=300)
+    assert amplitude[0] == pytest.approx(40 * np.sqrt((np.abs(gains) ** 2).sum()), rel=2e-3)
+
+
+def test_a_simulated_scan_is_there_and_gone_again():
+    grid = {"columns": 3, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
+    with scanned("small", [plate("copper", None, 0, 0)], RIG_FILE, seed=1, grid=grid) as (source, truth):
+        assert source.simulated
+        assert [p.metal for p in truth] == [True]
+        folder = source.path
+        assert folder.exists()
+    assert not folder.exists()
+
+
+def test_a_scene_that_cannot_be_simulated_is_named():
+    with (
+        pytest.raises(ScanError, match="'broken'"),
+        scanned("broken", [plate("x", 0.5 + 0j, 0, 0)], RIG_FILE, seed=1),
+    ):
+        pass
+
+
+def test_the_filter_s_corners_come_back_from_the_sweep():
+    item = catalogue.MAKERS["fig9"](Run(config=RIG_FILE))
+    assert item.data["largest_difference_db"] < 0.2
+    assert item.data["fitted_corners_hz"] == pytest.approx(item.data["programmed_corners_hz"], rel=0.15)
+
+
+def test_every_item_of_the_paper_is_made():
+    assert set(catalogue.MAKERS) == set(catalogue.TITLES)

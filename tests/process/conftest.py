@@ -1,0 +1,66 @@
+"""Small simulated scans, made once and shared by the laws that look at them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polysight.host.imaging import ChannelImages
+from polysight.host.materials import TruthPlate, read_truth
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.shared.config import Instrument
+from polysight.simulators.scene import Scene, decode_scene, load_scene, simulate
+from tests.support.paths import EXAMPLES
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, PET, scene_of
+
+
+class Imaged:
+    """A simulated scan that went through the host's pipeline up to the images."""
+
+    def __init__(self, folder: Path) -> None:
+        self.pipeline = Pipeline(ScanFolder.load(folder))
+        for row in self.pipeline.source.rows():
+            self.pipeline.add_row(row)
+        self.images: ChannelImages = self.pipeline.form_images()
+        self.rig: Instrument = self.pipeline.source.instrument
+        self.plates: tuple[TruthPlate, ...] = read_truth(folder / "truth.json")
+
+
+Make = Callable[..., Imaged]
+
+
+@pytest.fixture(scope="session")
+def imaged(rig: Instrument, tmp_path_factory: pytest.TempPathFactory) -> Make:
+    """`imaged("nine-materials", seed=2, leakage_h=[0, 0])`: the example scene with changed disturbances, imaged."""
+    done: dict[str, Imaged] = {}
+
+    def make(name: str, seed: int | None = None, **disturbances: Any) -> Imaged:
+        key = f"{name} {seed} {disturbances}"
+        if key not in done:
+            scene: Scene = load_scene(EXAMPLES / f"{name}.toml").with_disturbances(**disturbances)
+            folder = tmp_path_factory.mktemp("scan")
+            done[key] = Imaged(simulate(rig, scene, folder / "scan", seed=seed))
+        return done[key]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def scan_of() -> Callable[..., Path]:
+    """`scan_of(folder, scene, rig)`: a simulated scan, in a scan folder."""
+
+    def make(folder: Path, scene: dict[str, Any], rig: Instrument | None = None, **more: Any) -> Path:
+        return simulate(rig or published_rig(), decode_scene(scene, "test"), folder, **more)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def two_plates(scan_of: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan of copper and PET."""
+    return scan_of(tmp_path_factory.mktemp("two") / "scan", scene_of(COPPER, PET, columns=15, rows=17))

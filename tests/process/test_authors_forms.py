@@ -1,0 +1,133 @@
+"""The published forms, written by the simulator, become the images of the rig they were made with."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+import tomli_w
+
+from polysight.host.cli.main import main
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.sources.open import open_source
+from polysight.host.store.sources.published import PublishedCubes
+from polysight.host.sync.synchronised import recognise
+from polysight.shared.config import Image
+from polysight.shared.errors import DataError
+from polysight.shared.tables import to_builtins
+from polysight.simulators.scene import decode_scene, simulate, write_cube
+from tests.support.rigs import published_rig
+
+RIG = published_rig()
+SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))
+SCENE = {
+    "name": "two plates",
+    "grid": {"columns": 17, "rows": 21, "step_x_mm": 16.0, "step_y_mm": 8.0},
+    "burst": {"pulses": 2},
+    "plates": [
+        {"name": "copper", "centre_mm": [-40.0, 20.0], "size_mm": [50.0, 30.0], "metal": True},
+        {"name": "PET", "centre_mm": [40.0, -25.0], "size_mm": [30.0, 50.0], "permittivity": [3.8, 0.7]},
+    ],
+}
+
+
+def images(folder):
+    """Both images of a scan of a layout, and what is said of its recording."""
+    source = open_source(folder, SMALL)
+    pipeline = Pipeline(source)
+    for row in source.rows():
+        pipeline.add_row(row)
+    return pipeline.form_images(), pipeline
+
+
+def alike(a, b, channel):
+    """Normalised correlation of two images where both are valid; 1 is the same up to a factor."""
+    at = a.valid & b.valid
+    x, y = getattr(a, channel)[at], getattr(b, channel)[at]
+    return abs(np.vdot(x, y)) / np.sqrt(np.vdot(x, x).real * np.vdot(y, y).real)
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory):
+    """A scan without disturbances, row by row: the image that all others are compared with."""
+    scene = decode_scene(SCENE, "t").with_disturbances(ideal=True)
+    return images(simulate(RIG, scene, tmp_path_factory.mktemp("rows"), layout="authors"))[0]
+
+
+def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
+    scene = decode_scene(SCENE, "t").with_disturbances(packet_loss=0.002)
+    folder = simulate(
+        RIG, scene, tmp_path, layout="authors", by_columns=True, zero_filling=False, skipped={("RV", 3): {0, 7}}
+    )
+    made, pipeline = images(folder)
+    assert made.h.shape == quiet.h.shape == (50, 60)
+    np.testing.assert_allclose(made.x_m, quiet.x_m, atol=1e-12)
+    np.testing.assert_allclose(made.y_m, quiet.y_m, atol=1e-12)
+    for channel in ("h", "v"):
+        assert alike(made, quiet, channel) > 0.98
+    told = pipeline.quality.notes["recording"]
+    assert told["direction"] == "col"
+    assert told["boards"]["RV"]["positions_missing"] == 2
+    assert told["boards"]["RH"]["packets_lost"] > 0
+    assert pipeline.rig.grid.columns == 17
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        ({}, "each RX referenced to its own direct path"),
+        (
+            {"keep_direct": False, "from_transmitter": True},
+            "counted from the transmitter; the direct path was taken out",
+        ),
+        ({"common_reference": True, "conjugate": True}, "conjugated; all RX referenced to the direct path of one"),
+    ],
+)
+def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_path, form, said):
+    folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path, **form)
+    made, pipeline = images(folder)
+    for channel in ("h", "v"):
+        assert alike(made, quiet, channel) > 0.999
+    for board in ("RH", "RV"):
+        assert said in pipeline.quality.notes["recording"]["cubes"][board]
+    assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 0
+
+
+def test_a_cube_that_is_not_referenced_is_referenced_here_and_its_zeros_are_masked(quiet, tmp_path):
+    folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
+    rng = np.random.default_rng(1)
+    for board in ("RH", "RV"):
+        file = folder / f"{board}_synced.npy"
+        cube = np.load(file)
+        turn, bins = rng.uniform(0, 1, cube.shape[1:3]), rng.uniform(40, 60, cube.shape[1:3])
+        time = np.arange(256) / 256
+        cube *= np.exp(2j * np.pi * (turn[..., None] + bins[..., None] * time)).astype(np.complex64)
+        cube[:, 4, 5] = 0
+        cube[:, 5, 6] = np.nan
+        np.save(file, cube)
+    made, pipeline = images(folder)
+    for channel in ("h", "v"):
+        assert alike(made, quiet, channel) > 0.99
+    assert "referenced here" in pipeline.quality.notes["recording"]["cubes"]["RV"]
+    assert pipeline.quality.to_dict()["boards"]["RH"]["positions_masked"] == 2
+
+
+def test_an_empty_cube_is_an_error(tmp_path):
+    folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
+    source = open_source(folder, SMALL)
+    assert isinstance(source, PublishedCubes)
+    with pytest.raises(DataError, match="no data"):
+        recognise([0 * source.read_row("RH", 0).cube], source.instrument, source.instrument.receivers[0])
+
+
+def test_cubes_are_processed_like_any_scan_but_for_a_sync_report(tmp_path, capsys):
+    folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
+    config = tmp_path / "rig.toml"
+    config.write_bytes(tomli_w.dumps(to_builtins(SMALL)).encode())
+    assert main(["process", str(folder), "--out", str(tmp_path / "out"), "--config", str(config)]) == 0
+    assert "2 patches" in capsys.readouterr().out
+    quality = json.loads((tmp_path / "out" / "quality.json").read_text())
+    assert quality["boards"]["RH"]["positions"] == 17 * 21
+    assert set(quality["recording"]["cubes"]) == {"RH", "RV"}
+    assert main(["sync-report", str(folder), "--out", str(tmp_path / "sync"), "--config", str(config)]) == 3
+    assert "synchronised already" in capsys.readouterr().err

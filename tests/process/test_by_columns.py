@@ -1,0 +1,60 @@
+"""A scan taken column by column: sub-bands, and what is said of the rig, have x and y where the images have them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tomli_w
+
+from polysight.host.pipeline import Pipeline
+from polysight.host.process.request import Options
+from polysight.host.store.sources.open import open_source
+from polysight.shared.tables import to_builtins
+from tests.support.commands import content, told_by
+from tests.support.rigs import rig_with
+from tests.support.scenes import COPPER, PET, scene_of
+
+BANDS, COLUMNS, ROWS = 2, 13, 17
+IMAGE = {"columns": 50, "rows": 40, "pixel_mm": 4.0}
+RIG = rig_with(image=IMAGE)
+
+
+@pytest.fixture(scope="module")
+def scan(scan_of, tmp_path_factory):
+    scene = scene_of(COPPER, PET, columns=COLUMNS, rows=ROWS)
+    return scan_of(tmp_path_factory.mktemp("columns"), scene, RIG, layout="authors", by_columns=True)
+
+
+def test_sub_bands_lie_as_the_whole_band_s_image_does(scan, tmp_path):
+    source = open_source(scan, RIG)
+    pipeline = Pipeline(source, bands=BANDS)
+    for row in source.rows():
+        pipeline.add_row(row)
+    whole, parts = pipeline.form_images(), pipeline.band_images()
+    assert whole.h.shape == (IMAGE["rows"], IMAGE["columns"])
+    assert len(parts) == BANDS
+    for part in parts:
+        np.testing.assert_array_equal(part.x_m, whole.x_m)
+        np.testing.assert_array_equal(part.y_m, whole.y_m)
+        assert part.valid.shape == whole.valid.shape
+        for name in ("h", "v"):
+            a, b = (np.abs(getattr(image, name)[whole.valid & part.valid]) for image in (part, whole))
+            assert np.corrcoef(a, b)[0, 1] > 0.8
+    # The rig that is told is the one the images are of: rows along x, as the rig file has them.
+    pipeline.finish(tmp_path, Options(model="none", metal_box_mm=(-55.0, -5.0, -25.0, 25.0)))
+    assert grid_told(tmp_path) == (COLUMNS, ROWS)
+    bands = [s["bands"] for s in content(tmp_path / "materials.json")["segments"]]
+    assert bands
+    assert all(len(b) == BANDS for b in bands)
+
+
+def test_the_image_command_tells_the_same_rig(scan, tmp_path):
+    (tmp_path / "rig.toml").write_bytes(tomli_w.dumps(to_builtins(RIG)).encode())
+    told_by("image", scan, "--config", tmp_path / "rig.toml", "--out", tmp_path / "out")
+    assert grid_told(tmp_path / "out") == (COLUMNS, ROWS)
+
+
+def grid_told(out) -> tuple[int, int]:
+    rig = content(out / "scan.json")["instrument"]
+    assert (rig["image"]["columns"], rig["image"]["rows"]) == (IMAGE["columns"], IMAGE["rows"])
+    return rig["grid"]["columns"], rig["grid"]["rows"]

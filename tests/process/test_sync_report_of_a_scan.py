@@ -1,0 +1,81 @@
+"""`polysight sync-report`: of a scan of known disturbances it tells these, and what processing tells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.shared.geometry import rx_positions_m, tx_position_m
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from tests.support.commands import content, told_by
+from tests.support.rigs import published_rig, rig_with
+from tests.support.scenes import EVERYWHERE, scene_of
+
+COLUMNS, ROWS, PULSES = 10, 3, 8
+SYNC_NS = 5.0  # each board samples SYNC_IN so late at most, evenly drawn
+TRUE_KHZ = [350.0, 1400.0]  # the receivers' filters, which the chirp profile does not know
+NAMES = {"frequency_hz_std": "frequency_std_hz", "phase_rad_std": "phase_std_rad", "amplitude_std": "amplitude_std"}
+
+
+@pytest.fixture(scope="module")
+def scan(scan_of, tmp_path_factory):
+    """A scan whose filters were measured before it."""
+    folder = tmp_path_factory.mktemp("sync")
+    found = BoardFilter(TRUE_KHZ, [1.0, 1.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    made = head("hpf", [SourceScan("sweep", "sweep", True, 3)])
+    path = write(FilterFile(**made, boards={"RH": found, "RV": found}), folder / "calibration")
+    true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
+    more = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
+    scan = scan_of(folder / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **more), true)
+    _believe_programmed(scan)
+    return scan
+
+
+def _believe_programmed(scan):
+    """The scan's rig file says what the published one does of the filters."""
+    from polysight.host.store import manifest
+
+    facts = manifest.read(scan / "manifest.jsonl").facts
+    facts[0]["instrument"]["chirp"] |= {"hpf1_khz": 175.0, "hpf2_khz": 350.0}
+    (scan / "manifest.jsonl").write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
+
+
+def test_residuals_are_the_known_ones_and_those_of_processing(scan, tmp_path):
+    told = told_by("sync-report", scan, "--out", tmp_path / "report")
+    told_by("image", scan, "--out", tmp_path / "image")
+    report, quality = content(tmp_path / "report" / "sync.json"), content(tmp_path / "image" / "quality.json")
+    assert report["simulated"] is True
+    slope = published_rig().chirp.slope_hz_per_s
+    for name in ("RH", "RV"):
+        found, stages = report["boards"][name], report["boards"][name]["stages"]
+        assert (found["positions"], found["chirps"]) == (COLUMNS * ROWS, COLUMNS * ROWS * PULSES)
+        assert f"{name}: {found['chirps']} chirps at {found['positions']} positions" in told
+        # Two boards sample the trigger, each evenly within SYNC_NS; the direct path's phase then is any.
+        two_boards_hz = slope * SYNC_NS * 1e-9 * np.sqrt(2 / 12)
+        assert stages["received"]["frequency_hz_std"] == pytest.approx(two_boards_hz, rel=0.15)
+        assert stages["received"]["phase_rad_std"] == pytest.approx(np.pi / np.sqrt(3), rel=0.15)
+        # What is left is noise, once the filter is taken out as it is: its slope would turn frequency into amplitude.
+        for stage in ("aligned", "averaged", "referenced"):
+            assert stages[stage]["amplitude_std"] < 0.004
+            assert stages[stage]["phase_rad_std"] < 1.5 * stages[stage]["phase_rad_bound"] < 0.01
+        for stage, values in quality["boards"][name]["synchronisation"].items():
+            expected = {NAMES[k]: v for k, v in stages[stage].items() if k in NAMES}
+            assert values == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_direct_path_is_where_its_length_and_the_start_frequencies_put_it(scan_of, tmp_path):
+    """In quality.json: smallest, median and largest IF over the positions."""
+    offset_hz, rig = 500e3, published_rig()
+    disturbances = {"ideal": True, "if_offset_hz": offset_hz, "sync_uncertainty_ns": SYNC_NS}
+    scene = scene_of(EVERYWHERE, columns=12, rows=2, pulses=1, disturbances=disturbances)
+    told_by("image", scan_of(tmp_path / "scan", scene), "--out", tmp_path / "out")
+    boards, tx = content(tmp_path / "out" / "quality.json")["boards"], np.array(tx_position_m(rig))
+    reach_hz = rig.chirp.slope_hz_per_s * SYNC_NS * 1e-9  # by which the boards' starts differ at most
+    for board in rig.receivers:
+        path_m = np.linalg.norm(np.array(rx_positions_m(rig, board)) - tx, axis=1).mean()
+        expected = offset_hz + rig.chirp.slope_hz_per_s * path_m / SPEED_OF_LIGHT_M_S
+        found = boards[board.name]["direct_path_hz"]
+        assert expected - reach_hz < found["min"] < expected - 0.3 * reach_hz
+        assert expected + 0.3 * reach_hz < found["max"] < expected + reach_hz
+        assert found["median"] == pytest.approx(expected, abs=0.3 * reach_hz)

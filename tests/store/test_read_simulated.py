@@ -1,0 +1,53 @@
+"""What the simulators write, the host reads: two independent programs, one format."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.sources.open import open_source
+from polysight.host.store.validate import validate
+from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
+from tests.support.rigs import published_rig
+
+RIG = published_rig()
+RAW = {
+    "name": "plate",
+    "grid": {"columns": 4, "rows": 3, "step_x_mm": 10.0, "step_y_mm": 6.0},
+    "plates": [{"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [30.0, 30.0], "metal": True}],
+}
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.02])
+def test_a_simulated_scan_folder_is_whole(tmp_path: Path, loss: float) -> None:
+    scene = decode_scene(RAW, "t").with_disturbances(packet_loss=loss)
+    simulate(RIG, scene, tmp_path / "scan")
+    scan = ScanFolder.load(tmp_path / "scan")
+    radar = SimulatedRig(RIG, scene)
+    assert scan.simulated
+    assert scan.complete
+    assert scan.instrument == radar.rig
+    assert not [f for f in validate(tmp_path / "scan") if f.severity == "error"]
+    for row in scan.plan:
+        for board in ("RH", "RV"):
+            data = scan.read_row(board, row.index)
+            assert data.missing == lost_bytes(radar, board, row)
+            assert data.payload.size == data.frames_expected * 4096
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.02])
+@pytest.mark.parametrize("zero_filling", [True, False])
+def test_both_layouts_read_alike(tmp_path: Path, loss: float, zero_filling: bool) -> None:
+    scene = decode_scene(RAW, "t").with_disturbances(packet_loss=loss)
+    own = open_source(simulate(RIG, scene, tmp_path / "own"))
+    theirs = open_source(simulate(RIG, scene, tmp_path / "a", layout="authors", zero_filling=zero_filling), RIG)
+    assert isinstance(own, ScanFolder)
+    assert theirs.simulated
+    assert theirs.plan == own.plan
+    assert theirs.instrument.chirp == own.instrument.chirp
+    for row in own.rows():
+        for board in ("RH", "RV"):
+            a, b = own.read_row(board, row), theirs.read_row(board, row)  # type: ignore[union-attr]
+            assert np.array_equal(a.payload, b.payload)
+            assert a.missing == b.missing

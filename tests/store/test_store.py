@@ -1,0 +1,286 @@
+"""Manifest, scan folder, events and their validation, damaged in every way."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from polysight.host.capture.segment import write_index
+from polysight.host.store import manifest
+from polysight.host.store.events import EventWriter, read_events
+from polysight.host.store.manifest import ManifestWriter, encode_line, parse
+from polysight.host.store.scan_folder import ScanFolder, new_scan_id
+from polysight.host.store.source import RawSource
+from polysight.host.store.validate import to_json, validate
+from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight.shared.messages import Fault, RunStarted
+from polysight.shared.raster import plan_raster
+from tests.support.acquisition.fake_rig import small_instrument
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+facts = st.dictionaries(st.text(max_size=6).filter(lambda k: k not in ("fact", "crc")), json_values, max_size=4).map(
+    lambda d: {**d, "fact": "row_committed"}
+)
+
+
+@given(st.lists(facts, max_size=4))
+def test_manifest_round_trip(some):
+    raw = b"".join(map(encode_line, some))
+    found = parse(raw)
+    assert found.facts == some
+    assert (found.length, found.torn, found.damaged) == (len(raw), False, [])
+
+
+@given(st.lists(facts, min_size=1, max_size=3), st.data())
+def test_flipped_bit_is_never_a_fact(some, data):
+    """One flipped bit in a line: that line is refused, all others stand."""
+    lines = [encode_line(f) for f in some]
+    which = data.draw(st.integers(0, len(lines) - 1))
+    bad = bytearray(lines[which])
+    bit = data.draw(st.integers(0, 8 * len(bad) - 1))
+    bad[bit // 8] ^= 1 << bit % 8
+    lines[which] = bytes(bad)
+    found = parse(b"".join(lines))
+    for fact in found.facts:
+        assert fact in some
+    assert len(found.facts) <= len(some)
+    assert found.torn or found.damaged or found.facts == some
+
+
+def test_every_truncation_gives_the_whole_lines_before_it(tmp_path):
+    some = [{"fact": "scan_started", "n": 1}, {"fact": "row_committed", "row": 0}, {"fact": "scan_ended", "x": "é"}]
+    lines = [encode_line(f) for f in some]
+    raw = b"".join(lines)
+    ends = [0, len(lines[0]), len(lines[0]) + len(lines[1]), len(raw)]
+    path = tmp_path / "manifest.jsonl"
+    for n in range(len(raw) + 1):
+        whole = max(k for k, e in enumerate(ends) if e <= n)
+        found = parse(raw[:n])
+        assert found.facts == some[:whole]
+        assert found.torn == (n not in ends)
+        assert found.damaged == []
+        path.write_bytes(raw[:n])
+        with ManifestWriter(path, create=False) as writer:
+            writer.append({"fact": "scan_resumed"})
+        after = manifest.read(path)
+        assert after.facts == [*some[:whole], {"fact": "scan_resumed"}]
+        assert not after.torn
+
+
+def test_two_writers_never_share_a_scan(tmp_path):
+    path = tmp_path / "manifest.jsonl"
+    with ManifestWriter(path, create=True):
+        with pytest.raises(DeviceError, match="another program"):
+            ManifestWriter(path, create=False)
+        with pytest.raises(DeviceError, match="cannot be created"):
+            ManifestWriter(path, create=True)
+    ManifestWriter(path, create=False).close()
+
+
+@pytest.fixture
+def whole(tmp_path) -> Path:
+    """A scan folder of four rows, written without any rig; row 1 of RV lacks some bytes."""
+    instrument = small_instrument()
+    scan = ScanFolder.create(tmp_path / "scan", instrument, plan_raster(instrument.grid), simulated=True)
+    frames = instrument.grid.columns * instrument.burst.pulses
+    events = EventWriter(scan.path / "events.msgpack")
+    events.append(RunStarted(scan_id=scan.scan_id, seq=1, t_mono_ns=1, plan=scan.plan))
+    events.append(Fault(scan_id=scan.scan_id, seq=2, t_mono_ns=2, number=101, what="test"))
+    events.sync()
+    events.close()
+    with scan.writer() as writer:
+        for row in scan.plan:
+            boards = {}
+            for name in ("RH", "RV"):
+                gaps = [(100, 200), (5000, 6000)] if (name, row.index) == ("RV", 1) else []
+                data = np.full(instrument.row_bytes, row.index + 1, dtype=np.uint8)
+                for a, b in gaps:
+                    data[a:b] = 0
+                path = scan.row_path(name, row.index)
+                data.tofile(path)
+                index_crc = write_index(path.with_suffix(".idx"), {"missing": gaps}, np.zeros((2, 2), dtype=np.int64))
+                boards[name] = {
+                    "file": str(path.relative_to(scan.path)),
+                    "bytes": data.size,
+                    "frames_expected": frames,
+                    "frames_received": frames - 2 * bool(gaps),
+                    "missing_bytes": sum(b - a for a, b in gaps),
+                    "crc32": f"{manifest.zlib.crc32(data.tobytes()):08x}",
+                    "index_crc32": f"{index_crc:08x}",
+                }
+            writer.append(
+                {
+                    "fact": "row_committed",
+                    "row": row.index,
+                    "take": 1,
+                    "direction": row.direction,
+                    "boards": boards,
+                    "pulses": frames,
+                }
+            )
+        writer.append({"fact": "scan_ended", "exit_status": "success", "reason": ""})
+    return scan.path
+
+
+def test_whole_scan_is_valid_and_reads_back(whole):
+    assert validate(whole) == []
+    scan: RawSource = ScanFolder.load(whole)
+    assert list(scan.rows()) == [0, 1, 2, 3]
+    assert scan.simulated
+    data = scan.read_row("RV", 1)
+    assert data.missing == [(100, 200), (5000, 6000)]
+    assert data.missing_bytes == 1100
+    assert data.mask is not None
+    assert data.mask.sum() == 1100
+    assert (data.payload[~data.mask] == 2).all()
+    assert data.frames_expected == scan.instrument.burst.pulses * scan.instrument.grid.columns
+
+
+def test_last_take_wins(whole):
+    scan = ScanFolder.load(whole)
+    fact = scan.facts("row_committed")[2]
+    with scan.writer() as writer:
+        writer.append({**fact, "take": 7})
+    scan.reload()
+    assert scan.committed()[2].take == 7
+    assert len(scan.committed()) == 4
+
+
+def flip(path: Path, at: int = 50) -> None:
+    raw = bytearray(path.read_bytes())
+    raw[at] ^= 1
+    path.write_bytes(raw)
+
+
+DAMAGE = {
+    "flipped bit in a row": (lambda p: flip(p / "raw/RH/0002.bin"), "raw/RH/0002.bin", "CRC"),
+    "truncated row": (lambda p: (p / "raw/RV/0000.bin").write_bytes(b"x"), "raw/RV/0000.bin", "1 bytes"),
+    "absent row": (lambda p: (p / "raw/RV/0003.bin").unlink(), "raw/RV/0003.bin", "cannot be read"),
+    "flipped bit in an index": (lambda p: flip(p / "raw/RV/0001.idx", 5), "raw/RV/0001.idx", "CRC"),
+    "absent index": (lambda p: (p / "raw/RV/0001.idx").unlink(), "raw/RV/0001.idx", "absent"),
+    "flipped bit in the manifest": (lambda p: flip(p / "manifest.jsonl", -400), "manifest.jsonl line", "damaged"),
+    "flipped bit in the first line": (lambda p: flip(p / "manifest.jsonl", 40), "manifest.jsonl", "scan_started"),
+    "damaged events": (lambda p: (p / "events.msgpack").write_bytes(b"\xc1\xc1"), "events.msgpack", "not msgpack"),
+    "foreign events": (lambda p: (p / "events.msgpack").write_bytes(b"\x80"), "events.msgpack", "damaged"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_validate_names_each_damage(whole, kind):
+    damage, where, what = DAMAGE[kind]
+    damage(whole)
+    found = [f for f in validate(whole) if f.severity == "error"]
+    assert any(where in f.where and what in f.what for f in found), to_json(found)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"row": 9}, "outside"),
+        ({"direction": -1}, "direction"),
+        ({"pulses": 1}, "pulses"),
+        ({"boards": {}}, "boards"),
+    ],
+)
+def test_validate_compares_with_the_plan(whole, change, what):
+    scan = ScanFolder.load(whole)
+    fact = scan.facts("row_committed")[0]
+    with scan.writer() as writer:
+        writer.append({**fact, **change})
+    assert any(what in f.what for f in validate(whole) if f.severity == "error")
+
+
+def test_notes_damage_nothing(whole):
+    raw = (whole / "manifest.jsonl").read_bytes()
+    (whole / "manifest.jsonl").write_bytes(raw[:-5])
+    (whole / "raw/RH/0009.part").write_bytes(b"half")
+    with (whole / "events.msgpack").open("ab") as f:
+        f.write(b"\x84\xa4")
+    found = validate(whole)
+    assert {f.severity for f in found} == {"note"}
+    assert len(found) == 4
+    assert "0009.part" in str(found)
+
+
+def test_read_row_refuses_damage(whole):
+    flip(whole / "raw/RH/0002.bin")
+    scan = ScanFolder.load(whole)
+    with pytest.raises(DataError, match=r"0002\.bin"):
+        scan.read_row("RH", 2)
+    with pytest.raises(DataError, match="not committed"):
+        scan.read_row("LS", 2)
+    with pytest.raises(DataError, match="not committed"):
+        scan.read_row("RH", 17)
+
+
+def test_what_is_no_scan_is_refused(whole, tmp_path):
+    with pytest.raises(DataError, match="cannot be read"):
+        validate(tmp_path / "nothing")
+    (whole / "manifest.jsonl").write_bytes(b"")
+    with pytest.raises(DataError, match="scan_started"):
+        ScanFolder.load(whole)
+    (whole / "manifest.jsonl").write_bytes(encode_line({"fact": "scan_started", "instrument": {}, "plan": {}}))
+    with pytest.raises(ConfigError):
+        ScanFolder.load(whole)
+    assert validate(whole)[0].severity == "error"
+
+
+def test_every_truncation_of_the_manifest_loads_or_is_refused_clearly(whole):
+    raw = (whole / "manifest.jsonl").read_bytes()
+    first = raw.index(b"\n") + 1
+    for n in [*range(0, first + 1, 97), *range(first, len(raw), 61), len(raw)]:
+        (whole / "manifest.jsonl").write_bytes(raw[:n])
+        try:
+            rows = list(ScanFolder.load(whole).rows())
+        except PolysightError:
+            assert n < first
+            continue
+        assert rows == list(range(min(4, raw[:n].count(b"\n") - 1)))
+        assert [f for f in validate(whole) if f.severity == "error"] == []
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 400))
+def test_truncated_events_go_on_after_the_last_whole_one(tmp_path_factory, cut):
+    path = tmp_path_factory.mktemp("e") / "events.msgpack"
+    writer = EventWriter(path)
+    some = [Fault(scan_id="s", seq=k, t_mono_ns=k, number=1, what="x" * k) for k in range(1, 5)]
+    for event in some:
+        writer.append(event)
+    writer.close()
+    raw = path.read_bytes()
+    path.write_bytes(raw[:cut])
+    log = read_events(path)
+    assert log.events == some[: len(log.events)]
+    assert log.torn == (log.length < min(cut, len(raw)))
+    writer = EventWriter(path)
+    assert writer.last_seq == len(log.events)
+    for event in some[len(log.events) :]:
+        writer.append(event)
+    writer.close()
+    assert path.read_bytes() == raw
+
+
+def test_scan_ids_fit_the_wire():
+    name = new_scan_id(datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC))
+    assert name.startswith("20260304T050607Z-")
+    assert len({new_scan_id() for _ in range(20)}) > 1
+    json.dumps(name)
+
+
+def test_start_that_died_before_its_first_line_is_begun_anew(tmp_path):
+    instrument = small_instrument()
+    for torn in (b"", b'{"fact":"scan_star'):
+        (tmp_path / "manifest.jsonl").write_bytes(torn)
+        assert ScanFolder.create(tmp_path, instrument, plan_raster(instrument.grid)).committed() == {}
+        (tmp_path / "manifest.jsonl").unlink()

@@ -1,0 +1,11 @@
+"""What several tests need: paths, rigs, scenes, processes, and stand-ins for devices. Import it as `tests.support`.
+
+paths, rigs, scenes
+    Where things are; the published rig and changed ones; scene files small enough for a test.
+commands, processes, simulated_rig, pattern_rig, killed_at
+    Commands in this process; commands as processes; the whole simulated rig as processes.
+acquisition, capture, doctor, page, pi, radar, stage, store
+    Stand-ins and helpers of the test folder of the same name, used by other folders too.
+
+Nothing here is a test or a fixture: fixtures are in `tests/conftest.py` and in the `conftest.py` of each folder.
+"""

@@ -1,0 +1,1 @@
+"""A fake Pi, fake capture cards and late frames."""

@@ -1,0 +1,156 @@
+"""Capture cards that only answer commands and send made-up rows, over UDP on loopback."""
+
+from __future__ import annotations
+
+import functools
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+
+from polysight.shared.config import Board
+
+FULL = 1456  # bytes of samples in a full packet
+TAIL_S = 0.6  # from the last data; 2 s of a real card
+
+
+@functools.cache
+def payload_of(board: str, row: int, size: int) -> bytes:
+    seed = sum(board.encode()) * 1000 + row
+    return np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8).tobytes()
+
+
+class FakeCard:
+    """Answers commands from source port 1024 and sends a row on demand; its counters go on from record to record."""
+
+    def __init__(self, board: Board, row_bytes: int) -> None:
+        self.board, self.row_bytes = board, row_bytes
+        self.commands = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.commands.bind((board.card_address, board.command_port))
+        self.commands.settimeout(0.05)
+        self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.out.bind((board.card_address, 1024))
+        self.sequence, self.count = 1, 0
+        self.recording = False
+        self.mute = False
+        self.silent_data = False
+        self.seen: list[int] = []
+        # faults by (row, take): packets to leave out, frames to leave out (as a radar that missed triggers)
+        self.drop: dict[tuple[int, int], set[int]] = {}
+        self.short: dict[tuple[int, int], int] = {}
+        self.missed: dict[tuple[int, int], set[int]] = {}  # pulses, of rows that are sent at their pace
+        self.extra: dict[tuple[int, int], int] = {}  # before this pulse an edge nobody sent; frames are counted
+        self._rest = b""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            try:
+                raw, sender = self.commands.recvfrom(2048)
+            except TimeoutError:
+                continue
+            code = struct.unpack_from("<H", raw, 2)[0]
+            self.seen.append(code)
+            if self.mute:
+                continue
+            self.recording = {5: True, 6: False}.get(code, self.recording)
+            status = 0x0402 if code == 0x0E else 0
+            self.out.sendto(struct.pack("<HHHH", 0xA55A, code, status, 0xEEAA), sender)
+
+    def send_frame(self, row: int, take: int, slot: int, frame_bytes: int) -> None:
+        """The frame of one pulse, unless the radar missed it; packets leave as they fill."""
+        extra, last = self.extra.get((row, take)), slot == self.row_bytes // frame_bytes - 1
+        if slot == extra:
+            self._rest += bytes(frame_bytes)
+        if slot not in self.missed.get((row, take), ()) and not (last and extra is not None):
+            data = payload_of(self.board.name, row, self.row_bytes)
+            self._rest += data[slot * frame_bytes : (slot + 1) * frame_bytes]
+        while len(self._rest) >= FULL:
+            self._send_packet(FULL)
+
+    def end_frames(self) -> None:
+        """The short last packet, and its status."""
+        self._send_packet(len(self._rest))
+        status = struct.pack("<HHHH", 0xA55A, 0x0A, 0x0100, 0xEEAA)
+        self.out.sendto(status, (self.board.host_address, self.board.command_port))
+
+    def _send_packet(self, size: int) -> None:
+        body, self._rest = self._rest[:size], self._rest[size:]
+        head = struct.pack("<IIH", self.sequence, self.count & 0xFFFFFFFF, self.count >> 32)
+        if body:
+            self.out.sendto(head + body, (self.board.host_address, self.board.data_port))
+            self.sequence, self.count = self.sequence + 1, self.count + len(body)
+
+    def send_row(self, row: int, take: int) -> None:
+        if not self.recording or self.silent_data:
+            return
+        data = payload_of(self.board.name, row, self.row_bytes)
+        data = data[: len(data) - self.short.get((row, take), 0)]
+        to = (self.board.host_address, self.board.data_port)
+        for k, start in enumerate(range(0, len(data), FULL)):
+            body = data[start : start + FULL]
+            if k not in self.drop.get((row, take), ()):
+                head = struct.pack("<IIH", self.sequence, self.count & 0xFFFFFFFF, self.count >> 32)
+                self.out.sendto(head + body, to)
+            self.sequence += 1
+            self.count += len(body)
+        status = struct.pack("<HHHH", 0xA55A, 0x0A, 0x0100, 0xEEAA)
+        self.out.sendto(status, (self.board.host_address, self.board.command_port))
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.commands.close()
+        self.out.close()
+
+
+class LateCard(FakeCard):
+    """A card that keeps a row's last short packet for a while, as the real one does, or until the record's stop.
+
+    Sends full packets at once; the rest and the status `TAIL_S` later, or `lag_s` after the reply to a stop.
+    """
+
+    def __init__(self, board: Board, row_bytes: int, lag_s: float) -> None:
+        self._lag_s, self._record = lag_s, 0  # number of the record
+        self._tail: tuple[int, bytes] | None = None  # of which record, and what
+        self._lock = threading.Lock()
+        self.cut: dict[tuple[int, int], int] = {}  # (row, take): so many bytes are all that come
+        super().__init__(board, row_bytes)
+
+    def send_row(self, row: int, take: int) -> None:
+        if not self.recording:
+            return
+        data = payload_of(self.board.name, row, self.row_bytes)[: self.cut.get((row, take), self.row_bytes)]
+        whole = len(data) // FULL * FULL
+        for a in range(0, whole, FULL):
+            self._rest = data[a : a + FULL]
+            self._send_packet(FULL)
+        self._tail = self._record, data[whole:]
+        threading.Timer(TAIL_S, self._finish, [self._record]).start()
+
+    def _finish(self, record: int) -> None:
+        with self._lock:
+            if self._tail is None or self._tail[0] != record:
+                return
+            self._rest, self._tail = self._tail[1], None
+            self.recording = False
+            self.end_frames()
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            try:
+                raw, sender = self.commands.recvfrom(2048)
+            except TimeoutError:
+                continue
+            code = struct.unpack_from("<H", raw, 2)[0]
+            if code == 5:
+                self.recording, self._record = True, self._record + 1
+            self.out.sendto(struct.pack("<HHHH", 0xA55A, code, 0x0402 if code == 0x0E else 0, 0xEEAA), sender)
+            if code == 6 and self.recording:
+                time.sleep(self._lag_s)
+                self._finish(self._record)
+                self.recording = False

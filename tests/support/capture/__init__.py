@@ -1,0 +1,1 @@
+"""Simulated capture cards in this process; recordings made by formula."""

@@ -1,0 +1,54 @@
+"""Records of packets as a card numbers them, and their placement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from polysight.host.capture.dca1000 import encode_packet
+from polysight.host.capture.placement import Counters, Placed, Placement
+
+FULL = 1456  # bytes of samples in a full packet
+
+
+@dataclass
+class Record:
+    data: bytes
+    packets: list[bytes]
+
+    @staticmethod
+    def make(size: int, count: int, sequence: int, seed: int = 0) -> Record:
+        # no zero bytes, so that a wrongly zeroed byte shows
+        data = np.random.default_rng(seed).integers(1, 256, size, dtype=np.uint8).tobytes()
+        starts = range(0, size, FULL)
+        return Record(data, [encode_packet(sequence + k, count + a, data[a : a + FULL]) for k, a in enumerate(starts)])
+
+    def bytes_of(self, k: int) -> tuple[int, int]:
+        return k * FULL, min((k + 1) * FULL, len(self.data))
+
+
+def place(
+    size: int, packets: list[bytes], start: Counters | None = None, frame: int = 1, batch: int = 7
+) -> tuple[Placed, np.ndarray]:
+    out = np.zeros(size, dtype=np.uint8)
+    placement = Placement(out, frame, start)
+    for i in range(0, len(packets), batch):
+        some = packets[i : i + batch]
+        block = np.zeros((len(some), max(map(len, some))), dtype=np.uint8)
+        for k, p in enumerate(some):
+            block[k, : len(p)] = np.frombuffer(p, dtype=np.uint8)
+        placement.place(block, np.array([len(p) for p in some]))
+    return placement.finish(), out
+
+
+def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
+    mask = np.zeros(size, dtype=bool)
+    for a, b in gaps:
+        mask[a:b] = True
+    return mask
+
+
+def is_original_or_masked(record: Record, placed: Placed, out: np.ndarray) -> bool:
+    kept = ~mask_of(out.size, placed.missing)
+    return bool((out[kept] == np.frombuffer(record.data, dtype=np.uint8)[kept]).all())

@@ -1,0 +1,1 @@
+"""Rigs and benches for the doctor."""

@@ -1,0 +1,83 @@
+"""What the tests of the live view have in common: scans that grow on demand, and servers on free ports."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from polysight.host.acquisition.control import ALIVE, CONTROL
+from polysight.host.page.server import make_app, server
+from polysight.host.page.watch import Watch
+from polysight.host.store import manifest
+from polysight.host.store.scan_folder import EVENTS, MANIFEST, utc_now
+from tests.support.processes import LIMIT_S, wait_for
+
+
+class GrowingScan:
+    """A copy of a finished scan whose manifest and events come line by line; a sign of life is given on demand."""
+
+    def __init__(self, finished: Path, folder: Path) -> None:
+        self._facts = manifest.read(finished / MANIFEST).facts
+        self._events = (finished / EVENTS).read_bytes()
+        self.path = folder
+        folder.mkdir()
+        shutil.copytree(finished / "raw", folder / "raw")
+
+    def grow(self) -> str:
+        """Write the next fact, and the events it knows of; returns its name, empty when there is none left."""
+        if not self._facts:
+            return ""
+        fact = self._facts.pop(0)
+        fact |= {key: utc_now() for key in fact if key.endswith("_utc")}
+        known = fact.get("events", {}).get("bytes", 0)
+        if known:
+            (self.path / EVENTS).write_bytes(self._events[:known])
+        self.write(fact)
+        return str(fact["fact"])
+
+    def write(self, fact: manifest.Fact) -> None:
+        """Write a fact of one's own."""
+        with (self.path / MANIFEST).open("ab") as f:
+            f.write(manifest.encode_line(fact))
+
+    def grow_to(self, fact: str) -> None:
+        """Write facts up to the next one of this name."""
+        while self.grow() != fact:
+            assert self._facts, f"no {fact} left"
+
+    def live(self) -> None:
+        """Give a sign of life."""
+        (self.path / CONTROL).mkdir(exist_ok=True)
+        (self.path / CONTROL / ALIVE).touch()
+
+
+class Served:
+    """A live view: on a port of loopback that is free, or where it is told to be."""
+
+    def __init__(self, watch: Watch, token: str, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._server = server(make_app(watch, token, loopback=host == "127.0.0.1"))
+        self._server.config.host, self._server.config.port = host, port
+        self._thread = threading.Thread(target=self._server.run)
+        self._thread.start()
+        wait_for(lambda: self._server.started, "the server serves")
+        self.port = int(self._server.servers[0].sockets[0].getsockname()[1])
+        self.address = f"http://{host}:{self.port}"
+
+    def close(self) -> None:
+        """End it."""
+        self._server.should_exit = True
+        self._thread.join(LIMIT_S)
+        assert not self._thread.is_alive(), "the server does not end"
+
+
+@contextmanager
+def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0) -> Iterator[Served]:
+    """A server for the block."""
+    made = Served(watch, token, host, port)
+    try:
+        yield made
+    finally:
+        made.close()

@@ -1,0 +1,58 @@
+"""`polysight-pi` as a process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.support.paths import REPO
+
+PROGRAM = (sys.executable, "-m", "polysight.pi_controller")
+
+
+class Process:
+    """`polysight-pi run`, once it is ready. Its environment can be added to."""
+
+    def __init__(self, config: Path, *args: object, **environment: str) -> None:
+        self.popen = subprocess.Popen(
+            [*PROGRAM, "run", "--config", str(config), *map(str, args)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=REPO,
+            env={**os.environ, **environment},
+        )
+        assert self.popen.stdout is not None
+        self.ready = self.popen.stdout.readline().split()
+        self.events = self.popen.stdout.readline().split()
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
+        """Its exit status and what else it said."""
+        self.popen.send_signal(number)
+        out = self.popen.communicate(timeout=60)
+        return self.popen.returncode, *out
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.popen.poll() is None:
+            self.popen.kill()
+        self.popen.communicate(timeout=60)
+
+
+def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Any command, to its end."""
+    done = subprocess.run(
+        [*PROGRAM, *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=REPO,
+        env={**os.environ, **environment},
+    )
+    assert "Traceback" not in done.stderr
+    return done

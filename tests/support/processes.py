@@ -1,0 +1,157 @@
+"""Commands of both halves as processes, run as a user runs them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import BIN
+
+LIMIT_S = 60.0
+
+
+@dataclass
+class Ended:
+    """A command that has ended."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def message(self) -> str:
+        """The one error message, from its `program:` on. Fails when there is a traceback, none, or more than one."""
+        assert "Traceback" not in self.err, self.err
+        starts = ("polysight ", "error: ", "usage: ")
+        begun = [i for i, line in enumerate(self.err.splitlines()) if line.startswith(starts)]
+        assert len(begun) == 1, self.err
+        return "\n".join(self.err.splitlines()[begun[0] :])
+
+
+def wait_for(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
+    """Return when the condition holds; fail after the limit."""
+    deadline = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {limit_s} s: {what}"
+        time.sleep(0.005)
+
+
+def processes_naming(text: str) -> dict[int, str]:
+    """Command lines of living processes in which `text` occurs."""
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            with suppress(OSError):
+                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+                if text in line:
+                    found[int(entry.name)] = line
+    return found
+
+
+class Program:
+    """A command in a process group of its own, its output in files."""
+
+    def __init__(self, command: Sequence[str | Path], folder: Path, cwd: Path, env: dict[str, str] | None) -> None:
+        self._out, self._err = folder / f"out-{time.monotonic_ns()}", folder / f"err-{time.monotonic_ns()}"
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self.process = subprocess.Popen(
+                [str(word) for word in command],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                cwd=cwd,
+                env={**os.environ, **(env or {})},
+                start_new_session=True,
+            )
+
+    @property
+    def out(self) -> str:
+        """What it has written to stdout so far."""
+        return self._out.read_text(encoding="utf-8")
+
+    @property
+    def err(self) -> str:
+        """What it has written to stderr so far."""
+        return self._err.read_text(encoding="utf-8")
+
+    def interrupt(self) -> None:
+        """Ctrl-C: SIGINT to the process group."""
+        os.killpg(self.process.pid, signal.SIGINT)
+
+    def wait(self, limit_s: float = LIMIT_S) -> Ended:
+        """Its end; fails when it does not come within the limit."""
+        try:
+            status = self.process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            pytest.fail(f"{self.process.args} hangs; it said:\n{self.out}\n{self.err}")
+        return Ended(status, self.out, self.err)
+
+    def wait_ready(self) -> str:
+        """The rest of its `ready` line."""
+
+        def there() -> bool:
+            assert self.process.poll() is None, self.err
+            return self.out.startswith("ready ") and "\n" in self.out
+
+        wait_for(there, f"{self.process.args} ready")
+        return self.out.partition("\n")[0].removeprefix("ready ")
+
+    def kill(self) -> None:
+        """SIGKILL to it alone, as the kernel kills a process."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+    def end(self) -> None:
+        """SIGTERM, and SIGKILL when that does not help."""
+        if self.process.poll() is None:
+            self.process.terminate()
+            try:
+                self.process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                self.kill()
+                pytest.fail(f"{self.process.args} does not end on SIGTERM")
+
+
+class Bench:
+    """Starts programs in a folder and ends them all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.programs: list[Program] = []
+
+    def start(self, *command: str | Path, env: dict[str, str] | None = None) -> Program:
+        """Start a command of this environment's bin folder."""
+        program = Program([BIN / command[0], *command[1:]], self.folder, self.folder, env)
+        self.programs.append(program)
+        return program
+
+    def run(self, *command: str | Path, env: dict[str, str] | None = None, limit_s: float = LIMIT_S) -> Ended:
+        """Run a command to its end."""
+        return self.start(*command, env=env).wait(limit_s)
+
+    def polysight(self, *arguments: str | Path, limit_s: float = LIMIT_S) -> Ended:
+        """Run a command of the host."""
+        return self.run("polysight", *arguments, limit_s=limit_s)
+
+    def wait_for(self, condition: Callable[[], bool], what: str) -> None:
+        """Return when the condition holds; fail after a minute."""
+        wait_for(condition, what)
+
+    def processes(self) -> dict[int, str]:
+        """Command lines of living processes that name this folder."""
+        return processes_naming(str(self.folder))
+
+    def close(self) -> None:
+        """End everything, the last one first."""
+        for program in reversed(self.programs):
+            program.end()

@@ -1,0 +1,1 @@
+"""Boards under native control in virtual time."""

@@ -1,0 +1,60 @@
+"""A rig under native control, virtual time, and simulated boards behind words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from polysight.shared.config import Instrument, NativeRadar, Radar
+from polysight.simulators.radars import FUNCTIONAL, RadarBoard
+from tests.support.rigs import published_rig
+
+
+class VirtualClock:
+    """Time that passes by waiting, and a little by looking."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def now(self) -> float:
+        self.time += 1e-6
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.time += seconds
+
+
+class BoardWords:
+    """The word link of a simulated board, without USB between."""
+
+    def __init__(self, board: RadarBoard, clock: VirtualClock) -> None:
+        self.board, self.clock = board, clock
+        self.closed = False
+
+    def write(self, words: Sequence[int]) -> None:
+        for word in words:
+            self.clock.sleep(2e-6)
+            self.board.write_word(word)
+
+    def read(self, count: int) -> list[int]:
+        self.clock.sleep(2e-6 * count)
+        return [self.board.read_word() for _ in range(count)]
+
+    def interrupt(self) -> bool:
+        return self.board.interrupt
+
+    def reset(self, held: bool) -> None:
+        self.board.sense(FUNCTIONAL)
+        self.board.reset(held)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def native_rig() -> Instrument:
+    """The published rig under native control, each receiver's direct path in the middle of its IF window."""
+    rig = published_rig()
+    boards = tuple(b if b.role == "transmit" else msgspec.structs.replace(b, start_offset_hz=790e3) for b in rig.boards)
+    radar = Radar(control="native", native={b.name: NativeRadar(usb_serial=f"FT{b.name}") for b in boards})
+    return msgspec.structs.replace(rig, boards=boards, radar=radar)

@@ -1,0 +1,46 @@
+"""The published rig, and rigs that differ from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.tables import decode, to_builtins
+from tests.support.paths import RIG_FILE
+
+MID_BAND_OFFSET_HZ = 790e3  # start offset of a receiver that puts the direct path mid-band
+Change = Callable[[dict[str, Any]], None]
+
+
+def published_rig() -> Instrument:
+    """The rig of instrument.toml."""
+    return load_instrument(RIG_FILE)
+
+
+def rig_table() -> dict[str, Any]:
+    """The published rig as plain values, to be changed and written or decoded."""
+    return to_builtins(published_rig())
+
+
+def rig_with(change: Change | None = None, **tables: dict[str, Any]) -> Instrument:
+    """The published rig with some keys of tables replaced, then changed by hand.
+
+    `rig_with(grid={"columns": 3}, burst={"pulses": 2})`; `change` gets the whole rig as plain values.
+    """
+    table = rig_table()
+    for name, keys in tables.items():
+        table[name] |= keys
+    if change is not None:
+        change(table)
+    return decode(table, Instrument, "test")
+
+
+def programmed_rig(offset_hz: float = MID_BAND_OFFSET_HZ, **tables: dict[str, Any]) -> Instrument:
+    """As :func:`rig_with`, with this start offset of every receiver; by default the direct path is mid-band."""
+
+    def program(table: dict[str, Any]) -> None:
+        for board in table["boards"]:
+            board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else offset_hz
+
+    return rig_with(program, **tables)

@@ -1,0 +1,97 @@
+"""The whole simulated rig as processes, with its Pi."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import tomli_w
+
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import PolysightError
+from polysight.shared.tables import decode, to_builtins
+from tests.support.paths import RIG_FILE
+from tests.support.processes import Bench, Program, wait_for
+from tests.support.scenes import small_scene
+
+SCENE = small_scene(12, 6, pulses=4, pixels=40, pixel_mm=4.0)
+
+
+class Rig(Bench):
+    """A simulated rig that runs, with its Pi; `scan` and `folder/"rig.toml"` are for the host."""
+
+    def __init__(self, folder: Path, time_scale: float, env: dict[str, str] | None, scene: str) -> None:
+        super().__init__(folder)
+        self._scene = scene
+        self._env = env
+        self.config = folder / "rig.toml"
+        self._time_scale = time_scale
+
+    def begin(self) -> None:
+        """Start the simulators and the Pi."""
+        folder = self.folder
+        (folder / "scene.toml").write_text(self._scene)
+        self.simulators = self.start(
+            "python", "-m", "polysight.simulators.rig", "--config", RIG_FILE, "--scene", folder / "scene.toml",
+            "--dir", folder / "rig", "--time-scale", str(self._time_scale), env=self._env,
+        )  # fmt: skip
+        base = Path(self.simulators.wait_ready())
+        table = to_builtins(load_instrument(base))
+        table["limits"] |= {"command_timeout_s": 1.5, "end_of_record_s": 1.0}
+        table["pi"]["heartbeat_ms"] = 100
+        self.instrument = decode(table, Instrument, "test")
+        self.config.write_text(tomli_w.dumps(table))
+        self.pi = self.start_pi()
+
+    def start_pi(self) -> Program:
+        """Start the Pi's program; an earlier one has ended."""
+        wires = self.folder / "rig" / "wires.sock"
+        self.pi = self.start("polysight-pi", "run", "--config", self.config, "--wires", wires)
+        self.pi.wait_ready()
+        return self.pi
+
+    def scan(self, *more: str) -> Program:
+        """Start a scan into `folder`."""
+        return self.start("polysight", "scan", "--config", self.config, "--out", self.folder / "scan", *more)
+
+    def wait_mid_row(self, scan: Program, rows: int) -> None:
+        """Until so many rows are committed and something of the next one has come."""
+
+        def there() -> bool:
+            assert scan.process.poll() is None, f"the scan ended too early: {scan.err}"
+            return self.committed() >= rows and self._receiving()
+
+        wait_for(there, f"row {rows} being received")
+
+    def committed(self) -> int:
+        """How many rows of the scan are committed."""
+        with suppress(PolysightError):  # not begun yet
+            return len(ScanFolder.load(self.folder / "scan").committed())
+        return 0
+
+    def _receiving(self) -> bool:
+        """Whether any byte of a row that is not committed has come; the file is made at its full size, as zeros."""
+        with suppress(FileNotFoundError):  # committed this moment
+            return any(any(p.read_bytes()[:4096]) for p in self.folder.glob("scan/raw/*/*.part"))
+        return False
+
+    def close(self) -> None:
+        """End everything; nothing of this rig may live on."""
+        super().close()
+        left = self.processes()
+        assert not left, left
+
+
+@contextmanager
+def running(
+    folder: Path, time_scale: float = 40.0, env: dict[str, str] | None = None, scene: str = SCENE
+) -> Iterator[Rig]:
+    """A simulated rig in `folder` that runs; nothing of it is left afterwards, whatever happened."""
+    made = Rig(folder, time_scale, env, scene)
+    try:
+        made.begin()
+        yield made
+    finally:
+        made.close()

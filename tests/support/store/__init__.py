@@ -1,0 +1,1 @@
+"""A scan without processes, and a disk that fails."""

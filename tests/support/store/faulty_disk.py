@@ -1,0 +1,209 @@
+"""A disk that fails, or a program that is killed, at the n-th thing that is done to one folder.
+
+Only what Python does in this process is seen: every write, fsync, reservation, truncation, and every name made, moved
+or removed below the folder. So a test can count them once and then fail each of them.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal
+
+import pytest
+
+Fault = Literal["full", "short", "killed", "killed within", "power cut"]
+SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "unlink", "ftruncate", "posix_fallocate")
+REAL_OPEN = io.open
+REAL = SimpleNamespace(**{name: getattr(os, name) for name in SEEN})
+GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsync")
+
+
+class Killed(BaseException):
+    """The program ends here: nothing catches this, and whatever runs on its way out reaches the disk no more."""
+
+
+class FaultyDisk:
+    """Counts what is done below `folder`; with a fault, the `at`-th is hit (from 1).
+
+    full
+        It and all that need space after it fail with ENOSPC, until :meth:`free_space`.
+    short
+        As full, but a write that is hit writes half of its bytes first, as a disk does whose last block is taken.
+    killed, killed within
+        The program ends before it, or in the middle of it.
+    power cut
+        The same, and what was not synced may be lost: contents may be the old ones, the new ones, or zeros; names made
+        or moved may not be there.
+    """
+
+    def __init__(self, folder: Path, fault: Fault | None = None, at: int = 0, seed: int = 0) -> None:
+        self._folder, self._fault, self.at = str(folder), fault, at
+        self._random = random.Random(seed)
+        self._dead = self._space = False
+        self.done: list[str] = []
+        self._durable: dict[Path, bytes] = {}  # what of a touched file is on the disk for certain
+        # Names that are not synced yet: their folder, and how to lose them.
+        self._undo: list[tuple[Path, Callable[[], object]]] = []
+
+    def free_space(self) -> None:
+        """The disk takes writes again."""
+        self._space = True
+
+    def _hit(self, what: str, path: Path, half: Callable[[], object] = lambda: None) -> None:
+        """Count one operation, and fail it when it is its turn."""
+        if not str(path).startswith(self._folder):
+            return
+        if self._dead:
+            raise Killed
+        self.done.append(f"{what} {path.name}")
+        n = len(self.done)
+        if self._fault in ("full", "short") and n >= self.at and not self._space and what in GROWS:
+            if n == self.at and self._fault == "short":
+                half()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        if self._fault in ("killed", "killed within", "power cut") and n == self.at:
+            if self._fault != "killed":
+                half()
+            self._dead = True
+            raise Killed
+
+    # --- what a power cut leaves ---
+
+    def _touch(self, path: Path) -> None:
+        if str(path).startswith(self._folder):
+            self._durable.setdefault(path, path.read_bytes() if path.exists() else b"")
+
+    def _synced(self, path: Path) -> None:
+        if path.is_dir():
+            self._undo = [(folder, back) for folder, back in self._undo if folder != path]
+        elif path in self._durable:
+            del self._durable[path]
+
+    def lose_power(self) -> None:
+        """Draw what of the unsynced is left. Names are lost from the newest on: file systems keep their order."""
+        for path, durable in self._durable.items():
+            if path.exists():
+                now = path.read_bytes()
+                torn = durable + bytes(max(0, len(now) - len(durable)))
+                path.write_bytes(self._random.choice([durable, now, torn, now[: self._random.randint(0, len(now))]]))
+        for _, back in reversed(self._undo[self._random.randint(0, len(self._undo)) :]):
+            back()
+
+    # --- the operations ---
+
+    @contextmanager
+    def __call__(self) -> Iterator[FaultyDisk]:
+        """Within the block everything goes through here."""
+        calls = {"open": self._os_open, "pwrite": self._pwrite, "fsync": self._fsync, "mkdir": self._mkdir}
+        calls |= {"rename": self._rename, "unlink": self._unlink}
+        calls |= {name: partial(self._on_file, name) for name in ("ftruncate", "posix_fallocate")}
+        with pytest.MonkeyPatch.context() as patch:
+            for name, call in calls.items():
+                patch.setattr(os, name, call)
+            patch.setattr(io, "open", self._opened)
+            try:
+                yield self
+            finally:
+                killed = self._dead
+        if killed and self._fault == "power cut":
+            self.lose_power()
+
+    def _opened(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **named: Any) -> Any:
+        path = Path(str(file))
+        if isinstance(file, int) or not str(path).startswith(self._folder) or not set(mode) & set("wxa+"):
+            return REAL_OPEN(file, mode, buffering, *more, **named)
+        new = not path.exists()
+        if new:
+            self._hit("create", path)
+        self._touch(path)
+        raw = _SeenFile(self, str(path), mode.replace("b", ""))
+        if new:
+            self._undo.append((path.parent, lambda: path.unlink(missing_ok=True)))
+        if buffering == 0:
+            return raw
+        return io.BufferedRandom(raw) if "+" in mode else io.BufferedWriter(raw)
+
+    def _os_open(self, path: Any, flags: int, *more: Any, **named: Any) -> int:
+        new = flags & os.O_CREAT and not Path(path).exists()
+        if new:
+            self._hit("create", Path(path))
+        fd = REAL.open(path, flags, *more, **named)
+        if new and str(path).startswith(self._folder):
+            self._durable.setdefault(Path(path), b"")
+            self._undo.append((Path(path).parent, lambda: Path(path).unlink(missing_ok=True)))
+        return fd
+
+    def _pwrite(self, fd: int, data: Any, offset: int) -> int:
+        path = _path_of(fd)
+        self._touch(path)
+        self._hit("pwrite", path, lambda: REAL.pwrite(fd, bytes(data)[: len(data) // 2], offset))
+        return REAL.pwrite(fd, data, offset)
+
+    def _on_file(self, name: str, fd: int, *more: Any) -> Any:
+        self._touch(_path_of(fd))
+        self._hit(name, _path_of(fd))
+        return getattr(REAL, name)(fd, *more)
+
+    def _fsync(self, fd: int) -> None:
+        self._hit("fsync", _path_of(fd))
+        self._synced(_path_of(fd))  # not the real one: this machine's disk need not wait
+
+    def _mkdir(self, path: Any, *more: Any, **named: Any) -> None:
+        self._hit("mkdir", Path(path))
+        REAL.mkdir(path, *more, **named)
+        if str(path).startswith(self._folder):
+            self._undo.append((Path(path).parent, Path(path).rmdir))
+
+    def _rename(self, a: Any, b: Any, **named: Any) -> None:
+        a, b = Path(a), Path(b)
+        self._hit("rename", b)
+        before = b.read_bytes() if b.exists() else None
+        REAL.rename(a, b, **named)
+        self._durable.pop(b, None)
+        if a in self._durable:
+            self._durable[b] = self._durable.pop(a)
+
+        def back() -> None:
+            if b.exists():
+                REAL.rename(b, a)
+            if before is not None:
+                b.write_bytes(before)
+
+        self._undo.append((b.parent, back))
+
+    def _unlink(self, path: Any, **named: Any) -> None:
+        self._hit("unlink", Path(path))
+        REAL.unlink(path, **named)
+        self._durable.pop(Path(path), None)
+
+
+class _SeenFile(io.FileIO):
+    """A file whose writes the disk sees."""
+
+    def __init__(self, disk: FaultyDisk, path: str, mode: str) -> None:
+        self._disk = disk
+        super().__init__(path, mode)
+
+    def write(self, data: Any) -> int:
+        path, start = Path(str(self.name)), self.tell()
+        self._disk._touch(path)
+        self._disk._hit("write", path, lambda: REAL.pwrite(self.fileno(), bytes(data)[: len(data) // 2], start))
+        return super().write(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        self._disk._touch(Path(str(self.name)))
+        self._disk._hit("truncate", Path(str(self.name)))
+        return super().truncate(size)
+
+
+def _path_of(fd: int) -> Path:
+    """The path that a descriptor is open at."""
+    return Path(f"/proc/self/fd/{fd}").readlink()

@@ -1,0 +1,254 @@
+"""A scan without processes: the host's own run and resume, the Pi's own ledger and journal, and simulated samples.
+
+Everything that is written to a disk is written by the code that writes it in the instrument; only wires, sockets and
+time are left out. A whole scan takes some milliseconds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polysight.host.acquisition import scan as host_run
+from polysight.host.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
+from polysight.host.capture.receiver import RowCapture
+from polysight.host.capture.segment import Segment, write_index
+from polysight.host.pipeline import Pipeline
+from polysight.host.store import manifest
+from polysight.host.store.scan_folder import MANIFEST, PART, ScanFolder
+from polysight.pi_controller.journal import JournalFolder, JournalFullError
+from polysight.pi_controller.ledger import Ledger
+from polysight.shared import messages as m
+from polysight.shared.config import Instrument
+from polysight.shared.errors import PolysightError
+from polysight.shared.raster import plan_raster
+from polysight.shared.tables import decode, to_builtins
+from polysight.simulators.scene import SimulatedRig, load_scene, row_offsets_mm
+from tests.support.rigs import published_rig
+from tests.support.scenes import small_scene
+
+SCENE = small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
+
+
+class Samples:
+    """The simulated samples of every row: the same for every take of it."""
+
+    def __init__(self, folder: Path) -> None:
+        (folder / "scene.toml").write_text(SCENE)
+        radar = SimulatedRig(published_rig(), load_scene(folder / "scene.toml"))
+        table = to_builtins(radar.rig)
+        table["limits"] |= {"free_disk_bytes": 0}
+        self.instrument = decode(table, Instrument, "small scan")
+        self._rows: dict[tuple[str, int], bytes] = {}
+        for row in plan_raster(radar.rig.grid):
+            x, y = row_offsets_mm(radar, row)
+            for board in radar.rig.recorded:
+                self._rows[board.name, row.index] = radar.chirps(board.name, x, y, row.index * len(x)).tobytes()
+
+    def of(self, board: str, row: int) -> bytes:
+        """Payload of one row."""
+        return self._rows[board, row]
+
+
+class SmallPi:
+    """The Pi's ledger and journal, and rows that are over at once. Stands for PiClient."""
+
+    def __init__(self, instrument: Instrument, folder: Path) -> None:
+        self._instrument = instrument
+        self._journals = JournalFolder(folder)
+        self.published: list[bytes] = []
+        self._ledger = Ledger(self._journals, self.published.extend)
+        self._plan = plan_raster(instrument.grid)
+        self._scan_id, self._seen = "", 0
+        self._take: Any = None
+        self.state: m.State = "ready"
+        self.fault = ""
+        self.gaps_filled = 0
+        self.event_socket = os.eventfd(1)  # always something to look at
+
+    def follow(self, scan_id: str, last_seq: int, on_event: Any) -> None:
+        self._scan_id, self._seen, self._take = scan_id, last_seq, on_event
+
+    def _commit(self, *events: m.AnyEvent) -> None:
+        """As the executor does: what cannot be journalled puts the Pi into fault."""
+        for event in events:
+            self._ledger.add(event)
+        try:
+            self._ledger.commit()
+        except JournalFullError as e:
+            self.state, self.fault = "fault", str(e)
+
+    def begin_run(self, run: m.BeginRun) -> None:
+        try:
+            resumed, lost = self._ledger.open(run.scan_id, run.plan, run.last_seq)
+        except PolysightError as e:
+            raise host_run.ScanError(f"the Pi refused BeginRun: {e.what}", e.why, e.remedy) from None
+        self._commit(m.RunStarted(**NEW, plan=run.plan, resumed=resumed, lost=lost))
+
+    def status(self) -> m.StatusReply:
+        return m.StatusReply(
+            state=self.state, homed=True, x_mm=0, y_mm=0, scan_id=self._scan_id, row_index=-1, take=0, points=0,
+            pulses=0, last_seq=self._ledger.last_seq, fault=109 if self.state == "fault" else 0, reason=self.fault,
+        )  # fmt: skip
+
+    def run_row(self, scan_id: str, row_index: int, take: int) -> None:
+        assert scan_id == self._scan_id
+        row, n = self._plan.row(row_index), self._instrument.burst.pulses
+        self._commit(m.RowStarted(**NEW, row=row, take=take))
+        points = [
+            m.Capture(
+                **NEW, row_index=row.index, take=take, point=i, column=row.column(i), edge_ns=i, first_pulse_ns=i,
+                last_pulse_ns=i, pulses=n, width_max_ns=1, jitter_ns=1,
+            )
+            for i in range(row.points)
+        ]  # fmt: skip
+        self._commit(*points)
+        end = m.RowFinished(
+            **NEW, row_index=row.index, take=take, status="done", points=row.points, edges=row.points,
+            bursts=row.points, pulses=row.points * n,
+        )  # fmt: skip
+        if self.state != "fault":
+            self._commit(end)
+
+    def events(self) -> list[m.AnyEvent]:
+        """What is in the journal and was not seen yet."""
+        found = self._ledger.replay(self._scan_id, self._seen + 1, 10000).events
+        for event in found:
+            assert event.seq == self._seen + 1, "the sequence has a gap"
+            self._seen = event.seq
+            self._take(event)
+        return found
+
+    def drain(self) -> None:
+        """Nothing is under way."""
+
+    def end_run(self, scan_id: str, exit_status: m.ExitStatus, reason: str) -> None:
+        assert scan_id == self._scan_id
+        self._commit(m.RunStopped(**NEW, exit_status=exit_status, reason=reason))
+        self.events()
+
+    def home(self) -> None:
+        self.state, self.fault, self._ledger.broken = "ready", "", False
+
+    def come_to_rest(self, reason: str) -> None:
+        """Nothing moves."""
+
+    def abort(self, reason: str) -> None:
+        raise AssertionError(f"nothing asks for an abort here: {reason}")
+
+    def lose(self) -> None:
+        """The program is gone; its files stay as they are."""
+        os.close(self.event_socket)
+        self._journals.close()
+
+
+class SmallRig:
+    """Every byte comes. Stands for CaptureRig; rows are written as its receivers write them."""
+
+    def __init__(self, samples: Samples) -> None:
+        self._samples = samples
+        self.warnings: list[str] = []
+        self.receivers: dict[str, Any] = {}
+        self.cards: dict[str, Any] = {}
+        self.complete = True
+        self._segments: dict[str, Segment] = {}
+        self._row = (0, 0)
+
+    def begin_row(self, row: int, take: int, points: int, folder: Path) -> None:
+        del points
+        self._row = (row, take)
+        for board in self._samples.instrument.recorded:
+            path = folder / "raw" / board.name / f"{row:04d}{PART}"
+            self._segments[board.name] = Segment(path, self._samples.instrument.row_bytes)
+
+    def statuses(self) -> dict[str, Any]:
+        return {}
+
+    def reports(self) -> dict[str, Any]:
+        return {}
+
+    def end_row(self) -> dict[str, RowCapture]:
+        return {name: self._end(name, segment) for name, segment in self._segments.items()}
+
+    def _end(self, name: str, segment: Segment) -> RowCapture:
+        row, take = self._row
+        data = self._samples.of(name, row)
+        segment.data[:] = np.frombuffer(data, dtype=np.uint8)
+        crc = segment.finish()
+        index = write_index(segment.path.with_suffix(".idx"), {"missing": []}, np.zeros((1, 2), dtype=np.int64))
+        zero = dict.fromkeys(("duplicates", "late", "outside", "disagreeing", "malformed", "short", "strangers"), 0)
+        return RowCapture(
+            row=row, take=take, expected=len(data), bytes=len(data), missing=[], located=True, reason="", packets=1,
+            **zero, stale=0, kernel_drops=0, first_arrival_ns=0, last_arrival_ns=0, crc32=crc, index_crc32=index,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Forget the row."""
+        for segment in self._segments.values():
+            segment.close()
+
+
+class SmallScan:
+    """One scan in `folder`/scan with its journal in `folder`/journal, run and resumed as often as one likes."""
+
+    def __init__(self, samples: Samples, folder: Path) -> None:
+        self._samples = samples
+        self.path, self.journals = folder / "scan", folder / "journal"
+        self.told: list[str] = []
+        self.acknowledged: set[int] = set()
+
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        """In place of the sockets: a Pi that has just been started, or one that goes on."""
+        instrument = self._samples.instrument
+        with ExitStack() as stack:
+            pi = SmallPi(instrument, self.journals)
+            stack.callback(pi.lose)
+            rig = SmallRig(self._samples)
+            stack.callback(rig.close)
+            hello = m.HelloReply(pi_release="t", firmware="t", backend="wires", state="homed", scan_id="", last_seq=0)
+            patch = stack.enter_context(pytest.MonkeyPatch.context())
+            patch.setattr(host_run, "_connect", lambda *_: (pi, rig, hello))
+            yield
+
+    def run(self) -> ScanResult:
+        """Begin the scan, or go on with it when it is begun."""
+        with self._connected():
+            if self.begun:
+                return resume_scan(self.path, progress=self._tell)
+            return run_scan(self._samples.instrument, self.path, progress=self._tell)
+
+    @property
+    def begun(self) -> bool:
+        """Whether the manifest has its first line."""
+        path = self.path / MANIFEST
+        return path.exists() and manifest.read(path).length > 0
+
+    def _tell(self, progress: ScanProgress) -> None:
+        self.told.append(progress.message)
+        if progress.phase == "committed":
+            self.acknowledged.add(progress.row)
+
+    def rows(self) -> dict[str, str]:
+        """SHA-256 of the payload of every committed row."""
+        committed = ScanFolder.load(self.path).committed().values()
+        files = [self.path / board.file for row in committed for board in row.boards.values()]
+        return {str(f.relative_to(self.path)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
+
+    def image(self) -> bytes:
+        """The final image's bytes, both channels and their mask."""
+        pipeline = Pipeline(ScanFolder.load(self.path))
+        for row in pipeline.source.rows():
+            pipeline.add_row(row)
+        images = pipeline.form_images()
+        return b"".join(part.tobytes() for part in (images.h, images.v, images.valid))
+
+
+NEW: dict[str, Any] = {"scan_id": "", "seq": 0, "t_mono_ns": 0}

@@ -1,4 +1,4 @@
-"""Recorded rows of a scan, synchronised: raw rows by the chain, rows of published cubes by bringing them to our form."""
+"""Recorded rows of a scan, synchronised: raw rows by the chain, rows of published cubes by bringing them to its form."""
 
 from __future__ import annotations
 

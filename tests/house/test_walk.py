@@ -1,4 +1,4 @@
-"""docs/architecture.md names the way from a packet to a name: every stop exists, and a scan passes them in this order."""
+"""docs/architecture.md names the way from a packet to a name: every stop exists, a scan passes them in this order."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """`polysight calibrate` and `polysight leakage`: what recorded scans say of the rig.
 
 Each `calibrate` command looks at scans, writes one dated file, and says what that changes; neither the scans nor the
-rig file are written. `leakage` prints what belongs into the rig file's [polarimetry]. Scans of a metal plate become the
-reference by position (`load_reference`).
+rig file are written. `leakage` prints what belongs into the rig file's [polarimetry].
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Radar samples from DCA1000 capture cards: control, reception, placement by byte count, decoding.
 
-`CardClient` controls a card over UDP, `survey_cards` tries each hop to it. One process a card (`receiver_process`, driven
-by `ReceiverProcess`) places packets into the row's file; `RowCapture` says what is missing. `row_words` turns payload into
-samples. `inspect_bin` and `inspect_pcap` say what is in any recording.
+`CardClient` controls a card over UDP, `survey_cards` tries each hop to it. One process a card (`receiver_process`,
+driven by `ReceiverProcess`) places packets into the row's file; `RowCapture` says what is missing. `row_words` turns
+payload into samples. `inspect_bin` and `inspect_pcap` say what is in any recording.
 """
 
 from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom

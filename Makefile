@@ -7,7 +7,7 @@ OUT ?= out
 JOBS ?= 2
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test test-long test-uml check bench firmware flash pi-install library reproduce docs clean
+.PHONY: help demo test test-long test-uml quick check bench firmware flash pi-install library reproduce docs clean
 
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,16 @@ test-long: $(VENV)/installed  ## tests at full length: 10,000 random rows and 1,
 test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode Linux built from Debian's source (10 minutes, once)
 	@./tests/install-tools.sh kernel
 	$(BIN)/python -m pytest tests/uml --uml -rP
+
+CHANGED = $(shell git diff --name-only --diff-filter=d HEAD -- host papers pi_controller shared simulators 2>/dev/null | grep '\.py$$')
+LAWS := tests/house/test_rooms.py tests/shared tests/polarimetry tests/sync/test_tone.py tests/imaging/test_direct.py
+
+quick: $(VENV)/installed  ## under a minute: lint, types of what differs from the last commit, the fastest laws
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(if $(CHANGED),$(BIN)/pyright $(CHANGED),@echo "types: nothing differs from the last commit")
+	$(BIN)/lint-imports >/dev/null || $(BIN)/lint-imports
+	$(BIN)/python -m pytest -q -n $(JOBS) $(LAWS)
 
 check: $(VENV)/installed  ## lint, format, types, import contracts
 	$(BIN)/ruff check .

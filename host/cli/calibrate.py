@@ -44,42 +44,41 @@ def add_commands(add: Add) -> None:
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 
 
-def _add_calibrate(add: Add) -> None:
-    """`polysight calibrate` and its actions."""
-    sub = add(
-        "calibrate",
-        _direct_path,
-        "measure the rig with itself: places, filters, metal reference, start frequencies; from recorded scans",
-        "polysight calibrate direct-path scans/points --target points.toml",
+def _add_action(
+    actions: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    text: str,
+    example: str,
+) -> argparse.ArgumentParser:
+    part = actions.add_parser(
+        name,
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}. Writes one dated file, and nothing else.",
+        epilog=f"example:\n  {example}",
+        formatter_class=_FORM,
     )
-    actions = sub.add_subparsers(dest="action", required=True, metavar="WHAT")
+    part.set_defaults(run=run)
+    part.add_argument(
+        "--out",
+        type=Path,
+        default=Path("calibration"),
+        metavar="DIR",
+        help="folder of the file (default: calibration)",
+    )
+    part.add_argument(
+        "--config",
+        type=Path,
+        metavar="RIG",
+        help="rig file, for recordings that bring none; for direct-path also: refine its places, not the scan's",
+    )
+    part.add_argument("--json", action="store_true", help="print JSON, for programs")
+    return part
 
-    def action(name: str, run: Callable[[argparse.Namespace], int], text: str, example: str) -> argparse.ArgumentParser:
-        part = actions.add_parser(
-            name,
-            help=text,
-            description=f"{text[0].upper()}{text[1:]}. Writes one dated file, and nothing else.",
-            epilog=f"example:\n  {example}",
-            formatter_class=_FORM,
-        )
-        part.set_defaults(run=run)
-        part.add_argument(
-            "--out",
-            type=Path,
-            default=Path("calibration"),
-            metavar="DIR",
-            help="folder of the file (default: calibration)",
-        )
-        part.add_argument(
-            "--config",
-            type=Path,
-            metavar="RIG",
-            help="rig file, for recordings that bring none; for direct-path also: refine its places, not the scan's",
-        )
-        part.add_argument("--json", action="store_true", help="print JSON, for programs")
-        return part
 
-    part = action(
+def _add_direct_path(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    part = _add_action(
+        actions,
         "direct-path",
         _direct_path,
         "where receivers and object plane really are, from a scan of points at known places",
@@ -100,14 +99,29 @@ def _add_calibrate(add: Add) -> None:
         metavar="MM",
         help="how well boards and plane were measured by hand, one standard deviation (default: 5 mm)",
     )
-    part = action(
+
+
+def _add_calibrate(add: Add) -> None:
+    """`polysight calibrate` and its actions."""
+    sub = add(
+        "calibrate",
+        _direct_path,
+        "measure the rig with itself: places, filters, metal reference, start frequencies; from recorded scans",
+        "polysight calibrate direct-path scans/points --target points.toml",
+    )
+    actions = sub.add_subparsers(dest="action", required=True, metavar="WHAT")
+
+    _add_direct_path(actions)
+    part = _add_action(
+        actions,
         "hpf",
         _hpf,
         "the receivers' high-pass filters, from scans of one scene at several start frequencies",
         "polysight calibrate hpf scans/if-200 scans/if-500 scans/if-900 scans/if-1500",
     )
     part.add_argument("scans", type=Path, nargs="+", metavar="SCAN", help="scans, each with another start_offset_hz")
-    part = action(
+    part = _add_action(
+        actions,
         "metal",
         _metal,
         "the gains of both channels at every pixel, from a scan of a metal plate that covers the plane",
@@ -121,7 +135,8 @@ def _add_calibrate(add: Add) -> None:
         metavar="K",
         help="keep K sub-bands of the sweep too, for `polysight process --bands K` (default: none)",
     )
-    part = action(
+    part = _add_action(
+        actions,
         "start-frequency",
         _start_frequency,
         "the start frequency of each receiver that puts its direct path in the middle of the band",

@@ -15,7 +15,7 @@ from polysight.host.jobs.process import train
 from polysight.host.materials import Library
 from polysight.host.polarimetry import fresnel
 from polysight.host.products.files import read_products
-from polysight.host.report.export import material_columns
+from polysight.host.report.exports import material_columns
 from polysight.shared.config import load_instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.simulators.scene import load_scene, simulate

@@ -9,8 +9,8 @@ from polysight.host.capture.card import CardClient, EepromSettings, program_eepr
 from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES, Code, Status, Version
 from polysight.host.capture.decode import decode_row, raw_words, row_words, valid_frames
 from polysight.host.capture.inspect import CardReport, Known, Report, inspect_bin
-from polysight.host.capture.inspect_pcap import inspect_pcap, is_pcap
 from polysight.host.capture.network import check_receive_buffer, route_interface, silent_radar
+from polysight.host.capture.pcap import inspect_pcap, is_pcap
 from polysight.host.capture.receiver import Progress, ReceiverProcess, RowCapture
 from polysight.host.capture.scheduling import receiver_cores, take_priority
 from polysight.host.capture.segment import read_index, write_index

@@ -8,7 +8,7 @@ from polysight.host.sync.align import AlignedRow, align_row, whole_blocks
 from polysight.host.sync.backlash import echo_of_row, estimate_backlash, object_filter
 from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
 from polysight.host.sync.direct_path import reference
-from polysight.host.sync.high_pass import HighPass, fit_high_pass, high_pass
+from polysight.host.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.residuals import STAGES, noise_power
 from polysight.host.sync.rows import RowSynchroniser

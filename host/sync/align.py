@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.sync import high_pass as hpf
+from polysight.host.sync import high_pass_filter as hpf
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.passes import Passes, passes_for
 from polysight.host.sync.tone import Real, Tone, cis

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from polysight.host.capture import raw_words
 from polysight.host.sync import direct_path, residuals
-from polysight.host.sync import high_pass as hpf
+from polysight.host.sync import high_pass_filter as hpf
 from polysight.host.sync.align import align_row
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.shared.config import Board, Chirp, Instrument

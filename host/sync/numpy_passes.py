@@ -11,7 +11,7 @@ import scipy.fft
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from polysight.host.sync import high_pass as hpf
+from polysight.host.sync import high_pass_filter as hpf
 from polysight.host.sync.tone import block_edges, block_times, cis, phasor, refine, search_size, strongest
 
 CHUNK = 8

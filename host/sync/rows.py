@@ -10,7 +10,7 @@ import numpy as np
 from polysight.host.capture import row_words
 from polysight.host.store import CubeRow, RowData, Source
 from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
-from polysight.host.sync.high_pass import HighPass
+from polysight.host.sync.high_pass_filter import HighPass
 from polysight.host.sync.synchronised import CubeForm, recognise
 from polysight.shared.config import Instrument
 

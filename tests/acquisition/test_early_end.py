@@ -8,7 +8,7 @@ import pytest
 from polysight.host.acquisition.capture_rig import CaptureRig
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.capture.dca1000 import Code
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from tests.support.acquisition.fake_cards import FULL, LateCard
 from tests.support.acquisition.fake_rig import FakeRig
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polysight.host.acquisition.scan import run_scan
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 
 POINTS, PULSES = 8, 6
 

@@ -22,7 +22,7 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.acquisition.scan_loop import takes_so_far
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared.errors import DeviceError, ScanError
 from polysight.shared.tables import to_builtins
 

@@ -25,7 +25,7 @@ from polysight.host.jobs import live_scan as live
 from polysight.host.jobs import live_scan as progress
 from polysight.host.process.request import Options
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared import messages as m
 from polysight.shared.errors import DeviceError, PolysightError, ScanError, os_error
 from polysight.shared.faults import explain

@@ -21,7 +21,7 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.progress import NICE
 from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared import messages as m
 from polysight.shared.errors import DeviceError, ScanError
 

@@ -22,7 +22,7 @@ from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import image_grid
 from polysight.host.polarimetry import plane_reference
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.raster import plan_raster

@@ -9,7 +9,7 @@ from polysight.host.calibration.filters import BIN_HZ, LEAST, binned
 from polysight.host.cli.main import main
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.sync.high_pass import HighPass, high_pass
+from polysight.host.sync.high_pass_filter import HighPass, high_pass
 
 OFFSETS_HZ = (60e3, 250e3, 500e3, 850e3, 1250e3)
 TRUE_KHZ = (235.0, 700.0)

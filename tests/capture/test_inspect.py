@@ -10,7 +10,7 @@ import pytest
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.inspect import Known, Report, Shape, inspect_bin
-from polysight.host.capture.inspect_pcap import inspect_pcap, read_pcap
+from polysight.host.capture.pcap import inspect_pcap, read_pcap
 from polysight.host.jobs.look import main_text, plot_profile
 from polysight.shared.errors import DataError
 from tests.support.capture.recordings import real_row, row, write_pcap

@@ -12,7 +12,7 @@ import pytest
 from polysight.host.cli.main import build_parser, main
 from polysight.host.cli.options import joined
 from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.report import write_json
+from polysight.host.products import write_json
 
 E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}
 SEGMENTS = [

@@ -15,7 +15,7 @@ from polysight.host.cli.main import main
 from polysight.host.doctor.bench import System
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.messages import BeginRun

@@ -25,7 +25,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared.messages import RowStarted
 from tests.support.paths import REPO
 from tests.support.scenes import small_scene

@@ -6,7 +6,7 @@ import pytest
 
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared.config import Instrument
 from polysight.shared.tables import decode, to_builtins
 from tests.support.pattern_rig import counts, small_table, start_rig

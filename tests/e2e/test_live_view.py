@@ -14,7 +14,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from tests.support.scenes import small_scene
 
 LIMIT_S = 120.0

@@ -11,7 +11,7 @@ from polysight.host.acquisition import scan as host_run
 from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish, ask, last_sign_of_life
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared.errors import ScanError
 from tests.support.processes import wait_for
 from tests.support.store.small_scan import SmallScan

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from polysight.host.products import folder as products_folder
+from polysight.host.products import write_json
 from polysight.host.products.folder import check_products_folder, making_products
-from polysight.host.report import write_json
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 
 OLD = {"image.npz": b"old", "report.html": b"old page", "figures/h.png": b"old h", "figures/p.png": b"old p"}

@@ -15,8 +15,8 @@ from polysight.host.cli.main import main
 from polysight.host.imaging.images import sub_bands
 from polysight.host.jobs.materials import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
+from polysight.host.products import write_json
 from polysight.host.products.files import MATERIALS, SavedProducts, read_products
-from polysight.host.report import write_json
 from polysight.shared.errors import DataError
 from polysight.shared.tables import to_builtins
 from tests.support.paths import RIG_FILE

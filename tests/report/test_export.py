@@ -12,10 +12,10 @@ import pytest
 import scipy.io
 
 from polysight.host.cli.main import main
+from polysight.host.products import write_image, write_json
 from polysight.host.products.files import read_products
-from polysight.host.report import export as hdf5
-from polysight.host.report import write_image, write_json
-from polysight.host.report.export import material_columns, write_csv, write_hdf5, write_mat
+from polysight.host.report import exports as hdf5
+from polysight.host.report.exports import material_columns, write_csv, write_hdf5, write_mat
 from tests.support.rigs import rig_table
 
 SEGMENTS = [

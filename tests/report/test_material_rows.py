@@ -10,7 +10,7 @@ import pytest
 import scipy.io
 
 from polysight.host.cli.main import main
-from polysight.host.report import write_image, write_json
+from polysight.host.products import write_image, write_json
 
 PATCH = {
     "label": 4, "name": "PET", "confidence": 0.75, "metal_reference": False, "metal_like": True,

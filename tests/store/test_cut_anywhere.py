@@ -13,7 +13,7 @@ import pytest
 
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.pi_controller.journal import records
 from polysight.shared.errors import DataError
 from polysight.shared.messages import RowStarted

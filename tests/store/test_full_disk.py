@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.shared.errors import PolysightError
 from tests.support.store.faulty_disk import GROWS, FaultyDisk
 from tests.support.store.small_scan import Samples, SmallScan

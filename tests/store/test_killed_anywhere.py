@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validate import Finding, validate
+from polysight.host.store.validation import Finding, validate
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.small_scan import Samples, SmallScan
 

@@ -17,7 +17,7 @@ from polysight.host.process.request import Options
 from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validate import damaged_rows, validate
+from polysight.host.store.validation import damaged_rows, validate
 from polysight.shared.errors import ConfigError, DataError, DeviceError, ScanError
 from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.scenes import small_scene

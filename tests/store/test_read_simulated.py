@@ -7,7 +7,7 @@ import pytest
 
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.sources.open import open_source
-from polysight.host.store.validate import validate
+from polysight.host.store.validation import validate
 from polysight.simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
 from tests.support.rigs import published_rig
 

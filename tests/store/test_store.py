@@ -17,7 +17,7 @@ from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
 from polysight.host.store.scan_folder import ScanFolder, new_scan_id
 from polysight.host.store.source import RawSource
-from polysight.host.store.validate import to_json, validate
+from polysight.host.store.validation import to_json, validate
 from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 from polysight.shared.messages import Fault, RunStarted
 from polysight.shared.raster import plan_raster

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from polysight.host.store import append_only as appending
-from polysight.host.store import validate
+from polysight.host.store import validation as validate
 from polysight.host.store.manifest import ManifestWriter
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.errors import DeviceError

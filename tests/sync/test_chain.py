@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.host.sync.high_pass import high_pass
+from polysight.host.sync.high_pass_filter import high_pass
 from polysight.host.sync.tone import estimate_tone
 from polysight.shared.errors import DataError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S

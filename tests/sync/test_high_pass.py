@@ -2,7 +2,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.sync.high_pass import Equaliser, HighPass, filtered, fit_high_pass, high_pass
+from polysight.host.sync.high_pass_filter import Equaliser, HighPass, filtered, fit_high_pass, high_pass
 from polysight.shared.errors import DataError
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from polysight.host.sync import numpy_passes as plain
 from polysight.host.sync.align import align_row
-from polysight.host.sync.high_pass import Equaliser, high_pass
+from polysight.host.sync.high_pass_filter import Equaliser, high_pass
 from polysight.host.sync.passes import passes_for
 
 compiled = pytest.importorskip("polysight.host.sync.compiled", reason="numba is not installed")

@@ -48,7 +48,7 @@ class Pipeline:
             images = self.images.finish()
         with self.quality.timed("point response"):
             self.quality.note(imaging=imaging.imaging_facts(self.images, images))
-        self.quality.note(**self.calibration.facts(), **self.synchroniser.recording_facts())
+        self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 
     def band_images(self) -> tuple[imaging.ChannelImages, ...]:

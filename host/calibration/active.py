@@ -133,13 +133,17 @@ class Calibration:
         return ImagedWith.of(placed, self.high_passes(placed))
 
     def facts(self) -> dict[str, Any]:
-        """For quality.json: `calibration`, the active files by kind; empty when there are none."""
+        """The active files by kind: path, when each was made, and whether from simulated data."""
         kinds = {"direct_path": self.places, "hpf": self.filters, "metal": self.metal}
-        active = {
+        return {
             kind: {"file": str(self._path(kind)), "made_utc": file.made_utc, "simulated": file.simulated}
             for kind, file in kinds.items()
             if file is not None
         }
+
+    def quality_facts(self) -> dict[str, Any]:
+        """For quality.json: :meth:`facts` as `calibration`; empty when there are none."""
+        active = self.facts()
         return {"calibration": active} if active else {}
 
     def name_of(self, kind: str) -> str:

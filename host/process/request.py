@@ -17,7 +17,7 @@ from polysight.host.polarimetry import Incidence, PlaneReference
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 
-LIBRARY = Path(__file__).parent / "materials" / "simulated-library.npz"
+LIBRARY = Path(__file__).parents[1] / "materials" / "simulated-library.npz"
 
 
 @dataclass(frozen=True)

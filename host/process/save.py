@@ -52,6 +52,21 @@ def write_quality(out: Path, quality: dict[str, Any]) -> None:
     write_json(out / "quality.json", quality)
 
 
+def materials_content(
+    source: Scan, found: MaterialsResult, classifier: Classifier | None, unnamed: str = ""
+) -> dict[str, Any]:
+    """Content of materials.json; `unnamed` says why there is no classifier."""
+    return {
+        "scan_id": source.scan_id,
+        "simulated": source.simulated,
+        "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
+        "library": classifier_sentence(classifier) if classifier else unnamed or "Nothing was named.",
+        "model": classifier.model if classifier else None,
+        "pixel_accuracy": pixel_accuracy(found),
+        "segments": found.rows(),
+    }
+
+
 def write_materials(
     out: Path,
     source: Scan,
@@ -72,20 +87,9 @@ def write_materials(
     write_quality(out, quality)
     write_labels(out / LABELS, labels_of(found), f"patches of scan {source.scan_id}, in pixels of image.npz")
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, source.simulated))
-    rows = found.rows()
-    named_by = classifier_sentence(classifier) if classifier else unnamed or "Nothing was named."
-    write_json(
-        out / "materials.json",
-        {
-            "scan_id": source.scan_id,
-            "simulated": source.simulated,
-            "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
-            "library": named_by,
-            "model": classifier.model if classifier else None,
-            "pixel_accuracy": pixel_accuracy(found),
-            "segments": rows,
-        },
-    )
+    materials = materials_content(source, found, classifier, unnamed)
+    rows, named_by = materials["segments"], materials["library"]
+    write_json(out / "materials.json", materials)
     context = context_of(
         found,
         images.x_m,

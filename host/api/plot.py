@@ -11,7 +11,6 @@ from polysight.host.products.datasets import ProcessedScan
 from polysight.host.report.context import ReportContext
 from polysight.host.report.figures import draw_overview
 
-
 _PANEL_IN = 3.8  # width of one picture
 
 

@@ -43,10 +43,11 @@ def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
     for full_name, variable in dataset.data_vars.items():
         name, _, suffix = str(full_name).rpartition("_")
         if variable.attrs.get(_PART) == "real" and f"{name}_imag" in dataset:
-            value = variable + np.complex64(1j) * dataset[f"{name}_imag"]
+            both = np.empty(variable.shape, np.complex64 if variable.dtype == np.float32 else np.complex128)
+            both.real, both.imag = variable.values, dataset[f"{name}_imag"].values
             attrs = {key: text for key, text in variable.attrs.items() if key != _PART}
             attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
-            made[name] = value.assign_attrs(attrs)
+            made[name] = (variable.dims, both, attrs)
         elif variable.attrs.get(_PART) != suffix or suffix != "imag":
             made[str(full_name)] = variable
     return dataset.drop_vars(list(dataset.data_vars)).assign(made)

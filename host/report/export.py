@@ -1,4 +1,4 @@
-"""HDF5: arrays with their axes as dimension scales, units on everything, the rest as attributes."""
+"""Products for other programs: HDF5, NetCDF, Zarr, MATLAB, PNG, CSV."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from polysight.host.products.datasets import CONVENTION
+from polysight.host.products.dataset_files import write_netcdf, write_zarr
+from polysight.host.products.datasets import CONVENTION, full_dataset, read_processed
 from polysight.host.products.files import SavedProducts, read_products
 from polysight.host.products.material_table import material_columns
 from polysight.host.report import ReportContext, figures, write_atomically
@@ -183,7 +184,7 @@ def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
     return paths
 
 
-FORMATS = ("hdf5", "mat", "png", "csv")
+FORMATS = ("hdf5", "netcdf", "zarr", "mat", "png", "csv")
 _FOLDER = "export"
 
 
@@ -197,7 +198,9 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
     """
     if not formats:
         raise ConfigError(
-            "nothing to export", "no format was named", "add --hdf5, --mat, --png or --csv, or several of them"
+            "nothing to export",
+            "no format was named",
+            "add --hdf5, --netcdf, --zarr, --mat, --png or --csv, or several of them",
         )
     products = read_products(folder)
     if "csv" in formats and not products.materials:
@@ -215,6 +218,8 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             continue
         writer, name = {
             "hdf5": (write_hdf5, "image.h5"),
+            "netcdf": (lambda path, saved: write_netcdf(path, full_dataset(read_processed(saved))), "image.nc"),
+            "zarr": (lambda path, saved: write_zarr(path, full_dataset(read_processed(saved))), "image.zarr"),
             "mat": (write_mat, "image.mat"),
             "csv": (write_csv, "materials.csv"),
         }[kind]

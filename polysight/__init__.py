@@ -2,6 +2,9 @@
 
 The names below are the public Python interface. They are imported when first used, so that `import polysight` is quick
 and needs no other package. Start with :func:`open_scan`.
+
+The parts behind them: `polysight.host` (from the capture cards to the report), `polysight.shared` (configuration,
+messages, errors), `polysight.pi_controller` (the Raspberry Pi), `polysight.simulators`.
 """
 
 from importlib import import_module

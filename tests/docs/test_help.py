@@ -14,7 +14,8 @@ from docs.check.pages import ROOT
 MODULES = (
     "polysight.host.cli", "polysight.pi_controller.cli", "polysight.host.radar", "docs.check",
     "docs.reference", "polysight.simulators", "polysight.simulators.rig", "polysight.simulators.cards",
-    "polysight.simulators.stage", "polysight.simulators.wires", "polysight.simulators.uno", "polysight.simulators.replay",
+    "polysight.simulators.stage", "polysight.simulators.wires", "polysight.simulators.uno",
+    "polysight.simulators.replay",
 )  # fmt: skip
 
 

@@ -101,7 +101,11 @@ def test_netcdf_has_no_complex_variables(folder):
 
 def test_splitting_and_joining_is_the_identity():
     made = {
-        "a": ("t", np.array([1 + 2j, complex(np.nan, np.nan), complex(0, np.inf)], np.complex64), {"units": "1", "long_name": "a"}),
+        "a": (
+            "t",
+            np.array([1 + 2j, complex(np.nan, np.nan), complex(0, np.inf)], np.complex64),
+            {"units": "1", "long_name": "a"},
+        ),
         "b_real": ("t", [1.0, 2.0, 3.0], {"units": "m", "long_name": "not a part of anything"}),
         "c": ("t", np.array([1e-300 + 1e300j, 0, 1]), {"units": "V", "long_name": "c"}),
     }

@@ -61,7 +61,8 @@ reproduce: $(VENV)/installed  ## the paper's tables and figures from simulation,
 library: $(VENV)/installed  ## make the simulated reference library of the classifier again
 	$(BIN)/polysight train --simulate examples/library --out host/materials/simulated-library.npz
 
-docs: $(VENV)/installed  ## check the links of README and docs, and run every command they show against the simulated rig
+docs: $(VENV)/installed  ## make the API reference (OUT=out), check all links, run every command that README and docs show
+	$(BIN)/python -m docs.reference --out $(OUT)/docs
 	$(BIN)/python -m docs.check --run
 
 firmware: $(VENV)/installed  ## build the sketch for an UNO with avr-gcc

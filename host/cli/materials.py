@@ -227,6 +227,8 @@ def _add_train(add: Add) -> None:
 
 _FORMATS = {
     "hdf5": "image.h5: arrays with axes as dimension scales, units, config, versions (needs h5py)",
+    "netcdf": "image.nc: an xarray dataset; complex variables as h_real, h_imag (needs h5netcdf)",
+    "zarr": "image.zarr: the same dataset as a Zarr store (needs zarr)",
     "mat": "image.mat: the same for MATLAB and Octave",
     "png": "amplitude (dB) and phase (degrees) of H, V and P, and the materials",
     "csv": "materials.csv: a line a patch, permittivity with standard errors",
@@ -243,7 +245,7 @@ def _add_export(add: Add) -> None:
     sub = add(
         "export",
         _export,
-        "write the products of a processed scan for other programs: HDF5, MATLAB, PNG, CSV",
+        "write the products of a processed scan for other programs: HDF5, NetCDF, Zarr, MATLAB, PNG, CSV",
         "polysight export out/one --hdf5 --csv",
     )
     sub.add_argument("products", type=Path, metavar="DIR", help="folder that polysight process wrote, or a scan folder")

@@ -58,7 +58,7 @@ from polysight.host.materials.published import (
     told_angle,
 )
 from polysight.host.materials.samples import CHANNELS, Samples, feature_matrix
-from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, segment
+from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, box_mask, segment
 from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row, with_bands
 from polysight.host.materials.train import (
     Score,
@@ -116,8 +116,10 @@ __all__ = [
     "Verdict",
     "Weights",
     "analyse",
+    "axis_mm",
     "bands_of_row",
     "best_model",
+    "box_mask",
     "concentrations",
     "entries_of",
     "entries_of_boxes",

@@ -105,22 +105,25 @@ def save_materials(
     write_json(out / QUALITY, numbers)
     write_labels(out / LABELS, labels_of(found), f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, scan.simulated))
-    rows, classifier = found.rows(), findings.classifier
-    named_by = classifier_sentence(classifier) if classifier else unnamed or "Nothing was named."
-    write_json(
-        out / MATERIALS,
-        {
-            "scan_id": scan.scan_id,
-            "simulated": scan.simulated,
-            "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
-            "library": named_by,
-            "model": classifier.model if classifier else None,
-            "pixel_accuracy": accuracy,
-            "segments": rows,
-        },
-    )
-    write_report(out, _report_context(scan, rig, findings, numbers, (named_by, unnamed)))
-    return Products(out, _lines(scan, found, rows) + ((unnamed,) if unnamed else ()))
+    content = materials_content(scan, found, findings.classifier, unnamed)
+    write_json(out / MATERIALS, content)
+    write_report(out, _report_context(scan, rig, findings, numbers, (content["library"], unnamed)))
+    return Products(out, _lines(scan, found, content["segments"]) + ((unnamed,) if unnamed else ()))
+
+
+def materials_content(
+    scan: Scan, found: MaterialsResult, classifier: Classifier | None, unnamed: str = ""
+) -> dict[str, Any]:
+    """Content of materials.json; `unnamed` says why there is no classifier."""
+    return {
+        "scan_id": scan.scan_id,
+        "simulated": scan.simulated,
+        "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
+        "library": classifier_sentence(classifier) if classifier else unnamed or "Nothing was named.",
+        "model": classifier.model if classifier else None,
+        "pixel_accuracy": pixel_accuracy(found),
+        "segments": found.rows(),
+    }
 
 
 def _report_context(

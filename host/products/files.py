@@ -122,9 +122,9 @@ def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
     return out
 
 
-def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
-    """Write scan.json, and return its content. `rig` is the one the images were made with."""
-    facts = {
+def scan_facts(source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
+    """Content of scan.json. `rig` is the one the images were made with."""
+    return {
         "scan_id": source.scan_id,
         "simulated": source.simulated,
         "processed_utc": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -132,6 +132,11 @@ def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelIm
         "rx_gains": rx_gains(images),
         "instrument": to_builtins(rig),
     }
+
+
+def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
+    """Write scan.json, and return its content, see :func:`scan_facts`."""
+    facts = scan_facts(source, rig, images)
     write_json(out / SCAN, facts)
     return facts
 

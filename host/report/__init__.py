@@ -6,7 +6,16 @@ leaves of errors; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from s
 
 from polysight.host.report.context import ReportContext, classifier_sentence, context_of
 from polysight.host.report.exports import export
-from polysight.host.report.figures import PALETTE, banner_png, draw_channel, extent_mm, figures, focus_figure, png
+from polysight.host.report.figures import (
+    PALETTE,
+    banner_png,
+    draw_channel,
+    draw_overview,
+    extent_mm,
+    figures,
+    focus_figure,
+    png,
+)
 from polysight.host.report.report import write_report
 from polysight.host.report.sync_report import QUANTITIES, SyncReport, write_sync_report
 from polysight.host.report.tables import INK, MUTED, STAMP
@@ -23,6 +32,7 @@ __all__ = [
     "classifier_sentence",
     "context_of",
     "draw_channel",
+    "draw_overview",
     "export",
     "extent_mm",
     "figures",

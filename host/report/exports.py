@@ -1,15 +1,10 @@
-"""Saved products as files for other programs: HDF5, MATLAB, PNG and CSV (`polysight export`).
-
-HDF5: arrays with their axes as dimension scales, units on everything, the rest as attributes. MATLAB: the same arrays,
-structs for the rest. The table of materials has the same columns in all of them (`material_columns`).
-"""
+"""Saved products as files for other programs (`polysight export`): HDF5, NetCDF, Zarr, MATLAB, PNG, CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
-import math
 import re
 import sys
 from importlib import import_module
@@ -19,72 +14,20 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from polysight.host.products import SavedProducts, read_products, write_atomically
+from polysight.host.products import (
+    CONVENTION,
+    SavedProducts,
+    full_dataset,
+    material_columns,
+    read_processed,
+    read_products,
+    write_atomically,
+    write_netcdf,
+    write_zarr,
+)
 from polysight.host.report.context import ReportContext
 from polysight.host.report.figures import figures
 from polysight.shared.errors import ConfigError, DataError
-
-_COLUMNS = (
-    "patch", "name", "confidence", "metal_reference", "metal_like", "centre_x_mm", "centre_y_mm", "width_mm",
-    "height_mm", "pixels", "incidence_deg", "permittivity_real", "permittivity_real_standard_error",
-    "permittivity_loss", "permittivity_loss_standard_error", "p_real", "p_imag", "p_abs_db", "p_phase_deg",
-    "inverse_p_standard_error", "true_name", "true_permittivity_real", "true_permittivity_loss",
-)  # fmt: skip
-CONVENTION = (
-    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
-    " column 0 the smallest x; rig frame; permittivity is real - j loss"
-)
-_UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
-_LONGEST_NAME = 63  # of a MATLAB struct's field
-FORMATS = ("hdf5", "mat", "png", "csv")
-_FOLDER = "export"
-
-
-def material_columns(products: SavedProducts) -> dict[str, list[Any]]:
-    """Columns by name, an entry for each patch; None where a number is not known.
-
-    Permittivity is `permittivity_real` - j `permittivity_loss`; p_imag and p_phase are those of P = H / V relative to
-    metal; positions count from the image's centre.
-    """
-    rows = [_row(segment) for segment in products.segments]
-    return {name: [row[name] for row in rows] for name in _COLUMNS}
-
-
-def _row(s: dict[str, Any]) -> dict[str, Any]:
-    x0, y0, x1, y1 = s["box_mm"]
-    e, truth = s.get("permittivity") or {}, s.get("truth") or {}
-    true = truth.get("permittivity") or {}
-    p = s.get("ratio")
-    size = math.hypot(p["real"], p["imag"]) if p else 0.0
-    return {
-        "patch": s["label"],
-        "name": s.get("name"),
-        "confidence": s.get("confidence"),
-        "metal_reference": bool(s.get("metal_reference")),
-        "metal_like": bool(s.get("metal_like")),
-        "centre_x_mm": (x0 + x1) / 2,
-        "centre_y_mm": (y0 + y1) / 2,
-        "width_mm": x1 - x0,
-        "height_mm": y1 - y0,
-        "pixels": s.get("interior_pixels"),
-        "incidence_deg": s.get("incidence_deg"),
-        "permittivity_real": e.get("real"),
-        "permittivity_real_standard_error": e.get("real_std"),
-        "permittivity_loss": _minus(e.get("imag")),
-        "permittivity_loss_standard_error": e.get("imag_std"),
-        "p_real": p["real"] if p else None,
-        "p_imag": p["imag"] if p else None,
-        "p_abs_db": 20 * math.log10(size) if size else None,
-        "p_phase_deg": math.degrees(math.atan2(p["imag"], p["real"])) if p else None,
-        "inverse_p_standard_error": s.get("inverse_ratio_std"),
-        "true_name": truth.get("name"),
-        "true_permittivity_real": true.get("real"),
-        "true_permittivity_loss": _minus(true.get("imag")),
-    }
-
-
-def _minus(value: float | None) -> float | None:
-    return None if value is None else -value
 
 
 def write_csv(path: Path, products: SavedProducts) -> None:
@@ -95,6 +38,9 @@ def write_csv(path: Path, products: SavedProducts) -> None:
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
     write_atomically(path, text.getvalue().encode("utf-8"))
+
+
+_UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
 
 
 def _h5py() -> Any:
@@ -112,8 +58,8 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
     """Write a file of these products.
 
     /h, /v, /p complex64 [y, x], /valid bool [y, x]; /x, /y float64 in metres, the dimension scales of all four; group
-    /materials with a column for each of :func:`material_columns`; attributes scan_id, simulated, convention, and as
-    JSON instrument, versions, quality, materials.
+    /materials with a column for each of :func:`polysight.host.products.material_table.material_columns`; attributes
+    scan_id, simulated, convention, and as JSON instrument, versions, quality, materials.
 
     Raises
     ------
@@ -166,6 +112,9 @@ def _write_materials(h5py: Any, group: Any, columns: dict[str, list[Any]]) -> No
         unit = _UNITS.get(name.rpartition("_")[2])
         if unit or name.startswith(("permittivity", "true_permittivity", "p_", "inverse", "confidence")):
             group[name].attrs["units"] = unit or "1"
+
+
+_LONGEST_NAME = 63
 
 
 def write_mat(path: Path, products: SavedProducts) -> None:
@@ -243,6 +192,10 @@ def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
     return paths
 
 
+FORMATS = ("hdf5", "netcdf", "zarr", "mat", "png", "csv")
+_FOLDER = "export"
+
+
 def export(folder: Path, formats: list[str], out: Path | None) -> int:
     """Write the formats asked for; prints each file.
 
@@ -253,7 +206,9 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
     """
     if not formats:
         raise ConfigError(
-            "nothing to export", "no format was named", "add --hdf5, --mat, --png or --csv, or several of them"
+            "nothing to export",
+            "no format was named",
+            "add --hdf5, --netcdf, --zarr, --mat, --png or --csv, or several of them",
         )
     products = read_products(folder)
     if "csv" in formats and not products.materials:
@@ -271,6 +226,8 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             continue
         writer, name = {
             "hdf5": (write_hdf5, "image.h5"),
+            "netcdf": (lambda path, saved: write_netcdf(path, full_dataset(read_processed(saved))), "image.nc"),
+            "zarr": (lambda path, saved: write_zarr(path, full_dataset(read_processed(saved))), "image.zarr"),
             "mat": (write_mat, "image.mat"),
             "csv": (write_csv, "materials.csv"),
         }[kind]

@@ -8,7 +8,7 @@ object interface only: no global state, no display.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -292,25 +292,33 @@ def permittivity_figure(ctx: ReportContext) -> bytes | None:
     return png(fig)
 
 
+def draw_overview(fig: Figure, axes: Sequence[Axes], ctx: ReportContext, bar_labels: bool = False) -> None:
+    """Draw amplitude H, V, P with colour bars on the first three axes, and the materials on a fourth one."""
+    for ax, key, title in zip(
+        axes[:3],
+        ("amplitude_h", "amplitude_v", "amplitude_p"),
+        ("H, s-polarised (dB)", "V, p-polarised (dB)", "P = H / V (dB)"),
+        strict=True,
+    ):
+        shown, unit = draw_channel(ax, ctx, key)
+        _dress(ax, title, ctx.simulated)
+        bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
+        if bar_labels:
+            bar.set_label(unit, fontsize=8, color=MUTED)
+        bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
+        if bar.solids is not None:
+            bar.solids.set_alpha(1)
+    for ax in axes[3:]:
+        draw_materials(ax, ctx, size=6.5)
+        _dress(ax, "Materials", ctx.simulated)
+
+
 def banner_png(path: Path, ctx: ReportContext) -> None:
     """One wide picture: amplitude H, V, P and the material map side by side, written to `path`."""
     fig = Figure(figsize=(15.0, 3.7), dpi=120, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
-    axes = fig.subplots(1, 4)
-    for ax, key, title in zip(
-        axes,
-        ("amplitude_h", "amplitude_v", "amplitude_p"),
-        ("H, s-polarised (dB)", "V, p-polarised (dB)", "P = H / V (dB)"),
-        strict=False,
-    ):
-        shown, _ = draw_channel(ax, ctx, key)
-        _dress(ax, title, ctx.simulated)
-        bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
-        bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
-        if bar.solids is not None:
-            bar.solids.set_alpha(1)
-    draw_materials(axes[3], ctx, size=6.5)
-    _dress(axes[3], "Materials", ctx.simulated)
+    axes = list(fig.subplots(1, 4))
+    draw_overview(fig, axes, ctx)
     for ax in axes[1:]:
         ax.set_ylabel("")
     path.write_bytes(png(fig))

@@ -1,0 +1,116 @@
+"""`python -m docs.reference --out DIR`: the API reference as HTML, made from the docstrings with pdoc, links checked.
+
+A package that names its public functions (`__all__`) has one page with these; another one has a page for each module.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pkgutil
+import re
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from html.parser import HTMLParser
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from urllib.parse import unquote
+
+import pdoc.doc
+import pdoc.render
+
+PACKAGES = ("polysight", "polysight.host", "polysight.shared", "polysight.simulators", "polysight.pi_controller")
+
+_TO_PRIVATE = re.compile(r'<a href="[^"#]*#_[^"]*">(.*?)</a>')  # base classes that have no place of their own
+
+
+def modules_of(name: str) -> Iterator[str]:
+    """Names of a module and of everything in it that has a page of its own. Imports them."""
+    module = import_module(name)
+    yield name
+    for public in getattr(module, "__all__", ()):
+        getattr(module, public)  # a lazy name is imported now, for pdoc to see it
+    if not hasattr(module, "__all__") and hasattr(module, "__path__"):
+        yield from (page for child in _children(module) for page in modules_of(child))
+
+
+def _children(package: ModuleType) -> Iterator[str]:
+    for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+        if not found.name.rpartition(".")[2].startswith("_"):
+            yield found.name
+
+
+def build(names: Sequence[str], out: Path) -> list[Path]:
+    """Write the pages of these modules, an index and a search index into `out`; returns the pages."""
+    pdoc.render.configure(docformat="numpy", show_source=False, footer_text="polysight, from its docstrings")
+    warnings.filterwarnings("ignore", "Error parsing type annotation")  # of named tuples: shown as they are written
+    modules = {name: pdoc.doc.Module.from_name(name) for name in names}
+    pages = []
+    for name, module in modules.items():
+        page = out / f"{name.replace('.', '/')}.html"
+        page.parent.mkdir(parents=True, exist_ok=True)
+        html = pdoc.render.html_module(module, modules)
+        page.write_text(_TO_PRIVATE.sub(r"\1", html), encoding="utf-8")
+        pages.append(page)
+    index = out / "index.html"
+    index.write_text(pdoc.render.html_index(modules), encoding="utf-8")
+    (out / "search.js").write_text(pdoc.render.search_index(modules), encoding="utf-8")
+    return [*pages, index]
+
+
+class _Page(HTMLParser):
+    """Links and anchors of an HTML page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Collect `href` of links and `id` of any element."""
+        table = dict(attrs)
+        if tag == "a" and table.get("href"):
+            self.links.append(str(table["href"]))
+        if table.get("id"):
+            self.anchors.add(str(table["id"]))
+
+
+def link_faults(out: Path) -> list[str]:
+    """Links between the pages below `out` whose file or anchor is not there: `page: link`."""
+    pages = {path.resolve(): _Page(path.read_text(encoding="utf-8")) for path in sorted(out.rglob("*.html"))}
+    faults = []
+    for path, page in pages.items():
+        for link in page.links:
+            if "://" in link or link.startswith(("mailto:", "data:")):
+                continue
+            name, _, anchor = unquote(link).partition("#")
+            target = (path.parent / name).resolve() if name else path
+            known = pages.get(target)
+            if known is None or (anchor and anchor not in known.anchors):
+                faults.append(f"{path.relative_to(out.resolve())}: {link}")
+    return faults
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Build the reference; 0 only when every link in it leads somewhere."""
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.reference",
+        description="Make the API reference from the docstrings, and check its links.",
+        epilog="example:\n  python -m docs.reference --out out/docs",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pages")
+    args = parser.parse_args(argv)
+    names = list(dict.fromkeys(name for package in PACKAGES for name in modules_of(package)))
+    build(names, args.out)
+    faults = link_faults(args.out)
+    for fault in faults:
+        sys.stdout.write(f"broken link: {fault}\n")
+    sys.stdout.write(f"{args.out / 'index.html'}: {len(names)} modules, {len(faults)} broken links\n")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,49 @@
+"""One figure of a processed scan, for notebooks."""
+
+from __future__ import annotations
+
+import io
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from polysight.host.products import ProcessedScan
+from polysight.host.report import ReportContext, draw_overview
+
+_PANEL_IN = 3.8  # width of one picture
+
+
+class NotebookFigure(Figure):
+    """A figure that notebooks show once, as the value of a cell, with or without matplotlib's inline backend."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+def plot_scan(done: ProcessedScan) -> Figure:
+    """Amplitude of H, V, P in dB, and the materials where the images are relative to metal; axes in mm."""
+    named = done.metal_referenced
+    rows, columns = (2, 2) if named else (1, 3)
+    height_in = _PANEL_IN * min(2.0, max(0.4, done.labels.shape[0] / done.labels.shape[1]))
+    size = (columns * (_PANEL_IN + 1.2), rows * (height_in + 0.4) + 0.5)
+    fig = NotebookFigure(figsize=size, dpi=100, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    context = ReportContext(
+        title=done.scan_id,
+        simulated=done.simulated is not False,
+        x_m=done.image["x_m"],
+        y_m=done.image["y_m"],
+        h=done.image["h"],
+        v=done.image["v"],
+        p=done.image["p"],
+        valid=done.image["valid"],
+        metal_referenced=named,
+        materials=done.segments,
+        segments=done.labels,
+    )
+    draw_overview(fig, list(fig.subplots(rows, columns).flat), context, bar_labels=True)
+    stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[done.simulated]
+    fig.suptitle(f"Scan {done.scan_id}{stamp}", fontsize=12)
+    return fig

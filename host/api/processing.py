@@ -1,0 +1,98 @@
+"""From recorded rows to results in memory: the only file of this package that knows the pipeline."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from polysight.host.imaging import ChannelImages
+from polysight.host.materials import KnownScene, MetalChoice, pixel_accuracy, read_truth
+from polysight.host.pipeline import Pipeline
+from polysight.host.polarimetry import ratio
+from polysight.host.process import Options, materials_content
+from polysight.host.products import ProcessedScan, plain, scan_facts
+from polysight.host.store import Source
+from polysight.shared.errors import DataError, advice
+
+
+class Processing:
+    """Processes one source; each step is done once, when its result is first asked for.
+
+    Parameters
+    ----------
+    source
+        Recorded scan.
+    folder
+        Where it was read; `truth.json` there holds the truth of a simulated scene.
+    options
+        Library, model, metal box, sub-bands, incidence.
+    """
+
+    def __init__(self, source: Source, folder: Path, options: Options) -> None:
+        self.source, self.folder, self.options = source, folder, options
+
+    @cached_property
+    def pipeline(self) -> Pipeline:
+        """The pipeline, without rows at first. Raises PolysightError when calibration and rig do not fit."""
+        return Pipeline(self.source, bands=self.options.bands)
+
+    @cached_property
+    def _images(self) -> ChannelImages:
+        """Both channels from all rows that hold data. Raises DataError when there are none."""
+        rows = list(self.source.rows())
+        if not rows:
+            raise DataError(
+                f"{self.folder}: no row is recorded whole",
+                "the scan was stopped in its first row, or files are missing",
+                f"`polysight resume {self.folder}` takes the missing rows of a scan folder",
+            )
+        for row in rows:
+            self.pipeline.add_row(row)
+        return self.pipeline.form_images()
+
+    @cached_property
+    def unreferenced(self) -> ProcessedScan:
+        """Images in arbitrary units, as `polysight image` writes them. Raises PolysightError."""
+        images, none = self._images, np.zeros(self._images.h.shape, np.int32)
+        pixels = {"h": images.h, "v": images.v, "p": ratio(images.h, images.v), "valid": images.valid}
+        return self._processed(images, pixels, {}, none, None)
+
+    @cached_property
+    def referenced(self) -> ProcessedScan:
+        """Images relative to metal, patches and materials, as `polysight process` writes them.
+
+        Raises
+        ------
+        DataError
+            when no metal is found, a row is damaged, or library or metal reference do not fit the scan.
+        """
+        pipeline, options = self.pipeline, self.options
+        classifier, unnamed = options.classifier(pipeline.rig), options.unnamed(pipeline.rig)
+        plane = pipeline.metal_plane(options)
+        images, truth = self._images, self.folder / "truth.json"
+        plates = read_truth(truth) if truth.exists() else ()
+        try:
+            metal, known = MetalChoice(options.metal_box_mm, None, plane), KnownScene(plates=plates)
+            found = pipeline.find_materials(images, metal, known, classifier, options.incidence)
+        except DataError as e:
+            raise DataError(e.what, e.why, advice(e.remedy, "metal_referenced=False shows images without")) from e
+        pipeline.quality.note(pixel_accuracy=pixel_accuracy(found))
+        valid = images.valid if plane is None else images.valid & plane.valid
+        c, labels = found.calibrated, found.segmentation.labels
+        interior = np.zeros(labels.shape, bool)
+        for patch in found.segmentation.patches:
+            interior |= patch.interior
+        materials = plain(materials_content(self.source, found, classifier, unnamed))
+        return self._processed(images, {"h": c.h, "v": c.v, "p": c.p, "valid": valid}, materials, labels, interior)
+
+    def _processed(self, images: ChannelImages, pixels, materials, labels, interior) -> ProcessedScan:
+        return ProcessedScan(
+            {**pixels, "x_m": images.x_m, "y_m": images.y_m},
+            plain(scan_facts(self.source, self.pipeline.rig, images)),
+            plain(self.pipeline.quality.to_dict()),
+            materials,
+            labels,
+            interior,
+        )

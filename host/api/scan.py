@@ -1,0 +1,346 @@
+"""A scan opened for notebooks: results as datasets, computed when they are asked for."""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from polysight.data import packaged
+from polysight.host.api.processing import Processing
+from polysight.host.polarimetry import Incidence
+from polysight.host.process import Options
+from polysight.host.products import (
+    IMAGE,
+    ProcessedScan,
+    Rows,
+    SavedProducts,
+    find_products,
+    full_dataset,
+    image_dataset,
+    patch_dataset,
+    read_processed,
+    runs,
+    write_netcdf,
+    write_zarr,
+)
+from polysight.host.store import MANIFEST, ScanFolder, Source, open_source
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+RIG = Path("instrument.toml")
+Box = tuple[float, float, float, float]
+
+
+def open_scan(
+    folder: str | os.PathLike[str],
+    *,
+    rig: str | os.PathLike[str] | Instrument | None = None,
+    library: str | os.PathLike[str] | None = None,
+    model: str | None = None,
+    metal_box_mm: Box | None = None,
+    bands: int = 1,
+    incidence: Incidence = "one",
+    fresh: bool = False,
+) -> Scan:
+    """Open a scan. Rows are read later, when a result is asked for.
+
+    Parameters
+    ----------
+    folder
+        A scan folder, a folder `unsynced/<scan>` or `raw/<scan>` of the published data, or a folder of products that
+        `polysight process` or `polysight image` wrote. Saved products in a scan folder are used if they hold all of
+        its rows and none of the parameters below is given; otherwise the rows are processed.
+    rig
+        Rig file of published data, or the rig itself: `instrument.toml` in that folder, in the current folder or the
+        packaged one if not given. Scan folders bring their own.
+    library
+        Reference library of the materials; the packaged simulated one if not given.
+    model
+        Classifier: "knn", "discriminant", "own-spread", a full name, or "none" for no names. The library's own choice
+        if not given.
+    metal_box_mm
+        Metal reference (x0, y0, x1, y1), mm from the image centre; found automatically if not given.
+    bands
+        Number of sub-bands of the sweep to image as well, for thin layers.
+    incidence
+        "one": one incidence angle for the image; "pixel": each pixel's own.
+    fresh
+        Process the rows even where saved products could be used.
+
+    Raises
+    ------
+    DataError
+        when the folder is none of these, or is damaged.
+    ConfigError
+        when a folder of products is given with processing parameters, or a rig file is wrong.
+    """
+    path = Path(folder)
+    options = Options(
+        metal_box_mm=metal_box_mm,
+        library=None if library is None else Path(library),
+        model=model,
+        bands=bands,
+        incidence=incidence,
+    )
+    if (path / IMAGE).exists() and not (path / MANIFEST).exists():
+        if fresh or options != Options():
+            raise ConfigError(
+                f"{path}: products cannot be processed again",
+                "the recorded rows are not in this folder",
+                "give the scan folder with these parameters, or leave them out to read the products",
+            )
+        return Scan(path, None, SavedProducts(path), options)
+    source = _open_source(path, rig)
+    saved = None if fresh or options != Options() else find_products(path)
+    if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
+        saved = None
+    return Scan(path, source, saved, options)
+
+
+def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
+    """Recorded data of any layout. Raises DataError or ConfigError."""
+    if not path.is_dir():
+        raise DataError(f"{path}: no such folder", "the path is wrong", "give the folder of a scan or of products")
+    if (path / MANIFEST).exists():
+        return ScanFolder.load(path)
+    if isinstance(rig, Instrument):
+        return open_source(path, rig)
+    file = Path(rig) if rig is not None else path / RIG if (path / RIG).exists() else packaged(RIG)
+    return open_source(path, load_instrument(file))
+
+
+def _is_current(saved: SavedProducts, scan: ScanFolder) -> bool:
+    """True unless the products say that they were made from other rows than the scan holds now. Raises DataError."""
+    committed = scan.committed()
+    for name, board in saved.quality.get("boards", {}).items():
+        made_from = board.get("raw_crc32")
+        there = {str(n): row.boards[name].crc32 for n, row in committed.items() if name in row.boards}
+        if made_from is not None and made_from != there:
+            return False
+    return True
+
+
+class Scan:
+    """A recorded scan, or the products of one. Made by :func:`open_scan`.
+
+    Results are computed once and kept. Each call returns new arrays, so that changing them changes no later result.
+    Every dataset has named dimensions (`y`, `x` in metres in the rig frame, `patch`), `units` and `long_name` on each
+    variable, and its provenance as attributes: `scan_id`, `simulated`, `rig`, `versions`, `processed_utc`,
+    `rows_missing`, `positions_masked`.
+
+    Attributes
+    ----------
+    folder
+        The folder that was opened.
+    """
+
+    def __init__(self, folder: Path, source: Source | None, saved: SavedProducts | None, options: Options) -> None:
+        self.folder = folder
+        self._source, self._saved_products, self._options = source, saved, options
+
+    @property
+    def scan_id(self) -> str:
+        """Name of the scan; "" when its products do not say."""
+        return self._source.scan_id if self._source is not None else self._saved.scan_id
+
+    @property
+    def simulated(self) -> bool | None:
+        """True if the data is simulated; None when the products do not say."""
+        return self._source.simulated if self._source is not None else self._saved.simulated
+
+    @property
+    def rig(self) -> Instrument:
+        """Rig of the images: geometry, chirp, boards, as calibrated; x from TX to RX.
+
+        Raises
+        ------
+        DataError
+            when products do not say.
+        """
+        known = self._saved.rig if self._saved_products is not None else self._processing.pipeline.rig
+        if known is None and self._source is not None:
+            known = self._processing.pipeline.rig
+        if known is None:
+            raise self._unknown("rig")
+        return known
+
+    @property
+    def rows(self) -> Rows:
+        """Rows of the scan: `indices`, `planned`, `committed`, `missing`. Raises DataError when products do not say."""
+        if self._source is not None:
+            return Rows(self._source.plan.rows, tuple(self._source.rows()))
+        known = self._saved.rows
+        if known is None:
+            raise self._unknown("rows")
+        return known
+
+    def image(self, *, metal_referenced: bool = True) -> xarray.Dataset:
+        """Both channels and their ratio on one grid.
+
+        Parameters
+        ----------
+        metal_referenced
+            True: relative to metal, with the cross-polar leakage removed, as `polysight process` writes them. False:
+            as imaged, in arbitrary units, as `polysight image` writes them; needs no metal in the scene.
+
+        Returns
+        -------
+        xarray.Dataset
+            `h` (s-polarised), `v` (p-polarised), `p` (H / V) complex64 [y, x], `valid` bool [y, x], `incidence_deg`.
+
+        Raises
+        ------
+        DataError
+            when no row is whole, no metal is found, or the products hold the other kind and the rows are not there.
+        """
+        return image_dataset(self._processed(metal_referenced))
+
+    def patches(self) -> xarray.Dataset:
+        """Patches found in the image, with everything known about each.
+
+        Returns
+        -------
+        xarray.Dataset
+            `label` int32 [y, x] and `interior` bool [y, x]; on dimension `patch` the variables of `permittivity` and
+            `materials`, `metal_like`, `width` and `height` (m), and `band_ratio` where sub-bands were asked for.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        return patch_dataset(self._processed(True))
+
+    def permittivity(self) -> xarray.Dataset:
+        """Relative permittivity eps' - j eps'' of each patch; not a number where P is too close to metal.
+
+        Returns
+        -------
+        xarray.Dataset
+            On dimension `patch`: `permittivity` complex128, `permittivity_real_standard_error`,
+            `permittivity_loss_standard_error`, `ratio` (P) complex128, `inverse_ratio_standard_error` (of 1 / P),
+            `patch_incidence_deg`, `name`, `pixels`; `true_permittivity` for a simulated scene.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        return self._columns(
+            "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error", "ratio",
+            "inverse_ratio_standard_error", "patch_incidence_deg", "name", "pixels", "true_permittivity",
+        )  # fmt: skip
+
+    def materials(self) -> xarray.Dataset:
+        """Name of each patch.
+
+        Returns
+        -------
+        xarray.Dataset
+            On dimension `patch`: `name` ("" when not named, "unknown" when it is none of the library), `confidence`,
+            `runner_up` and `runner_up_share` (the next name by number of pixels), `metal_reference`, `pixels`;
+            `true_name` for a simulated scene. Attributes `library`, `model`.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        names = ("name", "confidence", "runner_up", "runner_up_share", "metal_reference", "pixels", "true_name")
+        return self._columns(*names)
+
+    def plot(self, *, metal_referenced: bool = True) -> Figure:
+        """Figure of |H|, |V|, |P| (dB), and of the materials' names if metal-referenced; axes in mm.
+
+        Notebooks show the figure when it is the last line of a cell; `plot().savefig("scan.png")` saves it.
+
+        Raises
+        ------
+        DataError
+            as :meth:`image`.
+        """
+        from polysight.host.api.plot import plot_scan
+
+        return plot_scan(self._processed(metal_referenced))
+
+    def to_netcdf(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
+        """Write all results as one NetCDF file: complex variables as `h_real` and `h_imag`, see :func:`read_netcdf`.
+
+        Raises
+        ------
+        ConfigError
+            when h5netcdf is not installed.
+        DataError
+            as :meth:`image`.
+        """
+        write_netcdf(Path(path), full_dataset(self._processed(metal_referenced)))
+
+    def to_zarr(self, path: str | os.PathLike[str], *, metal_referenced: bool = True) -> None:
+        """Write all results as one Zarr store, which replaces an earlier one. Raises as :meth:`to_netcdf`."""
+        write_zarr(Path(path), full_dataset(self._processed(metal_referenced)))
+
+    def __repr__(self) -> str:
+        try:
+            rows = self.rows
+            told = f"{len(rows.committed)} of {rows.planned} rows"
+            told += f" (missing {runs(rows.missing)})" if rows.missing else ""
+        except DataError:
+            told = "number of rows not known"
+        simulated = "SIMULATED, " if self.simulated else ""
+        kind = "saved products" if self._saved_products is not None else "recorded rows"
+        return f"<Scan {self.scan_id or 'without a name'}: {simulated}{told}, {kind} in {self.folder}>"
+
+    @cached_property
+    def _processing(self) -> Processing:
+        if self._source is None:
+            raise DataError(
+                f"{self.folder}: holds no recorded rows",
+                "it is a folder of products",
+                "open the scan folder instead",
+            )
+        return Processing(self._source, self.folder, self._options)
+
+    @cached_property
+    def _saved(self) -> ProcessedScan:
+        if self._saved_products is None:
+            raise DataError(f"{self.folder}: holds no products", "it was not processed", "polysight process")
+        return read_processed(self._saved_products)
+
+    def _processed(self, metal_referenced: bool) -> ProcessedScan:
+        """The saved products where they are of the kind asked for, else what processing gives. Raises DataError."""
+        if self._saved_products is not None and self._saved.metal_referenced == metal_referenced:
+            return self._saved
+        if self._source is None:
+            raise self._other_kind(metal_referenced)
+        return self._processing.referenced if metal_referenced else self._processing.unreferenced
+
+    def _other_kind(self, metal_referenced: bool) -> DataError:
+        if metal_referenced:
+            return DataError(
+                f"{self.folder}: these images are not referenced to metal",
+                "only images were made of this scan",
+                "image(metal_referenced=False) reads them; `polysight process` finds metal, patches and materials",
+            )
+        return DataError(
+            f"{self.folder}: these images are referenced to metal",
+            "the images before that are not kept in the products",
+            "open the scan folder, or ask for metal_referenced=True",
+        )
+
+    def _unknown(self, what: str) -> DataError:
+        return DataError(
+            f"{self.folder}: the products do not say the {what}",
+            "they were made by an earlier release, or scan.json or quality.json is missing",
+            "open the scan folder instead",
+        )
+
+    def _columns(self, *names: str) -> xarray.Dataset:
+        """Those of the patches' variables that are there, with the coordinates of their dimension."""
+        patches = self.patches()
+        return patches[[name for name in names if name in patches]].drop_vars(["x", "y"], errors="ignore")

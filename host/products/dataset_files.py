@@ -1,0 +1,123 @@
+"""Datasets as NetCDF files and Zarr stores.
+
+NetCDF has no complex numbers: a complex variable `h` is stored as `h_real` and `h_imag`, each with the attribute
+`complex_part`, from which :func:`read_netcdf` makes `h` again. Zarr stores complex numbers as they are.
+"""
+
+from __future__ import annotations
+
+import shutil
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from polysight.shared.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import xarray
+
+_PART = "complex_part"
+_ZARR_FORMAT = 2  # every reader knows it, and its text columns need no extension
+
+
+def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Copy of a dataset with each complex variable `h` replaced by real variables `h_real` and `h_imag`."""
+    made: dict[str, Any] = {}
+    for name, variable in dataset.data_vars.items():
+        if variable.dtype.kind != "c":
+            made[str(name)] = variable
+            continue
+        about = variable.attrs.get("long_name", str(name))
+        for suffix, part in (("real", "real"), ("imag", "imaginary")):
+            values = variable.real if suffix == "real" else variable.imag
+            attrs = {**variable.attrs, "long_name": f"{about}, {part} part", _PART: suffix}
+            made[f"{name}_{suffix}"] = values.copy().assign_attrs(attrs)
+    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+
+
+def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Undo :func:`split_complex`: variables that say which part they are become complex ones again."""
+    made: dict[str, Any] = {}
+    for full_name, variable in dataset.data_vars.items():
+        name, _, suffix = str(full_name).rpartition("_")
+        if variable.attrs.get(_PART) == "real" and f"{name}_imag" in dataset:
+            both = np.empty(variable.shape, np.complex64 if variable.dtype == np.float32 else np.complex128)
+            both.real, both.imag = variable.values, dataset[f"{name}_imag"].values
+            attrs = {key: text for key, text in variable.attrs.items() if key != _PART}
+            attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
+            made[name] = (variable.dims, both, attrs)
+        elif variable.attrs.get(_PART) != suffix or suffix != "imag":
+            made[str(full_name)] = variable
+    return dataset.drop_vars(list(dataset.data_vars)).assign(made)
+
+
+def _require(package: str, kind: str) -> None:
+    try:
+        import_module(package)
+    except ImportError:
+        raise ConfigError(
+            f"{kind} needs the package {package}, which is not installed",
+            "only this export uses it, so it is an extra",
+            f"pip install 'polysight[export]', or pip install {package}",
+        ) from None
+
+
+def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
+    """Write a NetCDF 4 file; complex variables as two real ones, True and False in attributes as 1 and 0.
+
+    Raises
+    ------
+    ConfigError
+        when h5netcdf is not installed.
+    """
+    _require("h5netcdf", "NetCDF")
+    split = split_complex(dataset)
+    split.attrs = {key: int(value) if isinstance(value, bool) else value for key, value in split.attrs.items()}
+    packed = {"zlib": True, "complevel": 4, "shuffle": True}
+    encoding = {name: packed for name, v in split.data_vars.items() if v.ndim == 2 and v.dtype.kind in "biuf"}
+    part = path.with_name(f".{path.name}.part")
+    split.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+    part.replace(path)
+
+
+def read_netcdf(path: Path) -> xarray.Dataset:
+    """Read a file that :func:`write_netcdf` wrote, whole, with its complex variables.
+
+    Raises
+    ------
+    ConfigError
+        when h5netcdf is not installed.
+    DataError
+        when the file cannot be read.
+    """
+    import xarray
+
+    _require("h5netcdf", "NetCDF")
+    try:
+        dataset = xarray.load_dataset(path, engine="h5netcdf")
+    except (OSError, ValueError) as e:
+        raise DataError(f"{path}: not a NetCDF file: {e}", "the path is wrong, or the file is damaged") from None
+    if "simulated" in dataset.attrs and dataset.attrs["simulated"] != "unknown":
+        dataset.attrs["simulated"] = bool(dataset.attrs["simulated"])
+    return join_complex(dataset)
+
+
+def write_zarr(path: Path, dataset: xarray.Dataset) -> None:
+    """Write a Zarr store (a folder, Zarr format 2); an earlier store at `path` is replaced.
+
+    Raises
+    ------
+    ConfigError
+        when zarr is not installed, or `path` holds something else.
+    """
+    _require("zarr", "Zarr")
+    if path.exists() and not (path / ".zgroup").exists():
+        raise ConfigError(f"{path} is not a Zarr store", "something else has that name", "give another folder")
+    part = path.with_name(f".{path.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    dataset.to_zarr(part, mode="w", zarr_format=_ZARR_FORMAT, consolidated=True)
+    if path.exists():
+        shutil.rmtree(path)
+    part.rename(path)

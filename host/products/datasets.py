@@ -1,0 +1,376 @@
+"""Processed scans as xarray datasets: named dimensions, coordinates in metres, units, and where the data comes from.
+
+One vocabulary for notebooks and exports: `image_dataset` has the pixels, `patch_dataset` the patches, `full_dataset`
+both. Permittivity is eps' - j eps'' (eps'' is the loss); what is not known is not a number. xarray is imported when a
+dataset is made, not before.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from skimage import measure
+
+from polysight.host.materials import PATCHES, axis_mm, box_mask, image_centre_mm
+from polysight.host.polarimetry import incidence_choice, specular_incidence_rad
+from polysight.host.products.files import SavedProducts
+from polysight.host.products.material_table import material_columns
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.tables import decode
+
+if TYPE_CHECKING:
+    import xarray
+
+Labels = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
+CONVENTION = (
+    "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
+    " column 0 the smallest x; rig frame; permittivity is real - j loss"
+)
+UNREFERENCED = "none: h, v and p are in arbitrary units"
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a scan, counted from 0.
+
+    Attributes
+    ----------
+    planned
+        Number of rows in the plan.
+    committed
+        Indices of the rows that hold data, ascending.
+    """
+
+    planned: int
+    committed: tuple[int, ...]
+
+    @property
+    def indices(self) -> range:
+        """Indices of all planned rows."""
+        return range(self.planned)
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Indices of the planned rows that hold no data."""
+        return tuple(sorted(set(self.indices) - set(self.committed)))
+
+
+@dataclass(frozen=True)
+class ProcessedScan:
+    """Result of processing a scan, in memory: the content of its product files.
+
+    Attributes
+    ----------
+    image
+        `h`, `v`, `p` complex64 [ny, nx], `valid` bool [ny, nx], `x_m`, `y_m` float64: image.npz.
+    scan, quality, materials
+        Content of scan.json, quality.json and materials.json. Without materials the image is not metal-referenced.
+    labels
+        int32 [ny, nx]: number of the patch that holds each pixel, 0 for none.
+    interior
+        bool [ny, nx]: pixels that the patches' statistics are made from; None when not known.
+    """
+
+    image: dict[str, npt.NDArray[Any]]
+    scan: dict[str, Any]
+    quality: dict[str, Any]
+    materials: dict[str, Any]
+    labels: Labels
+    interior: Mask | None
+
+    @property
+    def segments(self) -> list[dict[str, Any]]:
+        """Patches as materials.json lists them."""
+        return list(self.materials.get("segments", []))
+
+    @property
+    def metal_referenced(self) -> bool:
+        """True if h, v and p are relative to metal."""
+        return bool(self.materials)
+
+    @property
+    def scan_id(self) -> str:
+        """Name of the scan; "" when it is not known."""
+        return str(self.scan.get("scan_id", self.materials.get("scan_id", "")))
+
+    @property
+    def simulated(self) -> bool | None:
+        """True if the data was simulated; None when it is not known."""
+        return self.scan.get("simulated", self.materials.get("simulated"))
+
+    @cached_property
+    def rig(self) -> Instrument | None:
+        """Rig file the images were made with; None when it is not known. Raises ConfigError."""
+        raw = self.scan.get("instrument")
+        return None if raw is None else decode(raw, Instrument, f"scan.json of {self.scan_id}: instrument")
+
+    @property
+    def rows(self) -> Rows | None:
+        """Rows of the scan and those in the images; None when they are not known."""
+        boards = self.quality.get("boards", {}).values()
+        if self.rig is None or not boards or any("rows_recorded" not in b for b in boards):
+            return None
+        committed = set.intersection(*(set(b["rows_recorded"]) for b in boards))
+        by_columns = self.quality.get("recording", {}).get("direction") == "col"
+        planned = self.rig.grid.columns if by_columns else self.rig.grid.rows
+        return Rows(planned, tuple(sorted(committed)))
+
+
+def read_processed(products: SavedProducts) -> ProcessedScan:
+    """Read a folder of products. Raises DataError when a file is damaged."""
+    image = products.image
+    labels, interior = _saved_patches(products)
+    return ProcessedScan(image, products.scan, products.quality, products.materials, labels, interior)
+
+
+def _saved_patches(products: SavedProducts) -> tuple[Labels, Mask | None]:
+    """Labels from the patches' outlines, accurate to half a pixel, and the interiors from patches.npz."""
+    x, y = axis_mm(products.x_m), axis_mm(products.y_m)
+    labels = np.zeros((y.size, x.size), np.int32)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    for s in products.segments:
+        outline = np.asarray(s.get("outline_mm") or [], np.float64)
+        if len(outline):
+            inside = measure.points_in_poly(points, outline).reshape(labels.shape)
+        else:
+            inside = box_mask(tuple(s["box_mm"]), products.x_m, products.y_m)
+        labels[inside] = s["label"]
+    if not (products.folder / PATCHES).exists():
+        return labels, None
+    interior = np.zeros(labels.shape, bool)
+    for patch in products.patches.patches:
+        columns, rows = (_nearest(axis, patch.places_mm[:, i]) for i, axis in enumerate((x, y)))
+        labels[rows, columns] = patch.label
+        interior[rows, columns] = True
+    return labels, interior
+
+
+def _nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
+    """Indices of the axis values nearest to `places`; the axis is evenly spaced."""
+    return np.rint((places - axis[0]) / (axis[1] - axis[0])).astype(np.intp)
+
+
+def runs(numbers: Sequence[int]) -> str:
+    """Ascending numbers as text, `3, 7-9`; `none` when there are none."""
+    found: list[list[int]] = []
+    for n in numbers:
+        if found and n == found[-1][1] + 1:
+            found[-1][1] = n
+        else:
+            found.append([n, n])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in found) or "none"
+
+
+def provenance(done: ProcessedScan) -> dict[str, Any]:
+    """Attributes of every dataset: what the data is and where it comes from. Unknown entries are left out.
+
+    `simulated` is True, False or "unknown"; `versions` is JSON; `rows_missing` and `positions_masked` are text.
+    """
+    simulated = "unknown" if done.simulated is None else done.simulated
+    attrs: dict[str, Any] = {
+        "title": f"scan {done.scan_id or 'without a name'}{' (simulated)' if simulated is True else ''}",
+        "scan_id": done.scan_id,
+        "simulated": simulated,
+        "convention": CONVENTION,
+        "metal_reference": done.materials.get("metal_reference", {}).get("how", "given")
+        if done.metal_referenced
+        else UNREFERENCED,
+    }
+    if done.rig is not None:
+        attrs["rig"] = done.rig.name
+    if "processed_utc" in done.scan:
+        attrs["processed_utc"] = done.scan["processed_utc"]
+    if "versions" in done.scan:
+        attrs["versions"] = json.dumps(done.scan["versions"])
+    if done.rows is not None:
+        attrs["rows_planned"] = done.rows.planned
+        attrs["rows_missing"] = runs(done.rows.missing)
+    masked = [
+        f"{name} {b['positions_masked']} of {b['positions']}"
+        for name, b in done.quality.get("boards", {}).items()
+        if "positions_masked" in b and "positions" in b
+    ]
+    if masked:
+        attrs["positions_masked"] = ", ".join(masked)
+    return attrs
+
+
+def _text(values: Sequence[Any]) -> npt.NDArray[np.str_]:
+    return np.array([v or "" for v in values], dtype=np.str_)
+
+
+def _numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
+    return np.array([np.nan if v is None else v for v in values], np.float64)
+
+
+def _complex(real: Sequence[Any], loss_or_imag: Sequence[Any], sign: int = 1) -> npt.NDArray[np.complex128]:
+    """Complex numbers; both parts are not a number where one is not known."""
+    out = _numbers(real) + 1j * sign * _numbers(loss_or_imag)
+    out[np.isnan(out)] = complex(np.nan, np.nan)
+    return out
+
+
+def _described(dims: tuple[str, ...], values: Any, units: str, long_name: str) -> tuple[Any, ...]:
+    return dims, np.array(values), {"units": units, "long_name": long_name}
+
+
+def image_dataset(done: ProcessedScan) -> xarray.Dataset:
+    """Images of a processed scan.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions `y`, `x` (metres, rig frame). `h`, `v`, `p` complex64 [y, x]: s-polarised and p-polarised channel
+        and their ratio, relative to metal where `metal_reference` does not begin with "none". `valid` bool [y, x].
+        `incidence_deg`: one angle, or [y, x] where the scan was processed with each pixel's own; left out when the
+        rig is not known. Attributes: :func:`provenance`.
+    """
+    import xarray
+
+    image, plane = done.image, ("y", "x")
+    unit = "reflection relative to metal" if done.metal_referenced else "arbitrary units"
+    data = {
+        "h": _described(plane, image["h"], "1", f"s-polarised channel, {unit}"),
+        "v": _described(plane, image["v"], "1", f"p-polarised channel, {unit}"),
+        "p": _described(plane, image["p"], "1", f"polarisation ratio H / V, {unit}"),
+        "valid": _described(plane, image["valid"], "1", "True where the scan illuminates the pixel"),
+    }
+    if done.rig is not None:
+        if done.quality.get("incidence", {}).get("used") == "by pixel":
+            angles = incidence_choice(done.rig, image["x_m"], image["y_m"], "pixel").used_rad
+            data["incidence_deg"] = _described(plane, np.degrees(angles), "degree", "incidence angle of the pixel")
+        else:
+            angle = np.degrees(specular_incidence_rad(done.rig))
+            data["incidence_deg"] = _described((), angle, "degree", "incidence angle")
+    return xarray.Dataset(data, _axes(done), provenance(done))
+
+
+def _axes(done: ProcessedScan) -> dict[str, Any]:
+    return {
+        name: _described((name,), done.image[f"{name}_m"], "m", f"pixel centre, {name} of the rig frame")
+        for name in ("y", "x")
+    }
+
+
+def patch_dataset(done: ProcessedScan) -> xarray.Dataset:
+    """Patches of a processed scan: the patch of each pixel, and a table.
+
+    Returns
+    -------
+    xarray.Dataset
+        `label` int32 [y, x] (0: no patch) and, where known, `interior` bool [y, x], the pixels behind the numbers.
+        On dimension `patch`: `name`, `confidence`, `runner_up`, `runner_up_share`, `metal_reference`, `metal_like`,
+        `width` and `height` (m), `pixels`, `patch_incidence_deg`, `ratio` and `permittivity` (complex) with their
+        standard errors, where the truth is known `true_name` and `true_permittivity`, and with sub-bands `band_ratio`
+        [patch, band]. Coordinates `centre_x` and `centre_y` (m, rig frame). Attributes: :func:`provenance`,
+        `library`, `model`.
+
+    Raises
+    ------
+    DataError
+        when only images were made.
+    """
+    import xarray
+
+    if not done.metal_referenced:
+        raise DataError(
+            f"scan {done.scan_id}: no materials were looked for",
+            "only images were made of this scan",
+            "`polysight process` finds patches and materials; give the folder it writes, or the scan folder",
+        )
+    plane = ("y", "x")
+    data = {"label": _described(plane, done.labels, "1", "number of the patch that holds the pixel, 0 for none")}
+    if done.interior is not None:
+        data["interior"] = _described(plane, done.interior, "1", "True where the pixel is used for the patch's numbers")
+    data |= _table(done) | _band_table(done.segments)
+    told = {key: done.materials[key] for key in ("library", "model") if done.materials.get(key)}
+    return xarray.Dataset(data, _axes(done) | _patch_axes(done), provenance(done) | told)
+
+
+def _patch_axes(done: ProcessedScan) -> dict[str, Any]:
+    columns = material_columns(done)
+    middle = image_centre_mm(done.image["x_m"], done.image["y_m"])
+    axes = {"patch": _described(("patch",), np.array(columns["patch"], np.int32), "1", "number of the patch in label")}
+    for name, offset_mm in zip("xy", middle, strict=True):
+        at = (_numbers(columns[f"centre_{name}_mm"]) + offset_mm) / 1e3
+        axes[f"centre_{name}"] = _described(("patch",), at, "m", f"middle of the patch, {name} of the rig frame")
+    return axes
+
+
+def _table(done: ProcessedScan) -> dict[str, Any]:
+    """Variables on dimension `patch`."""
+    c = material_columns(done)
+    second = [_runner_up(s) for s in done.segments]
+    inverse = _numbers(c["inverse_p_standard_error"])
+    rows: list[tuple[str, Any, str, str]] = [
+        ("name", _text(c["name"]), "", "material; empty where it was not named"),
+        ("confidence", _numbers(c["confidence"]), "1", "confidence in the name, 0 to 1"),
+        ("runner_up", _text([name for name, _ in second]), "", "second most frequent material of the pixels"),
+        ("runner_up_share", _numbers([share for _, share in second]), "1", "share of the pixels named runner_up"),
+        ("metal_reference", np.array(c["metal_reference"], bool), "1", "True where the patch is the metal reference"),
+        ("metal_like", np.array(c["metal_like"], bool), "1", "True where P is too close to metal for a permittivity"),
+        ("width", _numbers(c["width_mm"]) / 1e3, "m", "extent along x"),
+        ("height", _numbers(c["height_mm"]) / 1e3, "m", "extent along y"),
+        ("pixels", _numbers(c["pixels"]), "1", "number of pixels behind the numbers"),
+        ("patch_incidence_deg", _numbers(c["incidence_deg"]), "degree", "mean incidence angle of the patch"),
+        ("ratio", _complex(c["p_real"], c["p_imag"]), "1", "median of P = H / V relative to metal"),
+        ("inverse_ratio_standard_error", inverse, "1", "standard error of V / H, real and imaginary part each"),
+        ("permittivity", _complex(c["permittivity_real"], c["permittivity_loss"], -1), "1", "relative permittivity"),
+    ]
+    for part in ("real", "loss"):
+        name = f"permittivity_{part}_standard_error"
+        rows.append((name, _numbers(c[name]), "1", f"standard error of the permittivity, {part} part"))
+    if any(c["true_name"]):
+        truth = _complex(c["true_permittivity_real"], c["true_permittivity_loss"], -1)
+        rows.append(("true_name", _text(c["true_name"]), "", "material of the simulated scene"))
+        rows.append(("true_permittivity", truth, "1", "relative permittivity of the simulated scene"))
+    return {name: _described(("patch",), values, units, about) for name, values, units, about in rows}
+
+
+def _runner_up(segment: dict[str, Any]) -> tuple[str | None, float | None]:
+    """The name with the most pixels beside the patch's own, and its share."""
+    others = {name: share for name, share in (segment.get("votes") or {}).items() if name != segment.get("name")}
+    return max(others.items(), key=lambda item: item[1], default=(None, None))
+
+
+def _band_table(segments: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Variables on dimensions `patch`, `band`; empty unless every patch was imaged in sub-bands."""
+    bands = [s.get("bands") for s in segments]
+    if not bands or any(b is None for b in bands):
+        return {}
+    rows: list[list[dict[str, Any]]] = [b for b in bands if b is not None]
+    ratios = [[b.get("ratio") or {"real": None, "imag": None} for b in row] for row in rows]
+    errors = [_numbers([b.get("inverse_ratio_std") for b in row]) for row in rows]
+    found = [_complex([p["real"] for p in row], [p["imag"] for p in row]) for row in ratios]
+    name, error = "band_ratio", "band_inverse_ratio_standard_error"
+    edges = {
+        f"band_{edge}_hz": _described(("band",), [b[f"{edge}_hz"] for b in rows[0]], "Hz", f"{edge} transmit frequency")
+        for edge in ("first", "last")
+    }
+    return {
+        name: _described(("patch", "band"), found, "1", "median of P = H / V in the sub-band"),
+        error: _described(("patch", "band"), errors, "1", "standard error of V / H in the sub-band"),
+        **edges,
+    }
+
+
+def full_dataset(done: ProcessedScan) -> xarray.Dataset:
+    """Everything in one dataset: :func:`image_dataset`, and :func:`patch_dataset` where materials were looked for.
+
+    The attribute `instrument` holds the rig file as JSON.
+    """
+    made = image_dataset(done)
+    if done.metal_referenced:
+        patches = patch_dataset(done)
+        made = made.assign_coords(patches.coords).assign(patches.data_vars).assign_attrs(patches.attrs)
+    if "instrument" in done.scan:
+        made.attrs["instrument"] = json.dumps(done.scan["instrument"])
+    return made

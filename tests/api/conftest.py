@@ -1,0 +1,52 @@
+"""One small simulated scan, and what the commands make of it."""
+
+from __future__ import annotations
+
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.shared.config import load_instrument
+from polysight.simulators.scene import decode_scene, simulate
+
+REPO = Path(__file__).resolve().parents[2]
+COPPER = {"name": "copper", "centre_mm": [-45.0, 0.0], "size_mm": [45.0, 45.0], "metal": True}
+PET = {"name": "PET", "centre_mm": [45.0, 0.0], "size_mm": [45.0, 45.0], "permittivity": [3.78, 0.7]}
+
+
+def simulated(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
+    """A scan of plates on the grid of examples/own-scene.toml, of nothing on a coarse one; `more` as of `simulate`."""
+    fine, coarse = (31, 27, 10.0, 6.0), (15, 17, 14.0, 8.0)
+    grid = dict(zip(("columns", "rows", "step_x_mm", "step_y_mm"), fine if plates else coarse, strict=True))
+    scene = {
+        "name": "small",
+        "grid": grid,
+        "burst": {"pulses": 2},
+        "image": {"columns": 90, "rows": 60, "pixel_mm": 2.0},
+        "plates": list(plates),
+    }
+    return simulate(load_instrument(REPO / "instrument.toml"), decode_scene(scene, "test"), folder, **more)
+
+
+def command(*words: object) -> None:
+    """Run a command of the host, which must succeed."""
+    with redirect_stdout(StringIO()):
+        assert main([str(word) for word in words]) == 0
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan folder of copper and PET, without products."""
+    return simulated(tmp_path_factory.mktemp("api") / "scan", COPPER, PET)
+
+
+@pytest.fixture(scope="session")
+def products(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `polysight process` makes of it."""
+    out = tmp_path_factory.mktemp("processed") / "products"
+    command("process", folder, "--out", out)
+    return out

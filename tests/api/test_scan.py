@@ -1,0 +1,397 @@
+"""Laws of `polysight.open_scan`: what it gives is what the commands write, described, and nothing is left behind."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+
+import polysight
+from polysight import open_scan, read_netcdf
+from polysight.host.products.files import read_image
+from polysight.host.store import manifest
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import ConfigError, DataError, PolysightError
+
+from .conftest import COPPER, PET, REPO, command, simulated
+
+pytestmark = pytest.mark.xdist_group("api")
+DATASETS = ("image", "patches", "permittivity", "materials")
+
+
+@pytest.fixture(scope="module")
+def scan(folder):
+    return open_scan(folder)
+
+
+def without_rows(folder: Path, out: Path, *rows: int) -> Path:
+    """A copy of a scan folder in which these rows were never committed."""
+    shutil.copytree(folder, out)
+    kept = [f for f in manifest.read(out / MANIFEST).facts if f["fact"] != "row_committed" or f["row"] not in rows]
+    (out / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept))
+    return out
+
+
+# --- what a dataset says of itself ------------------------------------------------------------------------------------
+
+
+def test_images_have_named_dimensions_and_coordinates_in_metres(scan):
+    image = scan.image()
+    assert {name: v.dims for name, v in image.data_vars.items()} == {
+        "h": ("y", "x"), "v": ("y", "x"), "p": ("y", "x"), "valid": ("y", "x"), "incidence_deg": (),
+    }  # fmt: skip
+    assert {image[name].dtype for name in "hvp"} == {np.dtype(np.complex64)}
+    assert image["valid"].dtype == bool
+    assert image.sizes == {"y": 60, "x": 90}
+    for axis in "xy":
+        assert np.diff(image[axis]) == pytest.approx(2e-3)
+    assert float(image["incidence_deg"]) == pytest.approx(54.9, abs=0.2)
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_every_variable_has_units_and_a_name_and_every_dataset_its_provenance(scan, name):
+    dataset = getattr(scan, name)()
+    for variable in dataset.variables.values():
+        assert set(variable.attrs) == {"units", "long_name"}
+        assert variable.attrs["long_name"]
+    assert {"x", "y"} <= set(dataset.coords) or dataset.sizes == {"patch": 2}
+    assert dataset.attrs["scan_id"] == "small"
+    assert dataset.attrs["simulated"] is True
+    assert "(simulated)" in dataset.attrs["title"]
+    assert dataset.attrs["rig"] == scan.rig.name
+    assert polysight.__version__ in dataset.attrs["versions"]
+    assert (dataset.attrs["rows_planned"], dataset.attrs["rows_missing"]) == (27, "none")
+    assert dataset.attrs["positions_masked"] == "RH 0 of 837, RV 0 of 837"
+
+
+def test_patches_are_where_the_plates_are(scan):
+    patches = scan.patches()
+    assert list(patches["patch"]) == [1, 2]
+    for patch, plate in zip((1, 2), (COPPER, PET), strict=True):
+        one, image = patches.sel(patch=patch), scan.image()
+        offset = (float(one["centre_x"] - image["x"].mean()), float(one["centre_y"] - image["y"].mean()))
+        assert 1e3 * np.array(offset) == pytest.approx(plate["centre_mm"], abs=6)
+        here = patches["label"].sel(x=one["centre_x"], y=one["centre_y"], method="nearest")
+        assert here == patch
+        inside = patches["interior"] & (patches["label"] == patch)
+        assert inside.sum() == one["pixels"]
+        assert (patches["label"].where(patches["interior"]) != 0).all()
+
+
+def test_permittivity_is_near_the_truth_and_unknown_for_metal(scan):
+    copper, pet = (scan.permittivity().sel(patch=n) for n in (1, 2))
+    for name in ("permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error"):
+        assert np.isnan(copper[name])
+        assert np.isfinite(pet[name])
+    assert complex(pet["true_permittivity"]) == 3.78 - 0.7j
+    assert abs(complex(pet["permittivity"]) - (3.78 - 0.7j)) < 1.0
+    assert abs(complex(copper["ratio"]) - 1) < 0.1
+
+
+def test_materials_have_names_and_a_runner_up(scan):
+    materials = scan.materials()
+    assert list(materials["true_name"].values) == ["copper", "PET"]
+    assert materials["metal_reference"].values.tolist() == [True, False]
+    assert materials["name"].values[0] == "copper"
+    assert (materials["runner_up"] != materials["name"]).all()
+    assert materials.attrs["library"]
+
+
+def test_sub_bands_are_a_dimension_of_their_own(folder):
+    patches = open_scan(folder, bands=3).patches()
+    assert patches["band_ratio"].dims == ("patch", "band")
+    assert patches.sizes["band"] == 3
+    assert (patches["band_first_hz"] < patches["band_last_hz"]).all()
+    near_metal = patches["band_ratio"].sel(patch=1)
+    assert (abs(near_metal - 1) < 0.3).all()
+
+
+def test_each_pixel_can_have_its_own_incidence(folder):
+    angles = open_scan(folder, incidence="pixel").image()["incidence_deg"]
+    assert angles.dims == ("y", "x")
+    assert abs(angles - 54.9).max() < 10
+
+
+# --- the same as the commands -----------------------------------------------------------------------------------------
+
+
+def same_image(image: xarray.Dataset, file: Path) -> None:
+    saved = read_image(file)
+    for name in ("h", "v", "p"):
+        np.testing.assert_allclose(image[name].values, saved[name], rtol=1e-6, atol=1e-6)
+    assert (image["valid"].values == saved["valid"]).all()
+    assert (image["x"].values == saved["x_m"]).all()
+    assert (image["y"].values == saved["y_m"]).all()
+
+
+def test_the_image_is_what_process_writes(scan, products):
+    same_image(scan.image(), products / "image.npz")
+
+
+def test_the_unreferenced_image_is_what_image_writes(scan, folder, tmp_path):
+    command("image", folder, "--out", tmp_path / "out")
+    same_image(scan.image(metal_referenced=False), tmp_path / "out" / "image.npz")
+    saved = open_scan(tmp_path / "out")
+    xarray.testing.assert_allclose(saved.image(metal_referenced=False), scan.image(metal_referenced=False))
+    for call in (saved.image, saved.patches, saved.plot):
+        with pytest.raises(DataError, match="not referenced to metal"):
+            call()
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_products_give_the_same_datasets_as_the_rows(scan, products, name):
+    from_rows, from_products = getattr(scan, name)(), getattr(open_scan(products), name)()
+    if "label" in from_rows:  # outlines are saved to half a pixel
+        differ = from_rows["label"] != from_products["label"]
+        assert differ.sum() < 0.2 * (from_rows["label"] > 0).sum()
+        from_rows, from_products = from_rows.drop_vars("label"), from_products.drop_vars("label")
+    xarray.testing.assert_allclose(from_rows, from_products, rtol=1e-6)
+    for dataset in (from_rows, from_products):
+        del dataset.attrs["processed_utc"]
+    assert from_rows.attrs == from_products.attrs
+
+
+def test_saved_products_of_a_scan_folder_are_used_while_they_hold_its_rows(folder, products, tmp_path):
+    scan = shutil.copytree(folder, tmp_path / "scan")
+    saved = shutil.copytree(products, scan / "products")
+    shutil.rmtree(scan / "raw")  # only the products can answer
+    assert "saved products" in repr(open_scan(scan))
+    same_image(open_scan(scan).image(), saved / "image.npz")
+    for asked in (open_scan(scan, fresh=True), open_scan(scan, model="none")):
+        assert "recorded rows" in repr(asked)
+        with pytest.raises(DataError, match="cannot be read"):
+            asked.image()
+
+
+def test_products_of_other_rows_are_not_used(folder, products, tmp_path):
+    scan = without_rows(folder, tmp_path / "scan", 26)
+    shutil.copytree(products, scan / "products")
+    opened = open_scan(scan)
+    assert "recorded rows" in repr(opened)
+    assert opened.image().attrs["rows_missing"] == "26"
+
+
+@pytest.mark.parametrize("by_columns", [False, True])
+def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
+    monkeypatch.chdir(tmp_path)
+    made = simulated(tmp_path / "data", COPPER, PET, layout="authors", by_columns=by_columns)
+    opened = open_scan(made)
+    assert "SIMULATED" in repr(opened)
+    assert opened.rows.missing == ()
+    assert opened.rows.planned == (31 if by_columns else 27)
+    command("process", made, "--out", tmp_path / "out")  # with the instrument.toml beside the data
+    same_image(opened.image(), tmp_path / "out" / "image.npz")
+    assert open_scan(tmp_path / "out").rows == opened.rows
+    (made / "instrument.toml").unlink()
+    assert open_scan(made).rig == open_scan(made, rig=load_instrument(REPO / "instrument.toml")).rig
+
+
+# --- rows, laziness, side effects -------------------------------------------------------------------------------------
+
+
+def test_missing_rows_are_named(folder, tmp_path):
+    scan = open_scan(without_rows(folder, tmp_path / "scan", 3, 7, 8))
+    assert scan.rows.planned == 27
+    assert list(scan.rows.indices) == list(range(27))
+    assert scan.rows.missing == (3, 7, 8)
+    assert set(scan.rows.committed) == set(range(27)) - {3, 7, 8}
+    assert "24 of 27 rows (missing 3, 7-8)" in repr(scan)
+    assert scan.image().attrs["rows_missing"] == "3, 7-8"
+
+
+def test_repr_is_one_line_and_says_simulated(scan, products):
+    for one in (scan, open_scan(products)):
+        assert repr(one).startswith("<Scan small: SIMULATED, 27 of 27 rows, ")
+        assert "\n" not in repr(one)
+
+
+def test_rows_are_read_once_and_only_when_asked_for(folder, monkeypatch):
+    read: list[tuple[str, int]] = []
+    true_read = ScanFolder.read_row
+
+    def counted(self, board, row):
+        read.append((board, row))
+        return true_read(self, board, row)
+
+    monkeypatch.setattr(ScanFolder, "read_row", counted)
+    scan = open_scan(folder)
+    assert scan.rows.planned == 27
+    assert scan.rig.name
+    assert not read
+    for _ in range(2):
+        scan.image()
+        scan.image(metal_referenced=False)
+        scan.materials()
+        scan.plot()
+    assert sorted(read) == [(board, row) for board in ("RH", "RV") for row in range(27)]
+
+
+def test_results_are_the_callers_to_change(scan):
+    before = scan.image()
+    changed = scan.image()
+    changed["h"][:] = 0
+    changed["x"].attrs.clear()
+    xarray.testing.assert_identical(scan.image(), before)
+
+
+def state(folder: Path) -> dict[str, tuple[int, int]]:
+    return {str(p): (p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.rglob("*"))}
+
+
+def test_nothing_is_written_unless_asked(folder, products, tmp_path, monkeypatch):
+    scan, saved = shutil.copytree(folder, tmp_path / "scan"), shutil.copytree(products, tmp_path / "products")
+    monkeypatch.chdir(tmp_path)
+    before = state(tmp_path)
+    for path in (scan, saved):
+        one = open_scan(path)
+        repr(one)
+        for name in DATASETS:
+            getattr(one, name)()
+        one.plot()
+    assert state(tmp_path) == before
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def same_dataset(found: xarray.Dataset, expected: xarray.Dataset) -> None:
+    xarray.testing.assert_equal(found[sorted(expected.data_vars)], expected[sorted(expected.data_vars)])
+    for name, variable in expected.variables.items():
+        assert found[name].attrs == variable.attrs, name
+        if variable.dtype.kind in "cfib":
+            assert found[name].dtype == variable.dtype, name
+
+
+@pytest.mark.parametrize("opened", ["folder", "products"])
+def test_netcdf_and_zarr_keep_every_value(opened, tmp_path, request):
+    scan = open_scan(request.getfixturevalue(opened))
+    scan.to_netcdf(tmp_path / "image.nc")
+    for _ in range(2):  # an earlier store is replaced
+        scan.to_zarr(tmp_path / "image.zarr")
+    netcdf, zarr = read_netcdf(tmp_path / "image.nc"), xarray.open_zarr(tmp_path / "image.zarr").load()
+    expected = scan.image().assign(scan.patches().data_vars)
+    for found in (netcdf, zarr):
+        same_dataset(found, expected)
+        assert found.attrs.items() >= {**scan.image().attrs, **scan.patches().attrs}.items()
+        assert scan.rig.name in found.attrs["instrument"]
+    assert not [v for v in xarray.load_dataset(tmp_path / "image.nc").variables.values() if v.dtype.kind == "c"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["image.nc", "image.zarr"]
+
+
+def test_images_without_metal_have_files_too(tmp_path):
+    scan = open_scan(simulated(tmp_path / "scan"))
+    scan.to_netcdf(tmp_path / "image.nc", metal_referenced=False)
+    found = read_netcdf(tmp_path / "image.nc")
+    assert "patch" not in found.dims
+    np.testing.assert_array_equal(found["h"], scan.image(metal_referenced=False)["h"])
+
+
+def test_a_folder_that_is_no_store_is_not_replaced(scan, tmp_path):
+    (tmp_path / "mine.zarr").mkdir()
+    (tmp_path / "mine.zarr" / "thesis.txt").write_text("text")
+    with pytest.raises(ConfigError, match="not a Zarr store"):
+        scan.to_zarr(tmp_path / "mine.zarr")
+    assert (tmp_path / "mine.zarr" / "thesis.txt").exists()
+
+
+# --- the figure -------------------------------------------------------------------------------------------------------
+
+
+def test_the_figure_has_axes_in_mm_colour_bars_and_says_simulated(scan):
+    for figure, pictures in ((scan.plot(), 4), (scan.plot(metal_referenced=False), 3)):
+        titled = [ax for ax in figure.axes if ax.get_title(loc="left")]
+        bars = [ax for ax in figure.axes if ax not in titled]
+        assert (len(titled), len(bars)) == (pictures, 3)
+        assert all((ax.get_xlabel(), ax.get_ylabel()) == ("x (mm)", "y (mm)") for ax in titled)
+        assert all(bar.get_ylabel().startswith("dB") for bar in bars)
+        assert figure.get_suptitle() == "Scan small (simulated)"
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    assert "copper" in " ".join(t.get_text() for t in scan.plot().axes[3].texts)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_scan_is_refused(tmp_path):
+    for path in (tmp_path, tmp_path / "absent", str(tmp_path)):
+        with pytest.raises(DataError):
+            open_scan(path)
+
+
+def test_a_scan_without_a_whole_row_says_so(folder, tmp_path):
+    scan = open_scan(without_rows(folder, tmp_path / "scan", *range(27)))
+    assert scan.rows.committed == ()
+    for call in (scan.image, scan.patches, scan.plot, lambda: scan.image(metal_referenced=False)):
+        with pytest.raises(DataError, match="no row is recorded whole"):
+            call()
+
+
+def test_a_scan_without_metal_says_what_can_be_had(tmp_path):
+    scan = open_scan(simulated(tmp_path / "scan"))
+    with pytest.raises(DataError) as e:
+        scan.image()
+    assert "metal_referenced=False" in e.value.remedy
+    assert scan.image(metal_referenced=False).attrs["metal_reference"].startswith("none")
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"library": "absent.npz"}, {"model": "no such model"}, {"metal_box_mm": (900.0, 900.0, 910.0, 910.0)}]
+)
+def test_parameters_that_cannot_be_used_are_errors(folder, wrong):
+    with pytest.raises(PolysightError):
+        open_scan(folder, **wrong).materials()
+
+
+def test_products_cannot_be_processed_again(products):
+    with pytest.raises(ConfigError, match="cannot be processed again"):
+        open_scan(products, bands=3)
+    with pytest.raises(DataError, match="referenced to metal"):
+        open_scan(products).image(metal_referenced=False)
+
+
+def test_products_that_say_nothing_of_the_scan_still_open(products, tmp_path):
+    bare = shutil.copytree(products, tmp_path / "bare")
+    for name in ("scan.json", "quality.json", "patches.npz"):
+        (bare / name).unlink()
+    scan = open_scan(bare)
+    assert "number of rows not known" in repr(scan)
+    assert "interior" not in scan.patches()
+    assert "incidence_deg" not in scan.image()
+    assert scan.simulated is True  # materials.json says so
+    for name in ("rig", "rows"):
+        with pytest.raises(DataError, match="do not say"):
+            getattr(scan, name)
+
+
+# --- the package ------------------------------------------------------------------------------------------------------
+
+
+def test_importing_polysight_imports_nothing_else():
+    code = (
+        "import sys\nfor name in ('numpy', 'xarray', 'msgspec', 'scipy', 'matplotlib'): sys.modules[name] = None\n"
+        "import polysight\nassert polysight.__version__\n"
+        "assert {'open_scan', 'fresnel', 'backproject'} <= set(dir(polysight))\n"
+        "assert not [m for m in sys.modules if m.startswith('polysight.host')]\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_opening_a_scan_needs_neither_xarray_nor_matplotlib_s_state(folder):
+    code = (
+        f"import sys, polysight\nscan = polysight.open_scan({str(folder)!r})\nrepr(scan), scan.rows, scan.rig\n"
+        "assert 'xarray' not in sys.modules\nscan.plot()\nassert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_public_name_is_there():
+    for name in polysight.__all__:
+        assert getattr(polysight, name)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = polysight.no_such_name

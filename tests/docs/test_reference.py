@@ -1,0 +1,49 @@
+"""The API reference: every public name has its text in it, and its links are checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import polysight
+from docs.reference import build, link_faults, modules_of
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> Path:
+    """Pages of the public interface and of the rooms behind it."""
+    out = tmp_path_factory.mktemp("reference")
+    rooms = ("polysight", "polysight.host.api", "polysight.host.imaging", "polysight.host.polarimetry")
+    names = [name for room in rooms for name in modules_of(room)]
+    assert names == list(rooms), "a package that names its public functions has one page"
+    build(names, out)
+    return out
+
+
+def test_every_public_name_is_on_the_page_with_its_text(reference):
+    page = (reference / "polysight.html").read_text(encoding="utf-8")
+    for name in set(polysight.__all__) - {"__version__"}:
+        assert f'id="{name}"' in page
+    for text in ("metal_box_mm", "Reference library of the materials", "complex64 [y, x]"):
+        assert text in page
+
+
+def test_links_between_the_pages_lead_somewhere(reference):
+    assert link_faults(reference) == []
+    pages = " ".join(p.read_text(encoding="utf-8") for p in reference.rglob("*.html"))
+    assert 'href="#open_scan"' in pages
+
+
+@pytest.mark.parametrize("link", ["gone.html", "other.html#gone", "#gone", "folder/other.html#here"])
+def test_a_link_that_leads_nowhere_is_found(tmp_path, link):
+    (tmp_path / "other.html").write_text('<p id="here">')
+    (tmp_path / "page.html").write_text(
+        f'<a href="other.html#here"></a><a href="#top"></a><a id="top" href="https://a.b/c"></a><a href="{link}"></a>'
+    )
+    assert link_faults(tmp_path) == [f"page.html: {link}"]
+
+
+def test_a_package_without_public_names_has_a_page_for_each_module():
+    found = list(modules_of("polysight.shared"))
+    assert {"polysight.shared", "polysight.shared.errors", "polysight.shared.config"} <= set(found)

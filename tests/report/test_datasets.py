@@ -1,0 +1,146 @@
+"""NetCDF and Zarr of a folder of products, read back by xarray."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+
+from polysight.host.cli.main import main
+from polysight.host.products import dataset_files, write_image, write_json
+from polysight.host.products.dataset_files import join_complex, read_netcdf, split_complex
+from polysight.shared.config import load_instrument
+from polysight.shared.errors import DataError
+from polysight.shared.tables import to_builtins
+
+REPO = Path(__file__).resolve().parents[2]
+PATCH = {
+    "label": 4, "name": "PET", "confidence": 0.75, "votes": {"PET": 0.75, "glass": 0.2, "unknown": 0.05},
+    "metal_reference": False, "metal_like": False, "box_mm": [-30.0, -40.0, 50.0, 40.0], "outline_mm": [],
+    "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5, "ratio": {"real": 0.0, "imag": 10.0},
+    "inverse_ratio_std": 0.004, "permittivity": {"real": 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125},
+    "truth": None,
+}  # fmt: skip
+METAL = {**PATCH, "label": 5, "name": None, "confidence": None, "votes": {}, "metal_reference": True,
+         "box_mm": [-100.0, -50.0, -80.0, 50.0], "ratio": None, "permittivity": None}  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Products that somebody else sent: no raw data, no patches.npz."""
+    rng = np.random.default_rng(3)
+    h, v = (rng.standard_normal((2, 6, 11)) + 1j * rng.standard_normal((2, 6, 11))).astype(np.complex64)
+    made = tmp_path / "one"
+    x, y = np.linspace(-0.1, 0.1, 11), np.linspace(0.05, 0.15, 6)
+    write_image(made / "image.npz", h, v, h / v, x, y, rng.uniform(size=h.shape) < 0.8)
+    write_json(made / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
+    rig = to_builtins(load_instrument(REPO / "instrument.toml"))
+    write_json(made / "scan.json", {"scan_id": "s", "simulated": True, "versions": {"numpy": "2"}, "instrument": rig})
+    boards = {"RH": {"positions": 9, "positions_masked": 2, "rows_recorded": [0, 1, 5]}}
+    write_json(made / "quality.json", {"boards": boards})
+    return made
+
+
+def both(folder: Path) -> list[xarray.Dataset]:
+    """The two files of a folder of products, read."""
+    out = folder.parent / "out"
+    assert main(["export", str(folder), "--netcdf", "--zarr", "--out", str(out)]) == 0
+    return [read_netcdf(out / "image.nc"), xarray.open_zarr(out / "image.zarr").load()]
+
+
+def test_the_files_hold_the_products(folder):
+    with np.load(folder / "image.npz") as saved:
+        for dataset in both(folder):
+            for name in ("h", "v", "p", "valid"):
+                np.testing.assert_array_equal(dataset[name], saved[name])
+                assert dataset[name].dtype == saved[name].dtype
+                assert dataset[name].dims == ("y", "x")
+            for axis in "xy":
+                np.testing.assert_array_equal(dataset[axis], saved[f"{axis}_m"])
+                assert dataset[axis].attrs["units"] == "m"
+
+
+def test_the_table_is_that_of_the_materials_in_si_units(folder):
+    for dataset in both(folder):
+        pet, metal = dataset.sel(patch=4), dataset.sel(patch=5)
+        assert (pet["name"], pet["runner_up"], metal["name"]) == ("PET", "glass", "")
+        assert (pet["confidence"], pet["runner_up_share"]) == (0.75, 0.2)
+        assert complex(pet["permittivity"]) == 3.5 - 0.25j
+        assert (pet["permittivity_real_standard_error"], pet["permittivity_loss_standard_error"]) == (0.0625, 0.125)
+        assert complex(pet["ratio"]) == 10j
+        assert np.isnan(metal["permittivity"])
+        assert float(pet["centre_x"]) == pytest.approx(0.01)
+        assert float(pet["centre_y"]) == pytest.approx(0.1)
+        assert float(pet["width"]) == pytest.approx(0.08)
+        assert dataset["label"].dtype == np.int32
+        inside = dataset["label"].sel(x=pet["centre_x"], y=pet["centre_y"], method="nearest")
+        assert (inside, dataset["label"].sel(x=-0.1, y=0.1, method="nearest")) == (4, 5)
+
+
+def test_the_attributes_say_where_it_comes_from(folder):
+    for dataset in both(folder):
+        assert dataset.attrs["scan_id"] == "s"
+        assert dataset.attrs["simulated"] is True
+        assert dataset.attrs["rows_missing"].startswith("2-4, 6-")
+        assert dataset.attrs["positions_masked"] == "RH 2 of 9"
+        assert '"columns"' in dataset.attrs["instrument"]
+
+
+def test_netcdf_has_no_complex_variables(folder):
+    both(folder)
+    with h5py.File(folder.parent / "out" / "image.nc") as f:
+        assert {"h_real", "h_imag", "p_real", "p_imag", "permittivity_real", "permittivity_imag"} <= set(f)
+        assert not {"h", "permittivity"} & set(f)
+        assert f["h_imag"].dtype == np.float32
+        assert f["h_imag"].attrs["long_name"].endswith("imaginary part")
+
+
+def test_splitting_and_joining_is_the_identity():
+    made = {
+        "a": (
+            "t",
+            np.array([1 + 2j, complex(np.nan, np.nan), complex(0, np.inf)], np.complex64),
+            {"units": "1", "long_name": "a"},
+        ),
+        "b_real": ("t", [1.0, 2.0, 3.0], {"units": "m", "long_name": "not a part of anything"}),
+        "c": ("t", np.array([1e-300 + 1e300j, 0, 1]), {"units": "V", "long_name": "c"}),
+    }
+    dataset = xarray.Dataset(made, attrs={"title": "x"})
+    split = split_complex(dataset)
+    assert set(split.data_vars) == {"a_real", "a_imag", "b_real", "c_real", "c_imag"}
+    joined = join_complex(split)
+    xarray.testing.assert_identical(joined[sorted(made)], dataset[sorted(made)])
+    assert {name: v.dtype for name, v in joined.items()} == {name: v.dtype for name, v in dataset.items()}
+
+
+def test_images_alone_export_too(folder):
+    for name in ("materials.json", "scan.json", "quality.json"):
+        (folder / name).unlink()
+    for dataset in both(folder):
+        assert set(dataset.dims) == {"y", "x"}
+        assert dataset.attrs["simulated"] == "unknown"
+        assert dataset.attrs["metal_reference"].startswith("none")
+
+
+@pytest.mark.parametrize(("option", "package"), [("--netcdf", "h5netcdf"), ("--zarr", "zarr")])
+def test_a_missing_package_is_named_with_its_extra(folder, monkeypatch, capsys, option, package):
+    def absent(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(dataset_files, "import_module", absent)
+    out = folder.parent / "out"
+    assert main(["export", str(folder), option, "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'polysight[export]'" in said
+    assert package in said
+    assert not list(out.iterdir())
+
+
+def test_what_is_no_netcdf_file_is_refused(tmp_path):
+    (tmp_path / "text.nc").write_text("text")
+    for name in ("text.nc", "absent.nc"):
+        with pytest.raises(DataError, match=name):
+            read_netcdf(tmp_path / name)

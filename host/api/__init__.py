@@ -8,8 +8,6 @@ that need no scan (`backproject`, `fresnel`, `permittivity_from_ratio`, `multila
 """
 
 from polysight.host.api.scan import Scan, open_scan
+from polysight.host.products import Rows, read_netcdf
 
-__all__ = [
-    "Scan",
-    "open_scan",
-]
+__all__ = ["Rows", "Scan", "open_scan", "read_netcdf"]

@@ -14,11 +14,6 @@ from polysight.shared.tables import decode, read_toml, to_builtins
 RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
 
 
-@pytest.fixture(scope="module")
-def rig() -> Instrument:
-    return load_instrument(RIG)
-
-
 def test_the_published_rig_survives_toml(rig: Instrument, tmp_path: Path):
     path = tmp_path / "copy.toml"
     path.write_text(tomli_w.dumps(to_builtins(rig)))

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
 from polysight.shared.wires import WireClient, WireEdge, WireMotion
 from polysight.simulators.cards.fault_draws import NetworkFaults
 from polysight.simulators.cards.sender import ReceiveQueue, bound_udp
 from polysight.simulators.faults import Faults
-from polysight.simulators.loopback import is_free, on_free_subnet, on_subnet
+from polysight.simulators.loopback import is_free, on_subnet
 from polysight.simulators.scene import pattern_frames
 
 ROOT = Path(__file__).parents[2]
@@ -88,11 +88,6 @@ def sequences(packets: list[bytes]) -> list[int]:
 
 
 Start = Callable[..., dict[str, HostSide]]
-
-
-@pytest.fixture
-def rig() -> Instrument:
-    return on_free_subnet(load_instrument(ROOT / "instrument.toml"))
 
 
 @pytest.fixture

@@ -6,16 +6,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.simulators.scene.scene_file import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def rig() -> Instrument:
-    return load_instrument(ROOT / "instrument.toml")
 
 
 def scene(**tables: Any) -> Scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
 from polysight.host.products import ProcessedScan, plain, scan_facts
-from polysight.host.store import Source
+from polysight.host.store import ScanFolder, Source, require_raw
 from polysight.shared.errors import DataError, advice
 
 
@@ -41,6 +42,8 @@ class Processing:
     @cached_property
     def _images(self) -> ChannelImages:
         """Both channels from all rows that hold data. Raises DataError when there are none."""
+        if isinstance(self.source, ScanFolder):
+            require_raw(self.source)
         rows = list(self.source.rows())
         if not rows:
             raise DataError(
@@ -72,6 +75,8 @@ class Processing:
         classifier, unnamed = options.classifier(pipeline.rig), options.unnamed(pipeline.rig)
         plane = pipeline.metal_plane(options)
         images, truth = self._images, self.folder / "truth.json"
+        if plane is not None:
+            images = replace(images, valid=images.valid & plane.valid_on(images.x_m, images.y_m))
         plates = read_truth(truth) if truth.exists() else ()
         try:
             metal, known = MetalChoice(options.metal_box_mm, None, plane), KnownScene(plates=plates)
@@ -79,13 +84,13 @@ class Processing:
         except DataError as e:
             raise DataError(e.what, e.why, advice(e.remedy, "metal_referenced=False shows images without")) from e
         pipeline.quality.note(pixel_accuracy=pixel_accuracy(found))
-        valid = images.valid if plane is None else images.valid & plane.valid
         c, labels = found.calibrated, found.segmentation.labels
         interior = np.zeros(labels.shape, bool)
         for patch in found.segmentation.patches:
             interior |= patch.interior
         materials = plain(materials_content(self.source, found, classifier, unnamed))
-        return self._processed(images, {"h": c.h, "v": c.v, "p": c.p, "valid": valid}, materials, labels, interior)
+        pixels = {"h": c.h, "v": c.v, "p": c.p, "valid": images.valid}
+        return self._processed(images, pixels, materials, labels, interior)
 
     def _processed(self, images: ChannelImages, pixels, materials, labels, interior) -> ProcessedScan:
         return ProcessedScan(

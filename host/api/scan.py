@@ -88,19 +88,24 @@ def open_scan(
         bands=bands,
         incidence=incidence,
     )
+    anew = fresh or options != Options()
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
-        if fresh or options != Options():
-            raise ConfigError(
-                f"{path}: products cannot be processed again",
-                "the recorded rows are not in this folder",
-                "give the scan folder with these parameters, or leave them out to read the products",
-            )
-        return Scan(path, None, SavedProducts(path), options)
+        return _products_only(path, options, anew)
     source = _open_source(path, rig)
-    saved = None if fresh or options != Options() else find_products(path)
+    saved = None if anew else find_products(path)
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
         saved = None
     return Scan(path, source, saved, options)
+
+
+def _products_only(path: Path, options: Options, anew: bool) -> Scan:
+    if anew:
+        raise ConfigError(
+            f"{path}: products cannot be processed again",
+            "the recorded rows are not in this folder",
+            "give the scan folder with these parameters, or leave them out to read the products",
+        )
+    return Scan(path, None, SavedProducts(path), options)
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -23,7 +24,7 @@ from polysight.host.acquisition.ready import make_ready
 from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.jobs import live_scan as live
 from polysight.host.jobs import live_scan as progress
-from polysight.host.process.request import Options
+from polysight.host.process.request import ProcessRequest
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared import messages as m
@@ -38,6 +39,10 @@ def commands(pi) -> list[type]:
 
 
 # --- what moves by itself ---------------------------------------------------------------------------------------------
+
+
+def request(folder: Path) -> ProcessRequest:
+    return ProcessRequest(data=str(folder), out=str(folder / "products"))
 
 
 @pytest.mark.parametrize("fault", [102, 109])
@@ -233,7 +238,7 @@ def test_scan_whose_messages_nobody_reads_is_made_and_processed(rig, tmp_path, m
         patch.setattr(sys, "stderr", streams[0])
         patch.setattr(sys, "stdout", streams[1])
         with suppress(OSError):  # of the summary, which comes last
-            live.scan(config, tmp_path / "s", None, Options(), False, True)
+            live.scan(config, request(tmp_path / "s"), None, False, True)
     for stream in streams:
         stream.close()
     assert validate(tmp_path / "s") == []
@@ -266,7 +271,7 @@ def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_pa
 
     monkeypatch.setattr(live, "Pipeline", broken)
     with pytest.raises(PolysightError, match=r"oops|no images") as e:
-        live.scan(config, tmp_path / "s", None, Options(), False, True)
+        live.scan(config, request(tmp_path / "s"), None, False, True)
     assert "every row is committed" in capsys.readouterr().out
     assert f"polysight process {tmp_path / 's'}" in e.value.remedy
 

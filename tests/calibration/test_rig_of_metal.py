@@ -173,12 +173,12 @@ def calibrated(plate, out, *more):
 
 def test_processing_refuses_the_calibration_of_another_rig(plate, taken_with, tmp_path):
     path = calibrated(plate, tmp_path / "c")
-    assert Pipeline(taken_with(path)).metal_reference(Options()) is not None
+    assert Pipeline(taken_with(path)).metal_plane(Options()) is not None
     moved = Pipeline(taken_with(path, MATTERS["V moved"][0]))
     with pytest.raises(DataError, match="RV or its antennas moved"):
-        moved.metal_reference(Options())
-    assert moved.metal_reference(Options(metal_box_mm=(0, 0, 9, 9))) is None  # the scene's own metal is of its own rig
-    assert moved.metal_reference(Options(), in_scene=True) is None
+        moved.metal_plane(Options())
+    assert moved.metal_plane(Options(metal_box_mm=(0, 0, 9, 9))) is None  # the scene's own metal is of its own rig
+    assert moved.metal_plane(Options(), in_scene=True) is None
 
 
 BANDS = 2

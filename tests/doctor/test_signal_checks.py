@@ -73,7 +73,7 @@ def test_a_direct_path_that_the_rig_file_did_not_expect():
 @pytest.mark.parametrize(("skew_ns", "verdict"), [(0.0, "ok"), (-13.0, "warning"), (21.5, "error")])
 def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
     skew = {"sync_skew_ns": {"receive_h": 1.0 - skew_ns / 2, "receive_v": 1.0 + skew_ns / 2}}
-    found = check_skew.judge(RIG, {name: signal_of(name, **skew) for name in ("RH", "RV")})
+    found = check_skew.judge_skew(RIG, {name: signal_of(name, **skew) for name in ("RH", "RV")})
     assert found.facts["skew_ns"] == pytest.approx(skew_ns, abs=5 * found.facts["standard_error_ns"])
     assert found.verdict == verdict
     assert found.facts["later_ns"]["RH"] == pytest.approx(1.0 - skew_ns / 2, abs=2.5)

@@ -13,7 +13,7 @@ import pytest
 
 from polysight.host.jobs.drop_raw import drop_raw, processed_digests
 from polysight.host.jobs.live_scan import resume
-from polysight.host.process.request import Options
+from polysight.host.process.request import ProcessRequest
 from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
@@ -84,7 +84,7 @@ def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
     done = polysight("process", scan, "--out", scan / "products")
     assert (done.returncode, "it was dropped on" in done.stderr) == (3, True), done
     with pytest.raises(DataError, match=f"raw data of {ROWS} rows"):
-        resume(scan, Options(), keep_incomplete=False, process=True)
+        resume(ProcessRequest(data=str(scan), out=str(scan / "products")), keep_incomplete=False, process=True)
     assert contents(scan / "products") == products
     assert drop_raw(scan, None, yes=True) == 0
     assert "dropped already" in capsys.readouterr().out

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from polysight.data import packaged
 from polysight.host.api.processing import Processing
+from polysight.host.materials import MODELS, SHORT
 from polysight.host.polarimetry import Incidence
 from polysight.host.process import Options
 from polysight.host.products import (
@@ -80,6 +81,7 @@ def open_scan(
     ConfigError
         when a folder of products is given with processing parameters, or a rig file is wrong.
     """
+    _check_arguments(model, library, metal_box_mm, bands, incidence)
     path = Path(folder)
     options = Options(
         metal_box_mm=metal_box_mm,
@@ -96,6 +98,25 @@ def open_scan(
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
         saved = None
     return Scan(path, source, saved, options)
+
+
+def _check_arguments(
+    model: str | None, library: str | os.PathLike[str] | None, box: Box | None, bands: int, incidence: str
+) -> None:
+    """Refuse now what could not be used after all rows are read. Raises ConfigError."""
+    wrong = ""
+    if incidence not in ("one", "pixel"):
+        wrong = f"incidence is {incidence!r}: 'one' or 'pixel'"
+    elif not isinstance(bands, int) or bands < 1:
+        wrong = f"bands is {bands!r}: a whole number, 1 or more"
+    elif box is not None and (isinstance(box, str) or len(box) != 4 or not (box[0] < box[2] and box[1] < box[3])):
+        wrong = f"metal_box_mm is {box!r}: (x0, y0, x1, y1) in mm from the image centre, x0 < x1 and y0 < y1"
+    elif model is not None and model not in (*MODELS, *SHORT, "none"):
+        wrong = f"model is {model!r}: one of {', '.join((*SHORT, 'none'))}"
+    elif library is not None and not Path(library).is_file():
+        wrong = f"library {library}: no such file"
+    if wrong:
+        raise ConfigError(wrong, "the argument is wrong", "see help(polysight.open_scan)")
 
 
 def _products_only(path: Path, options: Options, anew: bool) -> Scan:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from polysight.data import packaged
 from polysight.host.cli.options import Add, add_config_option, add_model_option, count, number
 from polysight.shared.errors import ConfigError
 
@@ -204,7 +205,8 @@ def _train(args: argparse.Namespace) -> int:
         return train_authors(args.authors, args.config, args.out)
     from polysight.host.jobs.process import train
 
-    return train(args.simulate, args.data, args.config, args.out)
+    scenes = None if args.simulate is None else packaged(args.simulate)
+    return train(scenes, args.data, args.config, args.out)
 
 
 def _add_train(add: Add) -> None:

@@ -14,13 +14,13 @@ from polysight.shared.errors import ConfigError
 def _demo(args: argparse.Namespace) -> int:
     from polysight.host.jobs.demo import run_demo
 
-    return run_demo(args.scene, args.config, args.out, args.time_scale)
+    return run_demo(packaged(args.scene), args.config, args.out, args.time_scale)
 
 
 def _simulate(args: argparse.Namespace) -> int:
     from polysight.host.jobs.demo import run_simulator
 
-    command = ["simulate", str(args.scene), "--config", str(args.config), "--out", str(args.out)]
+    command = ["simulate", str(packaged(args.scene)), "--config", str(args.config), "--out", str(args.out)]
     command += ["--layout", args.layout]
     if args.seed is not None:
         command += ["--seed", str(args.seed)]

@@ -20,7 +20,16 @@ from polysight.host.materials.analyse import (
     permittivity_change,
     pixel_accuracy,
 )
-from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER, UNKNOWN, Classifier, NamedPatch, Verdict
+from polysight.host.materials.classify import (
+    DISCRIMINANT,
+    MODELS,
+    PAPER,
+    SHORT,
+    UNKNOWN,
+    Classifier,
+    NamedPatch,
+    Verdict,
+)
 from polysight.host.materials.concentration import (
     ConcentrationResult,
     concentrations,
@@ -82,6 +91,7 @@ __all__ = [
     "PAPER",
     "PATCHES",
     "SAME_ANGLE_DEG",
+    "SHORT",
     "SIMULATED_LIBRARY",
     "UNKNOWN",
     "UNKNOWN_SCENE",

@@ -4,6 +4,7 @@
 hold data, `read_row` and facts about the recording; `raw_source` asks for one with the chirps still in it.
 """
 
+from polysight.host.store import manifest
 from polysight.host.store.append_only import sync_folder
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, Manifest, ManifestWriter
@@ -47,6 +48,7 @@ __all__ = [
     "drop",
     "droppable",
     "is_source",
+    "manifest",
     "mirrored",
     "new_scan_id",
     "open_source",

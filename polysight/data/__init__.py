@@ -8,10 +8,10 @@ FOLDER = Path(__file__).parent
 
 
 def packaged(path: Path) -> Path:
-    """`path` where it exists; otherwise the file of that name that comes with the package, if there is one.
+    """`path` where it exists; otherwise the file or folder of that name that comes with the package, if there is one.
 
     So `instrument.toml` and `examples/nine-materials.toml` are found from any folder, and a file of one's own comes
     first.
     """
     ours = FOLDER / path
-    return ours if not path.is_absolute() and not path.exists() and ours.is_file() else path
+    return ours if not path.is_absolute() and not path.exists() and ours.exists() else path

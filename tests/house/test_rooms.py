@@ -81,6 +81,53 @@ def test_neighbours_import_only_from_a_rooms_front():
     assert past == []
 
 
+def test_no_module_is_taken_from_behind_a_front():
+    """Not `from polysight.host.sync import tone` either, unless the front names it; nor relative imports."""
+    past = []
+    for file in (f for top in ("host", "papers", "polysight") for f in (ROOT / top).rglob("*.py")):
+        own = file.relative_to(ROOT).parts[1] if file.is_relative_to(ROOT / "host") else ""
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            parts = (node.module or "").split(".")
+            if node.level:
+                past.append(f"{file.relative_to(ROOT)}:{node.lineno} a relative import")
+            elif parts[:2] == ["polysight", "host"] and len(parts) == 3 and parts[2] not in (own, *ENTERED_BY_MODULE):
+                room = ROOT / "host" / parts[2]
+                if not room.is_dir():  # pipeline.py
+                    continue
+                front = (room / "__init__.py").read_text(encoding="utf-8")
+                modules = [
+                    a.name for a in node.names if (room / f"{a.name}.py").exists() and f'"{a.name}"' not in front
+                ]
+                past += [f"{file.relative_to(ROOT)}:{node.lineno} {m}" for m in modules]
+    assert past == []
+
+
+def test_the_package_has_one_name_and_does_without_simulators():
+    """Folders are imported as `polysight.x`, also at run time in a wheel; only tests and simulators use simulators."""
+    tops, wrong = ("host", "papers", "pi_controller", "shared", "simulators"), []
+    for file in (f for top in (*tops, "polysight") for f in (ROOT / top).rglob("*.py") if not f.is_symlink()):
+        for line, module in imports(file):
+            uses_simulators = module.startswith("polysight.simulators") and "simulators" not in file.parts
+            if module.split(".")[0] in tops or uses_simulators:
+                wrong.append(f"{file.relative_to(ROOT)}:{line} {module}")
+    assert wrong == []
+
+
+def test_every_folder_of_modules_is_a_package():
+    tops = [ROOT / top for top in ("host", "papers", "pi_controller", "shared", "simulators")]
+    folders = {f.parent for top in tops for f in top.rglob("*.py") if "build" not in f.parts}
+    assert [str(f.relative_to(ROOT)) for f in folders if not (f / "__init__.py").exists()] == []
+
+
+def test_the_pi_half_needs_only_what_its_wheel_brings():
+    allowed = {*sys.stdlib_module_names, "polysight", "gpiod", "msgpack", "msgspec", "serial", "zmq"}
+    files = [f for top in ("shared", "pi_controller") for f in (ROOT / top).glob("*.py")]
+    more = {f"{f.name}: {m}" for f in files for _, m in imports(f) if m.split(".")[0] not in allowed}
+    assert more == set()
+
+
 def test_the_names_of_the_folders_are_the_names_of_the_package():
     """`import host.imaging` from the root of a checkout gives the functions of `polysight.host.imaging`."""
     code = (

@@ -195,10 +195,18 @@ class Image(Section, frozen=True):
 
 
 class Polarimetry(Section, frozen=True):
-    """Cross-polar leakage of the receivers as [real, imaginary] amplitude, and the Gaussian filter against speckle."""
+    """Cross-polar leakage of the receivers as [real, imaginary] amplitude, and the Gaussian filter against speckle.
+
+    Leakage counts as known only with `leakage_std`, the standard error of each of its parts as it was measured. Without
+    it leakage was never measured: `leakage_h` and `leakage_v` are not used, and `leakage_prior` states how large it may
+    be.
+    """
 
     leakage_h: tuple[float, float] = (0.0, 0.0)
     leakage_v: tuple[float, float] = (0.0, 0.0)
+    leakage_std: NonNegative | None = None
+    # rms magnitude of leakage that was never measured, any phase: 0.058 is what amplitudes spread evenly up to 0.1 have
+    leakage_prior: NonNegative = 0.058
     smooth_px: NonNegative = 1.5
 
 

@@ -12,6 +12,7 @@ from polysight.host.imaging.focus import focus_sweep
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
 from polysight.host.imaging.images import TAPERS, ChannelImages, ImageBuilder, SubBand, SubBandImages, sub_bands
+from polysight.host.imaging.plane import PlaneEstimate, find_plane
 from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
 
@@ -23,12 +24,14 @@ __all__ = [
     "ImageBuilder",
     "ImageGrid",
     "ImagedWith",
+    "PlaneEstimate",
     "PointResponse",
     "SubBand",
     "SubBandImages",
     "Window",
     "backproject",
     "focus_sweep",
+    "find_plane",
     "image_grid",
     "imaging_facts",
     "point_response",

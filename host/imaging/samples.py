@@ -110,7 +110,7 @@ class BoardSamples:
         self._reduction, self._linear = reduction, slice(2 * a, 2 * b)
         self._maps = _on_pairs(np.vstack([reduction.matrix, reduction.direct])[:, a:b])
         self._filters = burst_filters(rig)
-        self._antennas = Antennas.of(rig, board)
+        self._antennas, self._chirp = Antennas.of(rig, board), rig.chirp
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
         self._offsets = scan_offsets_m(rig)
         self._planned = row_starts_m(self._offsets)
@@ -279,13 +279,52 @@ class BoardSamples:
             imager: Imager = self._final
             image: Any = self._final.image_of_spectra(self._spectra, gains)
         else:
-            aperture = replace(self.aperture, grid=self._grid if grid is None else grid)
-            imager, notice = choose_imager(aperture)
-            if notice:
-                _log.warning("%s: %s", self.board.name, notice)
+            imager, notice = self._imager(grid)
             image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
-        footprint: Any = imager.constant(self.mirror.astype(np.complex64), self.weights) / self.count
+        mirror = self.mirror if grid is None else self._mirror_at(float(np.mean(grid.z_m)))
+        footprint: Any = imager.constant(mirror.astype(np.complex64), self.weights) / self.count
         return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
+
+    def range_slope(self) -> tuple[Image, Image]:
+        """Derivative of image and footprint by range (the excess path of all pixels), carrier taken out; 1 / m.
+
+        The matched filter of path d is S(d) = sum_m y_m exp(-j 2 pi f_m d / c), so its derivative is the image of
+        samples times -j 2 pi (f_m - f) / c, f the middle of the sweep.
+        """
+        imager, _ = self._imager(None)
+        factors = self._by_range()
+        gains = (1 / self.rx_calibration()).astype(np.complex64)
+        image: Any = imager.image(self._cube * (gains[:, None, None, None] * factors[:, None, None] * self.weights))
+        return (image / self.count).astype(np.complex64), self.mirror_slope(0.0)
+
+    def mirror_image(self, height_m: float) -> Image:
+        """The footprint of a mirror that lies so much farther than the rig file's plane, complex64 [ny, nx]."""
+        return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m))
+
+    def mirror_slope(self, height_m: float) -> Image:
+        """Its derivative by range, see :meth:`range_slope`."""
+        return self._constant_image(self._mirror_at(float(np.mean(self._grid.z_m)) + height_m) * self._by_range())
+
+    def _constant_image(self, echo: NDArray[np.complexfloating]) -> Image:
+        imager, _ = self._imager(None)
+        image: Any = imager.constant(echo.astype(np.complex64), self.weights)
+        return (image / self.count).astype(np.complex64)
+
+    def _by_range(self) -> NDArray[np.complex64]:
+        f = self._reduction.frequencies_hz
+        return (-2j * np.pi * (f - f.mean()) / SPEED_OF_LIGHT_M_S).astype(np.complex64)
+
+    def _mirror_at(self, z_m: float) -> NDArray[np.complex128]:
+        return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
+
+    def _imager(self, grid: ImageGrid | None) -> tuple[Imager, str | None]:
+        """The imager of the rig file's grid, or of another, and a notice where it is slow."""
+        if grid is None and self._final is not None:
+            return self._final, None
+        imager, notice = choose_imager(replace(self.aperture, grid=self._grid if grid is None else grid))
+        if notice:
+            _log.warning("%s: %s", self.board.name, notice)
+        return imager, notice
 
 
 def _on_pairs(maps: NDArray[np.complex128]) -> NDArray[np.float32]:

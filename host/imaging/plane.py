@@ -1,0 +1,218 @@
+"""The object plane's distance and tilt, from the echoes of flat plates.
+
+A plate's echo tells its range twice: roughly but without ambiguity by how the image's amplitude changes with range
+(the sweep's bandwidth), and finely, but only up to half a wavelength's worth of height, by its phase. The first gives
+the plane to about a millimetre and resolves the second. Both are compared with a mirror's on the rig file's plane, seen
+from the same positions, so that aperture, taper and masked positions have no influence.
+
+All plates are taken to lie on one plane as far as they do; how far each lies off it is returned too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.host.imaging.images import ImageBuilder
+from polysight.host.imaging.samples import BoardSamples
+
+_STEP_M = 2e-4
+"""Height by which a mirror is moved to find how range and phase change with height."""
+_COHERENT = 0.7
+"""A patch whose pixels' ranges agree no better than this (1: the same everywhere) is no plate."""
+_TILT_PRIOR_RAD = 0.02
+"""Standard deviation of a plane's tilt before it is seen: one degree."""
+_LEAST_STD_M = 3e-4
+"""A plate's range is not trusted better than this: neighbours' sidelobes reach into it."""
+_PHASE_FITS_RAD = 0.5
+"""Plates whose phases lie on one plane within this are resolved; it is a fifth of what chance leaves."""
+_PHASE_STD_M = 5e-5
+"""What the reflection's own phase (some degrees for lossy plates) and roughness leave of a height."""
+
+
+@dataclass(frozen=True)
+class PlaneEstimate:
+    """Where the plates lie, beside the rig file's plane.
+
+    Attributes
+    ----------
+    offset_m, offset_std_m
+        How much farther the plane is at the middle of the image, and its standard deviation.
+    tilt_rad, tilt_std_rad
+        Rise of the plane's z along x and along y, radians, and their standard deviations.
+    heights_m
+        float64 [patch]: each patch's own, from its range (from its phase where `by_phase`); NaN where it does not tell.
+    by_phase
+        Whether the plates' phases lie on one plane, so that they fix it.
+    plates
+        How many patches tell.
+    """
+
+    offset_m: float
+    offset_std_m: float
+    tilt_rad: tuple[float, float]
+    tilt_std_rad: tuple[float, float]
+    heights_m: NDArray[np.float64]
+    by_phase: bool
+    plates: int
+
+    @property
+    def known(self) -> bool:
+        """Whether anything in the scene tells where the plane is."""
+        return self.plates > 0
+
+    def transposed(self) -> PlaneEstimate:
+        """The same with x and y swapped."""
+        return replace(self, tilt_rad=self.tilt_rad[::-1], tilt_std_rad=self.tilt_std_rad[::-1])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for quality.json; millimetres and degrees."""
+        if not self.known:
+            return {"known": False}
+        return {
+            "known": True,
+            "offset_mm": round(1e3 * self.offset_m, 3),
+            "offset_std_mm": round(1e3 * self.offset_std_m, 3),
+            "tilt_deg": [round(float(np.degrees(t)), 4) for t in self.tilt_rad],
+            "tilt_std_deg": [round(float(np.degrees(t)), 4) for t in self.tilt_std_rad],
+            "by": "phase" if self.by_phase else "range",
+            "plates": self.plates,
+        }
+
+
+def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> PlaneEstimate:
+    """Find the plane from the insides of flat patches.
+
+    Parameters
+    ----------
+    builder
+        With the rows added; its range gate must hold the plane (`depth_m`).
+    masks
+        bool [ny, nx], one a patch, on the builder's grid.
+    """
+    grid = builder.grid
+    x, y = grid.x_m - grid.x_m.mean(), grid.y_m - grid.y_m.mean()
+    ranges = [_ranges(board, masks) for board in builder.boards.values()]
+    precision = np.stack([1 / std**2 for _, std in ranges])
+    total = precision.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        heights = sum(precision[i] * np.nan_to_num(ranges[i][0]) for i in range(len(ranges))) / total
+    stds = np.sqrt(1 / np.where(total > 0, total, np.nan))
+    tells = np.isfinite(heights)
+    if not tells.any():
+        nowhere = np.full(len(masks), np.nan)
+        return PlaneEstimate(0.0, np.inf, (0.0, 0.0), (np.inf, np.inf), nowhere, False, 0)
+    places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
+    plane, covariance = _fit(places[tells], heights[tells], np.hypot(stds[tells], _LEAST_STD_M))
+    phase = _heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
+    fine = tells & np.isfinite(phase[0])
+    by_phase = False
+    if fine.sum() >= 2:
+        finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
+        off = phase[0][fine] - _at(finer, places[fine])
+        agree = float(np.sqrt(np.mean((off * phase[1]) ** 2))) < _PHASE_FITS_RAD
+        if agree and fine.sum() >= 4 and abs(finer[0] - plane[0]) < 3 * np.sqrt(covariance[0, 0]) + _LEAST_STD_M:
+            plane, covariance, heights, by_phase = finer, fine_covariance, phase[0], True
+    std = np.sqrt(np.diag(covariance))
+    return PlaneEstimate(
+        float(plane[0]),
+        float(std[0]),
+        (float(np.arctan(plane[1])), float(np.arctan(plane[2]))),
+        (float(std[1]), float(std[2])),
+        np.asarray(heights, np.float64),
+        by_phase,
+        int(tells.sum()),
+    )
+
+
+def _ranges(
+    board: BoardSamples, masks: Sequence[NDArray[np.bool_]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Height of each patch above the rig file's plane by the range of its echo, and its standard deviation, metres."""
+    image, footprint, _ = board.image()
+    slope, mirror_slope = board.range_slope()
+    moved, moved_slope = board.mirror_image(_STEP_M), board.mirror_slope(_STEP_M)
+    heights, stds = np.full(len(masks), np.nan), np.full(len(masks), np.inf)
+    for i, mask in enumerate(masks):
+        power = np.abs(image[mask].astype(np.complex128)) ** 2
+        if not power.sum() > 0:
+            continue
+        weight = power / power.sum()
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
+            by_height = (np.real(moved_slope[mask] / moved[mask]) - np.real(mirror_slope[mask] / footprint[mask])) / (
+                _STEP_M
+            )
+        per_metre = float(np.nansum(weight * by_height))
+        own = np.where(np.isfinite(own), own, 0.0)
+        mean = float(np.sum(weight * own))
+        spread = float(np.sqrt(np.sum(weight * (own - mean) ** 2)))
+        height, std = mean / per_metre, spread / abs(per_metre)
+        if std < 0.05 and np.isfinite(height):
+            heights[i], stds[i] = height, max(std, _LEAST_STD_M)
+    return heights, stds
+
+
+def _heights_by_phase(
+    board: BoardSamples,
+    masks: Sequence[NDArray[np.bool_]],
+    places: NDArray[np.float64],
+    plane: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], float]:
+    """Height of each patch by the phase of its echo, whole turns as a plane near `plane` asks; and radians a metre."""
+    image, footprint, _ = board.image()
+    moved = board.mirror_image(_STEP_M)
+    phases = np.full(len(masks), np.nan)
+    rates = []
+    for i, mask in enumerate(masks):
+        flat = -image[mask].astype(np.complex128) * np.conj(footprint[mask])  # r_s is nearly real and negative
+        coherent = abs(flat.sum()) / max(float(np.abs(flat).sum()), 1e-300)
+        if mask.any() and coherent > _COHERENT:
+            phases[i] = np.angle(flat.sum())
+            rates.append(float(np.angle(np.vdot(footprint[mask], moved[mask]))) / _STEP_M)
+    if not rates:
+        return phases, 1.0
+    rate = float(np.median(rates))
+    turn = 2 * np.pi / abs(rate)
+    known = np.flatnonzero(np.isfinite(phases))
+    best: tuple[float, NDArray[np.float64]] = (np.inf, np.full(len(masks), np.nan))
+    # The range leaves some turns of doubt, the same for all plates but for the tilt: try planes about it.
+    for tilt_x in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
+        for tilt_y in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
+            guess = _at(plane + [0, tilt_x, tilt_y], places[known])
+            heights = phases[known] / rate
+            common = np.angle(np.mean(np.exp(2j * np.pi * (heights - guess) / turn))) / (2 * np.pi) * turn
+            heights = heights + turn * np.round((guess + common - heights) / turn)
+            shift = turn * np.round((np.median(guess) - np.median(heights)) / turn)
+            fitted, _ = _fit(places[known], heights + shift, np.full(known.size, _PHASE_STD_M))
+            miss = float(np.sum((heights + shift - _at(fitted, places[known])) ** 2)) / _PHASE_STD_M**2
+            miss += float(np.sum((fitted[1:] / _TILT_PRIOR_RAD) ** 2))
+            if miss < best[0]:
+                out = np.full(len(masks), np.nan)
+                out[known] = heights + shift
+                best = (miss, out)
+    return best[1], rate
+
+
+def _fit(
+    places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Plane (height, rise along x, rise along y) through heights, and its covariance, with the tilt's prior.
+
+    The covariance grows with the scatter about the plane where that is larger than the heights' own deviations.
+    """
+    rows = np.column_stack([np.ones(len(places)), places]) / stds[:, None]
+    information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
+    plane = np.linalg.solve(information, rows.T @ (heights / stds))
+    covariance = np.linalg.inv(information)
+    off = (heights - _at(plane, places)) / stds
+    freedom = max(len(places) - 3, 1)
+    return plane, covariance * max(1.0, float(np.sum(off**2)) / freedom)
+
+
+def _at(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    return plane[0] + places @ plane[1:]

@@ -1,0 +1,357 @@
+"""Joint inversion of a scene: all patches' permittivities with what the rig leaves uncertain, and the error budget.
+
+Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measured as
+
+    V / H = (1 + rho) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
+
+with a, b the leakage of p into H and of s into V, rho the error of the metal reference, kappa the patch's brightness
+beside an ideal one (roughness, tilt, edges). r_s and r_p follow from t and the incidence angle by Eq. 2 and 3.
+Unknown are a, b, rho, the angle's error, and t of every patch; known are the measured ratios and brightnesses, each
+with its standard deviation, and a prior of everything that was not measured: zero mean, stated width. The solution is
+the maximum of the posterior (least squares, scipy), its covariance the inverse of the information matrix there.
+
+Where brightness and ratio of several patches agree on a leakage, the scene has measured it; where they do not tell, the
+prior stands. Each source of data or prior has a share in the variance of each permittivity; the shares add up to it:
+with J the Jacobian of all residuals and C the covariance, source s contributes C J_s' J_s C.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from scipy import optimize
+
+from polysight.host.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+BRIGHTNESS_STD = 0.05
+"""Prior of ln kappa: plates rough by 0.2 mm lose 7 %, edges and tilts change |H| by some per cent."""
+BRIGHTNESS_FREEDOM = 4.0
+"""How many patches' worth of evidence that prior is, when the patches' own scatter corrects it."""
+OUTLIER = 3.0
+"""Standard deviations of brightness beyond which a patch (a thin sheet, a shadow) loses its say (Cauchy)."""
+METAL_LIKE = 0.25
+"""|t - 1| below which no permittivity is given: it grows as 4 / |t - 1|^2, and its error with it."""
+LEAST_DISTANCE = 4.0
+"""|t - 1| in its standard deviations below which no permittivity is given."""
+SOURCES = ("noise", "metal reference", "leakage", "incidence", "brightness")
+_NUISANCES = 8  # a, b (2 each), rho (2), angle, brightness of the metal
+_BENT = 0.1  # standard deviation over radius of curvature of Eq. 3 beyond which its error is drawn, not propagated
+_DRAWS = 4000
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was measured of one patch, relative to metal; leakage is still in it.
+
+    Attributes
+    ----------
+    inverse_ratio
+        V / H.
+    std
+        Standard deviation of its real part and of its imaginary part: noise, speckle, edges.
+    brightness
+        |H|; None when it is not to be used (a box given by hand, a layered plate).
+    """
+
+    inverse_ratio: complex
+    std: float
+    brightness: float | None = None
+
+
+@dataclass(frozen=True)
+class Uncertain:
+    """What is known beforehand of the rig, as means and standard deviations.
+
+    Attributes
+    ----------
+    theta_rad, theta_std_rad
+        Incidence angle.
+    leakage
+        Of p in H and of s in V: as measured, or zero.
+    leakage_std
+        Standard deviation of each real and imaginary part.
+    leakage_measured
+        Whether that is a measurement, or the prior of the mount.
+    reference_std
+        Relative standard deviation of metal's V / H, each part.
+    brightness_std
+        Of ln |H| beside what Eq. 2 says, one patch beside another.
+    """
+
+    theta_rad: float
+    theta_std_rad: float
+    leakage: tuple[complex, complex] = (0j, 0j)
+    leakage_std: float = 0.041
+    leakage_measured: bool = False
+    reference_std: float = 0.01
+    brightness_std: float = BRIGHTNESS_STD
+
+
+@dataclass(frozen=True)
+class PatchEstimate:
+    """Permittivity of one patch.
+
+    Attributes
+    ----------
+    inverse_ratio
+        1 / P = r_p / r_s with everything estimated taken out.
+    inverse_ratio_covariance
+        float64 [2, 2] of its real and imaginary part.
+    permittivity
+        eps' - j eps''; None when the patch is metal-like.
+    covariance
+        float64 [2, 2] of its real and its imaginary part; None when metal-like.
+    shares
+        Source to its share of the covariance's trace; they add up to 1.
+    """
+
+    inverse_ratio: complex
+    inverse_ratio_covariance: Real
+    permittivity: complex | None
+    covariance: Real | None
+    shares: Mapping[str, float]
+
+    @property
+    def dominated_by(self) -> str | None:
+        """The source with the largest share of the error."""
+        return max(self.shares, key=lambda s: self.shares[s]) if self.shares else None
+
+
+@dataclass(frozen=True)
+class Inversion:
+    """The solution for a scene.
+
+    Attributes
+    ----------
+    patches
+        One estimate a patch, in the order given.
+    leakage
+        Estimate of p in H, s in V.
+    leakage_std
+        Standard deviation of each: root of the mean variance of its two parts.
+    prior_std
+        The same before this scene was seen.
+    theta_rad, theta_std_rad
+        The angle, likewise.
+    misfit
+        Brightness beside the model's, in standard deviations, one a patch; NaN where it was not used.
+    brightness_std
+        Standard deviation of ln |H| that the patches' scatter and the prior agree on.
+    cost
+        Sum of squared residuals at the solution, priors included.
+    """
+
+    patches: tuple[PatchEstimate, ...]
+    leakage: tuple[complex, complex]
+    leakage_std: tuple[float, float]
+    prior_std: float
+    theta_rad: float
+    theta_std_rad: float
+    misfit: Real
+    brightness_std: float
+    cost: float
+    nuisance_covariance: Real = field(repr=False)
+
+    @property
+    def leakage_determined(self) -> bool:
+        """Whether the scene narrowed the leakage of both receivers to less than half of what was known before."""
+        return max(self.leakage_std) < 0.5 * self.prior_std
+
+
+def true_ratio(inverse: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j) -> Complex:
+    """t of a measured V / H: the first formula of the module's text, solved for t."""
+    c = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + rho))
+    return (c - b) / (1 - a * c)
+
+
+def measured_ratio(t: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j) -> Complex:
+    """V / H of a true t: the first formula of the module's text."""
+    t = np.asarray(t, np.complex128)
+    return (1 + rho) * (1 + a) / (1 + b) * (t + b) / (1 + a * t)
+
+
+def slope(t: npt.ArrayLike, theta_rad: float) -> Complex:
+    """d eps / d t of Eq. 3 by t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
+    t = np.asarray(t, np.complex128)
+    return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
+
+
+class _Model:
+    """Residuals of the fit. Parameters are deviations from the prior's mean in its standard deviations.
+
+    Those of a patch are t as deviations from the measured ratio in units of its standard deviation.
+    """
+
+    def __init__(self, seen: Sequence[Seen], prior: Uncertain, brightness_std: float) -> None:
+        self.prior, self.n, self.brightness_std = prior, len(seen), brightness_std
+        self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
+        self.std = np.array([s.std for s in seen])
+        level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
+        # Metal-like patches have |H| = 1 whatever the leakage: they tell nothing of it.
+        self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_LIKE)
+        self.log_level = np.log(np.where(self.bright, level, 1.0))
+        self.start = true_ratio(self.q, *prior.leakage)
+
+    def nuisances(self, x: Real) -> tuple[complex, complex, complex, float]:
+        """a, b, rho and the angle."""
+        p = self.prior
+        a = p.leakage[0] + p.leakage_std * complex(x[0], x[1])
+        b = p.leakage[1] + p.leakage_std * complex(x[2], x[3])
+        return a, b, p.reference_std * complex(x[4], x[5]), p.theta_rad + p.theta_std_rad * float(x[6])
+
+    def ratios(self, x: Real) -> Complex:
+        """t of every patch."""
+        own = x[_NUISANCES:].reshape(2, -1)
+        return self.start + self.std * (own[0] + 1j * own[1])
+
+    def misfit(self, x: Real) -> Real:
+        """Brightness beside the model's in standard deviations, [patch]; 0 where it is not used."""
+        a, _, _, theta = self.nuisances(x)
+        t = self.ratios(x)
+        r_s = fresnel(permittivity_from_ratio(t, theta), theta)[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            model = np.log(np.abs(r_s * (1 + a * t) / (1 + a)))
+            off = (self.log_level - model) / self.brightness_std - x[7]
+        return np.where(self.bright & np.isfinite(off), np.clip(off, -1e3, 1e3), 0.0)
+
+    def residuals(self, x: Real) -> Real:
+        """Priors of the nuisances, then ratios, then brightness."""
+        a, b, rho, _ = self.nuisances(x)
+        off = (measured_ratio(self.ratios(x), a, b, rho) - self.q) / self.std
+        misfit = self.misfit(x)
+        robust = np.sign(misfit) * OUTLIER * np.sqrt(np.log1p((misfit / OUTLIER) ** 2))
+        return np.concatenate([x[:_NUISANCES], off.real, off.imag, robust])
+
+    def source_rows(self) -> dict[str, npt.NDArray[np.intp]]:
+        """Which residuals belong to which source."""
+        ratios = np.arange(_NUISANCES, _NUISANCES + 2 * self.n)
+        bright = np.concatenate([[7], np.arange(_NUISANCES + 2 * self.n, _NUISANCES + 3 * self.n)])
+        rows = {"noise": ratios, "metal reference": np.array([4, 5]), "leakage": np.arange(4)}
+        return rows | {"incidence": np.array([6]), "brightness": bright.astype(np.intp)}
+
+
+def invert(seen: Sequence[Seen], prior: Uncertain) -> Inversion:
+    """Solve for all patches of a scene together.
+
+    The standard deviation of brightness is found in two turns: the patches' own scatter about the first solution
+    corrects its prior (the mean of a scaled inverse chi-square; Gelman et al., Bayesian Data Analysis, section 2.6).
+
+    Parameters
+    ----------
+    seen
+        The patches without the metal reference.
+    prior
+        What is known of the rig.
+
+    Returns
+    -------
+    Inversion
+    """
+    level, found, model = prior.brightness_std, None, _Model(seen, prior, prior.brightness_std)
+    for _ in range(2):
+        model = _Model(seen, prior, level)
+        start = np.zeros(_NUISANCES + 2 * model.n) if found is None else found.x
+        found = optimize.least_squares(model.residuals, start, method="lm", xtol=1e-10, ftol=1e-10)
+        off = np.minimum(np.abs(model.misfit(found.x)[model.bright]), OUTLIER) * level
+        freedom = BRIGHTNESS_FREEDOM + max(off.size - 4, 0)  # four numbers of leakage are fitted to them
+        level = float(np.sqrt((BRIGHTNESS_FREEDOM * prior.brightness_std**2 + np.sum(off**2)) / freedom))
+        level = min(level, 3 * prior.brightness_std)
+    assert_found = found if found is not None else optimize.OptimizeResult()
+    return _solution(model, assert_found)
+
+
+def _solution(model: _Model, found: optimize.OptimizeResult) -> Inversion:
+    x, jac, prior, n = found.x, found.jac, model.prior, model.n
+    covariance = np.linalg.inv(jac.T @ jac)
+    a, b, _, theta = model.nuisances(x)
+    spread = prior.leakage_std * np.sqrt(np.diag(covariance)[:4])
+    t = model.ratios(x)
+    patches = tuple(_estimate(model, x, jac, covariance, i, complex(t[i]), theta) for i in range(n))
+    return Inversion(
+        patches,
+        (a, b),
+        (float(np.hypot(*spread[:2]) / np.sqrt(2)), float(np.hypot(*spread[2:]) / np.sqrt(2))),
+        prior.leakage_std,
+        theta,
+        float(prior.theta_std_rad * np.sqrt(covariance[6, 6])),
+        np.where(model.bright, model.misfit(x), np.nan),
+        model.brightness_std,
+        float(2 * found.cost),
+        covariance[:_NUISANCES, :_NUISANCES],
+    )
+
+
+def _estimate(
+    model: _Model, x: Real, jac: Real, covariance: Real, i: int, t: complex, theta: float
+) -> PatchEstimate:
+    """One patch: its ratio and permittivity with covariance, and where that comes from."""
+    at = [_NUISANCES + i, _NUISANCES + model.n + i]
+    unit = model.std[i]
+    of_ratio = unit**2 * covariance[np.ix_(at, at)]
+    distance = min(abs(t - 1), abs(1 / t - 1) if t else np.inf)
+    if not distance >= max(METAL_LIKE, LEAST_DISTANCE * np.sqrt(np.trace(of_ratio) / 2)):
+        return PatchEstimate(t, of_ratio, None, None, {})
+    value = complex(permittivity_from_ratio(t, theta))
+    by_t = complex(slope(t, theta)) * unit
+    step = 1e-5
+    by_theta = complex(
+        permittivity_from_ratio(t, theta + step) - permittivity_from_ratio(t, theta - step)
+    ) / (2 * step) * model.prior.theta_std_rad
+    # The permittivity's real and imaginary part by all parameters, [2, parameter].
+    gradient = np.zeros((2, x.size))
+    gradient[:, at[0]], gradient[:, at[1]] = (by_t.real, by_t.imag), (-by_t.imag, by_t.real)
+    gradient[:, 6] = by_theta.real, by_theta.imag
+    linear = gradient @ covariance @ gradient.T
+    total = float(np.trace(linear))
+    shares = {}
+    for source, rows in model.source_rows().items():
+        part = jac[rows] @ covariance @ gradient.T
+        shares[source] = float(np.sum(part**2)) / total
+    bend = 3 * np.sqrt(np.trace(of_ratio) / 2) / abs(1 - t)
+    if bend > _BENT:
+        linear = _drawn(t, theta, covariance[np.ix_([*at, 6], [*at, 6])], unit, model.prior.theta_std_rad)
+    return PatchEstimate(t, of_ratio, value, linear, shares)
+
+
+def _drawn(t: complex, theta: float, covariance: Real, unit: float, theta_std: float) -> Real:
+    """Covariance of the permittivity by drawing ratio and angle, where Eq. 3 bends within the error bar.
+
+    Draws beyond three standard deviations are left out, on both sides of them all: near metal the far tail has none.
+    """
+    rng = np.random.default_rng(0)
+    drawn = rng.multivariate_normal(np.zeros(3), covariance, _DRAWS, method="cholesky")
+    keep = np.sum(np.linalg.solve(covariance, drawn.T).T * drawn, axis=1) < 14.2  # 99.7 % of three dimensions
+    drawn = drawn[keep]
+    value = permittivity_from_ratio(t + unit * (drawn[:, 0] + 1j * drawn[:, 1]), theta + theta_std * drawn[:, 2])
+    away = value - complex(permittivity_from_ratio(t, theta))
+    parts = np.stack([away.real, away.imag])
+    return (parts @ parts.T / parts.shape[1]).astype(np.float64)
+
+
+def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real:
+    """Standard deviation of 1 / P that leakage and reference leave at any t, as root of the mean of both parts.
+
+    d t = -(1 - t) (b + a t) - t rho to first order.
+    """
+    t = np.asarray(t, np.complex128)
+    c = estimate.nuisance_covariance
+    by = np.stack([-(1 - t) * t, -(1 - t), -t])
+    scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
+    total = np.zeros(t.shape)
+    for i in range(3):
+        for j in range(3):
+            block = c[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] * scale[i] * scale[j]
+            both = by[i] * np.conj(by[j])
+            total += both.real * (block[0, 0] + block[1, 1]) + both.imag * (block[0, 1] - block[1, 0])
+    return np.sqrt(np.maximum(total, 0.0) / 2)
+
+
+def expected_ratio(permittivity: npt.ArrayLike, theta_rad: float) -> Complex:
+    """1 / P of a half space."""
+    return 1 / ratio_from_permittivity(permittivity, theta_rad)

@@ -124,7 +124,7 @@ def parse(raw: bytes) -> Manifest:
         else:
             link = _take_link(fact)
             if link is not None:
-                found.faults += _compare(link, found, due, number)
+                _compare(link, found, due, number)
                 found.count = link[0]
             found.count = due = found.count + 1
             found.facts.append(fact)
@@ -141,18 +141,22 @@ def _take_link(fact: Fact) -> tuple[int, str] | None:
     return fact.pop("count"), fact.pop("previous")
 
 
-def _compare(link: tuple[int, str], found: Manifest, due: int, number: int) -> list[ManifestFault]:
-    """Compare a line's link with what was read before it; a damaged line before it may count for several."""
+def _compare(link: tuple[int, str], found: Manifest, due: int, number: int) -> None:
+    """Compare a line's link with what was read before it, and add what is wrong to the faults."""
     count, previous = link
-    missing = count - found.count
-    if missing > 0:
+    missing, damaged = count - found.count, due < found.count  # damaged: the line before is
+    if missing > 0 and damaged:  # a damaged line end makes one line of two
+        last = found.faults.pop()
+        found.faults.append(ManifestFault(last.line, last.what, last.lost + missing))
+    elif missing > 0:
         what = f"{missing} lines before it are missing" if missing > 1 else "a line before it is missing"
-        return [ManifestFault(number, f"{what} (count {count}, {found.count} was due)", missing)]
-    if count < due:
-        return [ManifestFault(number, f"repeated or out of order (count {count}, {due} was due)")]
-    if due == found.count and previous != found.digest:
-        return [ManifestFault(number, "the line before is not the one that it was written after: replaced", 1)]
-    return []
+        found.faults.append(ManifestFault(number, f"{what} (count {count}, {found.count} was due)", missing))
+    elif count < due:
+        what = f"repeated or out of order (count {count}, {due} was due)"
+        found.faults.append(ManifestFault(number, what))
+    elif not damaged and previous != found.digest:
+        what = "the line before is not the one that it was written after: replaced"
+        found.faults.append(ManifestFault(number, what, 1))
 
 
 def read(path: Path) -> Manifest:

@@ -259,15 +259,16 @@ class ScanFolder:
     def manifest_faults(self) -> tuple[ManifestFault, ...]:
         """Lines of the manifest that are damaged or missing, and an end that counts more rows than there are."""
         content = self.content
-        ends = [k for k, fact in enumerate(content.facts) if fact["fact"] == "scan_ended"]
-        told = content.facts[ends[-1]].get("rows_committed") if ends else None
-        if not isinstance(told, int) or told <= len(self._committed()):
+        end = next((k for k in reversed(range(len(content.facts))) if content.facts[k]["fact"] == "scan_ended"), None)
+        told = None if end is None else content.facts[end].get("rows_committed")
+        if end is None or not isinstance(told, int) or told <= len(self._committed()):
             return tuple(content.faults)
-        known = {*self._count_rows(content.facts[: ends[-1]]), *self._committed()}  # later withdrawn, or taken again
-        if told <= len(known):
+        known = {*self._count_rows(content.facts[:end]), *self._committed()}  # later withdrawn, or taken again
+        lost = told - len(known)
+        if lost <= sum(fault.lost for fault in content.faults):
             return tuple(content.faults)
         what = f"scan_ended counts {told} rows, the lines before it commit {len(known)}"
-        return (*content.faults, ManifestFault(content.numbers[ends[-1]], what, told - len(known)))
+        return (*content.faults, ManifestFault(content.numbers[end], what, lost))
 
     @property
     def rows_absent(self) -> list[int]:

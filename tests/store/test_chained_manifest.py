@@ -157,7 +157,7 @@ def test_a_row_s_line_that_is_gone_is_an_error_that_names_line_and_row(scan):
     assert "row 2 " in errors(scan)
     found = ScanFolder.load(scan)
     assert list(found.rows()) == [0, 1, 3]
-    assert {f.line for f in found.manifest_faults} == {4, 5}
+    assert {f.line for f in found.manifest_faults} == {4}
 
 
 def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
@@ -190,4 +190,4 @@ def test_simulated_scans_are_chained_and_counted(tmp_path):
     folder = simulate(published_rig(), decode_scene(scene_of(COPPER, PET, columns=2, rows=3), "t"), tmp_path / "scan")
     assert ScanFolder.load(folder).manifest_faults == ()
     without(folder, 3)
-    assert {f.line for f in ScanFolder.load(folder).manifest_faults} == {3, 4}
+    assert {f.line for f in ScanFolder.load(folder).manifest_faults} == {3}

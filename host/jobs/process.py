@@ -29,7 +29,7 @@ from polysight.host.materials import (
 )
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
-from polysight.host.process import Options, ProcessRequest, Products, save_images
+from polysight.host.process import Options, ProcessRequest, Products, coverage_lines, save_images
 from polysight.host.products import IMAGE, check_products_folder, making_products, write_json
 from polysight.host.report import focus_figure
 from polysight.host.store import Source, open_source, raw_source, versions
@@ -193,7 +193,8 @@ def image(data: Path, out: Path, config: Path | None) -> int:
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
-    sys.stdout.write(f"image: {out / IMAGE}\n")
+    told = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
+    sys.stdout.write("".join(f"{line}\n" for line in told))
     return 0
 
 

@@ -18,7 +18,7 @@ from polysight.host.report.figures import (
 )
 from polysight.host.report.report import write_report
 from polysight.host.report.sync_report import QUANTITIES, SyncReport, write_sync_report
-from polysight.host.report.tables import INK, MUTED, STAMP
+from polysight.host.report.tables import INK, MUTED, STAMP, manifest_sentence, recorded_sentence
 
 __all__ = [
     "INK",
@@ -37,7 +37,9 @@ __all__ = [
     "extent_mm",
     "figures",
     "focus_figure",
+    "manifest_sentence",
     "png",
+    "recorded_sentence",
     "write_report",
     "write_sync_report",
 ]

@@ -79,7 +79,15 @@ from polysight.host.materials.train import (
     score,
     strangers,
 )
-from polysight.host.materials.truth import Plates, TruthPlate, read_truth, truth_labels, truth_plates
+from polysight.host.materials.truth import (
+    TRUTH,
+    Plates,
+    TruthPlate,
+    read_truth,
+    truth_beside,
+    truth_labels,
+    truth_plates,
+)
 
 __all__ = [
     "AMPLITUDE_ERROR",
@@ -93,6 +101,7 @@ __all__ = [
     "SAME_ANGLE_DEG",
     "SHORT",
     "SIMULATED_LIBRARY",
+    "TRUTH",
     "UNKNOWN",
     "UNKNOWN_SCENE",
     "Box",
@@ -166,6 +175,7 @@ __all__ = [
     "segment",
     "strangers",
     "told_angle",
+    "truth_beside",
     "truth_labels",
     "truth_plates",
     "with_bands",

@@ -53,7 +53,7 @@ from polysight.host.materials.patch_files import (
     read_patches,
     write_labels,
 )
-from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
+from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, format_permittivity, median_ratio
 from polysight.host.materials.published import (
     METALS,
     LabelledScan,
@@ -149,6 +149,7 @@ __all__ = [
     "fit_layer",
     "fit_library",
     "fit_weights",
+    "format_permittivity",
     "image_centre_mm",
     "is_metal",
     "label_folders",

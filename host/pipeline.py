@@ -26,7 +26,7 @@ class Pipeline:
         self.synchroniser = sync.RowSynchroniser(source, rig, self.calibration.high_passes(rig))
         self.images = imaging.ImageBuilder(rig, live=live, depth_m=depth_m)
         self.sub_bands = imaging.SubBandImages(rig, bands)
-        self.quality = process.Quality(rig)
+        self.quality = process.Quality(rig, source)
 
     def add_row(self, row: int) -> dict[str, sync.SyncedRow]:
         """Read, synchronise and reduce one row of every board for the images; returns the synchronised rows."""

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from polysight.host.products import ProcessedScan
-from polysight.host.report import ReportContext, draw_overview
+from polysight.host.report import ReportContext, draw_overview, figure_label, font_families
 
 _PANEL_IN = 3.8  # width of one picture
 
@@ -45,5 +45,6 @@ def plot_scan(done: ProcessedScan) -> Figure:
     )
     draw_overview(fig, list(fig.subplots(rows, columns).flat), context, bar_labels=True)
     stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[done.simulated]
-    fig.suptitle(f"Scan {done.scan_id}{stamp}", fontsize=12)
+    title = figure_label(f"Scan {done.scan_id}{stamp}", "title")
+    fig.suptitle(title, fontsize=12, family=list(font_families()), parse_math=False)
     return fig

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.materials import KnownScene, MetalChoice, pixel_accuracy, read_truth
+from polysight.host.materials import KnownScene, MetalChoice, pixel_accuracy, truth_beside
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
@@ -74,10 +75,12 @@ class Processing:
         pipeline, options = self.pipeline, self.options
         classifier, unnamed = options.classifier(pipeline.rig), options.unnamed(pipeline.rig)
         plane = pipeline.metal_plane(options)
-        images, truth = self._images, self.folder / "truth.json"
+        images = self._images
         if plane is not None:
             images = replace(images, valid=images.valid & plane.valid_on(images.x_m, images.y_m))
-        plates = read_truth(truth) if truth.exists() else ()
+        plates, note = truth_beside(self.folder)
+        if note:
+            warnings.warn(note, stacklevel=2)
         try:
             metal, known = MetalChoice(options.metal_box_mm, None, plane), KnownScene(plates=plates)
             found = pipeline.find_materials(images, metal, known, classifier, options.incidence)

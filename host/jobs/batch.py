@@ -311,11 +311,13 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
 
 
 def _found(products: Path) -> tuple[str, str]:
-    """Share of positions that are masked, and number of patches, as the products say."""
+    """Share of positions that are masked or were never recorded, and number of patches, as the products say."""
     saved = SavedProducts(products)
     try:
         boards = saved.quality["boards"].values()
-        share = sum(b["positions_masked"] for b in boards) / max(1, sum(b["positions"] for b in boards))
+        absent = saved.quality.get("coverage", {}).get("positions_absent", 0)  # of each board
+        lost = sum(b["positions_masked"] + absent for b in boards)
+        share = lost / max(1, sum(b["positions"] + absent for b in boards))
         return f"{100 * share:.2g} %", str(len(saved.materials["segments"]))
     except (PolysightError, AttributeError, KeyError, TypeError):
         return "", ""

@@ -29,8 +29,8 @@ from polysight.host.acquisition import (
 )
 from polysight.host.calibration import Calibration, of_rig, of_scan
 from polysight.host.imaging import image_grid
-from polysight.host.jobs.process import TRUTH, check_options, load_options, make_products, truth_of
-from polysight.host.materials import read_truth
+from polysight.host.jobs.process import check_options, load_options, make_products, truth_of
+from polysight.host.materials import TRUTH, read_truth
 from polysight.host.pipeline import Pipeline
 from polysight.host.process import Options, ProcessRequest
 from polysight.host.products import check_products_folder
@@ -232,7 +232,6 @@ def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config
     if process:
         _check_options(options, source.instrument, of_scan(source))
         check_products_folder(folder / PRODUCTS, source.scan_id)
-        truth_of(folder)
 
     def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:
         return resume_scan(

@@ -31,6 +31,7 @@ from polysight.host.materials import (
     bands_of_row,
     fit_concentration,
     fit_layer,
+    format_permittivity,
     match_patches,
     read_materials,
 )
@@ -143,13 +144,14 @@ def _line(row: Mapping[str, Any]) -> str:
     single = row["single_interface"]
     if single is None:
         return f"{head} metal-like: no permittivity\n"
-    text = f"{head} one interface {single['real']:6.2f} - j{-single['imag']:5.2f}"
+    text = f"{head} one interface {format_permittivity(complex(single['real'], single['imag']), width=6):15s}"
     if single.get("real_std") is not None:
         text += f"  +- {single['real_std']:.2f}"
     layer = row.get("layer")
     if layer is not None:
         real, loss = layer["permittivity"]
-        text += f"   in the stack {real:6.2f} - j{loss:5.2f}  +- {layer['std_real']:.2f}, {layer['std_loss']:.2f}"
+        text += f"   in the stack {format_permittivity(complex(real, -loss), width=6):15s}"
+        text += f"  +- {layer['std_real']:.2f}, {layer['std_loss']:.2f}"
         text += "".join(f"\n     note: {w}" for w in layer["warnings"])
     return text + "\n"
 
@@ -213,10 +215,12 @@ def _patch_line(row: dict[str, Any]) -> str:
     name = row["name"] or "not named"
     sure = f"{100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
     e = row.get("permittivity")
-    told = ("metal-like" if row.get("metal_like") else "-") if e is None else f"{e['real']:6.2f} - j{-e['imag']:5.2f}"
+    told = "metal-like" if row.get("metal_like") else "-"
+    if e is not None:
+        told = f"{format_permittivity(complex(e['real'], e['imag']), width=6):15s}"
     if e is not None and e.get("real_std") is not None:
         told += f"  +- {e['real_std']:.2f}"
-    return f"{row['label']:>3}  {name:24s} {sure:>5s}  {told}\n"
+    return f"{row['label']:>3}  {name:24s} {sure:>5s}  {told}".rstrip() + "\n"
 
 
 def report(folder: Path) -> int:

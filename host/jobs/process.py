@@ -18,6 +18,7 @@ from polysight.host.calibration import of_scan
 from polysight.host.imaging import ChannelImages, focus_sweep
 from polysight.host.jobs.demo import check_scenes, run_simulator
 from polysight.host.materials import (
+    TRUTH,
     KnownScene,
     MetalChoice,
     TrainingScan,
@@ -26,17 +27,17 @@ from polysight.host.materials import (
     patches_from_plates,
     read_labels,
     read_truth,
+    truth_beside,
 )
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
-from polysight.host.process import Options, ProcessRequest, Products, save_images
+from polysight.host.process import Options, ProcessRequest, Products, coverage_lines, save_images
 from polysight.host.products import IMAGE, check_products_folder, making_products, write_json
 from polysight.host.report import focus_figure
 from polysight.host.store import Source, open_source, raw_source, versions
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, ScanError, advice
 
-TRUTH = "truth.json"
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
@@ -70,9 +71,11 @@ def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, C
 
 
 def truth_of(data: Path) -> tuple[TruthPlate, ...]:
-    """Plates of the truth.json beside the data; none when there is no such file."""
-    path = data / TRUTH
-    return read_truth(path) if path.exists() else ()
+    """Plates of the truth.json beside the data; none, and a note on stderr, when it is not a truth file."""
+    plates, note = truth_beside(data)
+    if note:
+        sys.stderr.write(f"note: {note}\n")
+    return plates
 
 
 def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None:
@@ -193,7 +196,8 @@ def image(data: Path, out: Path, config: Path | None) -> int:
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
-    sys.stdout.write(f"image: {out / IMAGE}\n")
+    told = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
+    sys.stdout.write("".join(f"{line}\n" for line in told))
     return 0
 
 
@@ -251,7 +255,8 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
 
 def _training_scan(data: Path, config: Path) -> TrainingScan:
     source = open_source(data, config)
-    pipeline, plates = _all_rows(source, data), truth_of(data)
+    plates = read_truth(data / TRUTH) if (data / TRUTH).exists() else ()
+    pipeline = _all_rows(source, data)
     if not plates:
         raise DataError(f"{data}: no {TRUTH}", "its plates are not known", "give scans made by polysight simulate")
     metal = next((t for t in plates if t.metal), None)

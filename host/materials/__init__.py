@@ -53,7 +53,7 @@ from polysight.host.materials.patch_files import (
     read_patches,
     write_labels,
 )
-from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, median_ratio
+from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, format_permittivity, median_ratio
 from polysight.host.materials.published import (
     METALS,
     LabelledScan,
@@ -79,7 +79,15 @@ from polysight.host.materials.train import (
     score,
     strangers,
 )
-from polysight.host.materials.truth import Plates, TruthPlate, read_truth, truth_labels, truth_plates
+from polysight.host.materials.truth import (
+    TRUTH,
+    Plates,
+    TruthPlate,
+    read_truth,
+    truth_beside,
+    truth_labels,
+    truth_plates,
+)
 
 __all__ = [
     "AMPLITUDE_ERROR",
@@ -93,6 +101,7 @@ __all__ = [
     "SAME_ANGLE_DEG",
     "SHORT",
     "SIMULATED_LIBRARY",
+    "TRUTH",
     "UNKNOWN",
     "UNKNOWN_SCENE",
     "Box",
@@ -140,6 +149,7 @@ __all__ = [
     "fit_layer",
     "fit_library",
     "fit_weights",
+    "format_permittivity",
     "image_centre_mm",
     "is_metal",
     "label_folders",
@@ -166,6 +176,7 @@ __all__ = [
     "segment",
     "strangers",
     "told_angle",
+    "truth_beside",
     "truth_labels",
     "truth_plates",
     "with_bands",

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import ndimage, optimize, signal, stats
 
+from polysight.host.materials.permittivity import format_permittivity
 from polysight.host.polarimetry import multilayer
 from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError, PolysightError
@@ -166,8 +167,9 @@ class LayerFit:
         out = []
         for r in self.rivals:
             size = "" if r.thickness_m == self.thickness_m else f" at {r.thickness_m or 0:.3g} m"
-            e = r.permittivity
-            out.append(f"{e.real:.3g} - j{-e.imag:.3g}{size} explains the data as well (chi-square {r.chi2:.1f})")
+            out.append(
+                f"{format_permittivity(r.permittivity)}{size} explains the data as well (chi-square {r.chi2:.1f})"
+            )
         if self.freedom > 0 and stats.chi2.sf(self.chi2, self.freedom) < UNLIKELY:
             out.append(f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees")
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):

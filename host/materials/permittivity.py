@@ -57,6 +57,22 @@ class Permittivity:
         return self.value is not None
 
 
+def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
+    """Write `2.89 - j0.43` for a lossy medium and `2.89 + j27.30` for one with gain.
+
+    Parameters
+    ----------
+    value
+        eps' - j eps''.
+    digits
+        Digits behind the point.
+    width
+        Least width of the real part, so that columns line up.
+    """
+    real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))  # + 0.0: no -0.00
+    return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
+
+
 def median_ratio(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> complex:
     """Robust mean of P = H / V over pixels, taken as the reciprocal of the median of V / H.
 

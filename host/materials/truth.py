@@ -14,6 +14,8 @@ import numpy.typing as npt
 from polysight.host.materials.segment import Box, Patch, box_mask
 from polysight.shared.errors import DataError
 
+TRUTH = "truth.json"
+
 
 @dataclass(frozen=True)
 class TruthPlate:
@@ -44,7 +46,7 @@ def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
     """
     try:
         return tuple(_plate(p) for p in truth["plates"])
-    except (KeyError, TypeError, ValueError, IndexError) as e:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as e:
         raise DataError(
             f"the truth has another form than expected: {type(e).__name__}: {e}",
             "expected plates = [{name, centre_mm, size_mm, permittivity or metal}]",
@@ -56,10 +58,30 @@ Plates = tuple[TruthPlate, ...]
 
 def read_truth(path: Path) -> tuple[TruthPlate, ...]:
     """Plates of a truth.json. Raises DataError."""
+    remedy = f"give the one that polysight simulate wrote beside its data, or move {path.name} away"
     try:
         return truth_plates(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as e:
-        raise DataError(f"{path}: cannot be read as truth: {e}", "written by polysight simulate beside its data") from e
+    except DataError as e:
+        raise DataError(f"{path}: {e.what}", e.why, remedy) from None
+    except (OSError, ValueError, RecursionError) as e:
+        raise DataError(f"{path}: cannot be read as truth: {e}", "another program's file, or damaged", remedy) from None
+
+
+def truth_beside(folder: Path) -> tuple[Plates, str]:
+    """Plates of a scan folder's truth.json, for results that do without.
+
+    Returns
+    -------
+    plates, note
+        No plates when there is no such file; no plates and why, in one line, when it is not a truth file.
+    """
+    path = folder / TRUTH
+    if not path.exists():
+        return (), ""
+    try:
+        return read_truth(path), ""
+    except DataError as e:
+        return (), f"{e.what}; {e.why}. The results do without the truth.".replace("\n", " ")
 
 
 def _plate(raw: Mapping[str, Any]) -> TruthPlate:
@@ -71,6 +93,8 @@ def _plate(raw: Mapping[str, Any]) -> TruthPlate:
         re, loss = raw["permittivity"]
         eps = complex(float(re), -float(loss))
     thickness = raw.get("thickness_mm")
+    if not np.isfinite([cx, cy, w, h, *([] if eps is None else [eps.real, eps.imag])]).all():
+        raise ValueError(f"a number of plate {raw['name']} is not finite")
     box = (cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2)
     return TruthPlate(str(raw["name"]), box, eps, None if thickness is None else float(thickness), metal)
 

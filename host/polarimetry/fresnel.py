@@ -18,12 +18,23 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 _AIR = np.asarray(1.0 + 0j)
+_NAN = complex(np.nan, np.nan)
 
 
 def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
     """Index times cosine in the medium, sqrt(eps - sin^2 theta_i): the root that decays when passive (Im <= 0)."""
     q: Complex = np.sqrt(eps - sine**2)
     return np.where((q.real == 0) & (q.imag > 0), -q, q)
+
+
+def _media(
+    eps: npt.ArrayLike, theta_rad: npt.ArrayLike
+) -> tuple[Complex, Real, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Permittivity and angle broadcast, finite everywhere, and where they stood for metal or were not a number."""
+    eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
+    unknown = np.isnan(eps) | ~np.isfinite(theta)  # of a complex number: either part
+    metal = np.isinf(eps) & ~unknown
+    return np.where(metal | unknown, 1.0, eps), np.where(unknown, 0.5, theta), metal, unknown
 
 
 def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Complex]:
@@ -39,17 +50,16 @@ def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Comp
     Returns
     -------
     r_s, r_p
-        complex128, broadcast shape: s (perpendicular to the plane of incidence) and p (parallel to it).
+        complex128, broadcast shape: s (perpendicular to the plane of incidence) and p (parallel to it). Not a number
+        where either part of `eps`, or the angle, is not.
     """
-    eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
-    metal = ~np.isfinite(eps)
-    eps = np.where(metal, 1.0, eps)
+    eps, theta, metal, unknown = _media(eps, theta_rad)
     c, s = np.cos(theta), np.sin(theta)
     q = _normal_wavenumber(eps, s)
     r_s = np.where(metal, -1.0, (c - q) / (c + q))
     # cos(theta_t) = q / n, so n_i cos(theta_t) -+ n_t cos(theta_i) is (q -+ eps c) / n: no square root of eps needed.
     r_p = np.where(metal, -1.0, (q - eps * c) / (q + eps * c))
-    return r_s[()], r_p[()]
+    return np.where(unknown, _NAN, r_s)[()], np.where(unknown, _NAN, r_p)[()]
 
 
 def ratio_from_permittivity(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
@@ -58,15 +68,15 @@ def ratio_from_permittivity(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Com
     Written as (q cos + sin^2) / (q cos - sin^2) with q = sqrt(eps - sin^2), which equals r_s / r_p and has no 0/0 at
     eps = 1. Infinite permittivity gives 1 (metal), the exact Brewster angle of a lossless medium gives infinity.
 
-    Parameters and shapes as :func:`fresnel`; returns complex128.
+    Parameters and shapes as :func:`fresnel`; returns complex128, not a number where a parameter is not.
     """
-    eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
-    metal = ~np.isfinite(eps)
+    eps, theta, metal, unknown = _media(eps, theta_rad)
     s = np.sin(theta)
-    a = _normal_wavenumber(np.where(metal, 1.0, eps), s) * np.cos(theta)
+    a = _normal_wavenumber(eps, s) * np.cos(theta)
     pole = a == s**2
     ratio = (a + s**2) / np.where(pole, 1.0, a - s**2)
-    return np.where(metal, 1.0, np.where(pole, complex(np.inf, 0.0), ratio))[()]
+    ratio = np.where(metal, 1.0, np.where(pole, complex(np.inf, 0.0), ratio))
+    return np.where(unknown, _NAN, ratio)[()]
 
 
 def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:

@@ -6,7 +6,14 @@ while rows are processed; `save_images` and `save_materials` write the products.
 
 from polysight.host.process.quality import Quality
 from polysight.host.process.request import DrawnBoxes, Options, ProcessRequest
-from polysight.host.process.save import Findings, Products, materials_content, save_images, save_materials
+from polysight.host.process.save import (
+    Findings,
+    Products,
+    coverage_lines,
+    materials_content,
+    save_images,
+    save_materials,
+)
 
 __all__ = [
     "DrawnBoxes",
@@ -15,6 +22,7 @@ __all__ = [
     "ProcessRequest",
     "Products",
     "Quality",
+    "coverage_lines",
     "materials_content",
     "save_images",
     "save_materials",

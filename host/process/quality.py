@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polysight.host.materials import MaterialsResult, permittivity_change
 from polysight.host.polarimetry import IncidenceChoice, PlaneReference
-from polysight.host.store import CubeRow, RowData
+from polysight.host.store import CubeRow, RowData, Source
 from polysight.host.sync import SyncedRow, echo_of_row, estimate_backlash, object_filter
 from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import plan_raster
@@ -86,12 +86,29 @@ def masked_runs(masked: NDArray[np.bool_]) -> list[list[int]]:
 
 
 class Quality:
-    """Collects the figures of a scan while it is processed."""
+    """Collects the figures of a scan while it is processed; `rig` is the calibrated one of the source."""
 
-    def __init__(self, rig: Instrument) -> None:
+    def __init__(self, rig: Instrument, source: Source) -> None:
+        self.source = source
         self.boards = {board.name: BoardQuality(rig, board) for board in rig.receivers}
         self.seconds: dict[str, float] = {}
         self.notes: dict[str, Any] = {}
+
+    def coverage(self) -> dict[str, Any]:
+        """Rows, positions and frames compared with the plan; rows that were never recorded count as not received."""
+        plan, boards = self.source.plan, list(self.boards.values())
+        absent = [row for row in range(plan.rows) if any(row not in board.rows for board in boards)]
+        frames_at = 1 if self.source.synchronised else self.source.instrument.burst.pulses
+        return {
+            "rows_planned": plan.rows,
+            "rows_recorded": plan.rows - len(absent),
+            "rows_absent": absent,
+            "positions_planned": plan.positions,
+            "positions_absent": len(absent) * plan.columns,
+            "frames_planned": len(boards) * plan.positions * frames_at,
+            "frames_received": sum(row["frames_received"] for board in boards for row in board.rows.values()),
+            "manifest": [str(fault) for fault in self.source.manifest_faults],
+        }
 
     def note(self, **entries: Any) -> None:
         """Keep entries for quality.json."""
@@ -122,6 +139,7 @@ class Quality:
         """Content of quality.json; `more` are further entries."""
         return {
             "boards": {name: board.summary() for name, board in self.boards.items()},
+            "coverage": self.coverage(),
             "seconds_per_stage": {stage: round(s, 4) for stage, s in self.seconds.items()},
             **more,
             **self.notes,

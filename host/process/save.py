@@ -33,7 +33,14 @@ from polysight.host.products import (
     write_json,
     write_scan_facts,
 )
-from polysight.host.report import ReportContext, classifier_sentence, context_of, write_report
+from polysight.host.report import (
+    ReportContext,
+    classifier_sentence,
+    context_of,
+    manifest_sentence,
+    recorded_sentence,
+    write_report,
+)
 from polysight.host.store import Scan, versions
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
@@ -108,7 +115,14 @@ def save_materials(
     content = materials_content(scan, found, findings.classifier, unnamed)
     write_json(out / MATERIALS, content)
     write_report(out, _report_context(scan, rig, findings, numbers, (content["library"], unnamed)))
-    return Products(out, _lines(scan, found, content["segments"]) + ((unnamed,) if unnamed else ()))
+    lines = (*_lines(scan, found, content["segments"]), *coverage_lines(numbers["coverage"]))
+    return Products(out, (*lines, unnamed) if unnamed else lines)
+
+
+def coverage_lines(coverage: dict[str, Any]) -> tuple[str, ...]:
+    """For the terminal: what was recorded of the plan, and what is wrong with the manifest."""
+    damaged = manifest_sentence(coverage)
+    return (recorded_sentence(coverage), damaged) if damaged else (recorded_sentence(coverage),)
 
 
 def materials_content(
@@ -146,7 +160,7 @@ def _report_context(
             "processed": datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC"),
             **versions(),
         },
-        notes=[NOT_ON_HARDWARE, *([unnamed] if unnamed else [])],
+        notes=[note for note in (manifest_sentence(quality["coverage"]), NOT_ON_HARDWARE, unnamed) if note],
     )
     return _with_scan(context, scan.plan, rig, images)
 

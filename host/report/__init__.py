@@ -16,9 +16,10 @@ from polysight.host.report.figures import (
     focus_figure,
     png,
 )
+from polysight.host.report.fonts import figure_label, font_families
 from polysight.host.report.report import write_report
 from polysight.host.report.sync_report import QUANTITIES, SyncReport, write_sync_report
-from polysight.host.report.tables import INK, MUTED, STAMP
+from polysight.host.report.tables import INK, MUTED, STAMP, manifest_sentence, recorded_sentence
 
 __all__ = [
     "INK",
@@ -35,9 +36,13 @@ __all__ = [
     "draw_overview",
     "export",
     "extent_mm",
+    "figure_label",
     "figures",
     "focus_figure",
+    "font_families",
+    "manifest_sentence",
     "png",
+    "recorded_sentence",
     "write_report",
     "write_sync_report",
 ]

@@ -22,6 +22,7 @@ from matplotlib.patches import Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 
 from polysight.host.report.context import ReportContext
+from polysight.host.report.fonts import figure_label, font_families
 from polysight.host.report.tables import INK, MUTED, STAMP, coverage_figure, masked_positions
 
 PALETTE = (
@@ -184,8 +185,19 @@ def _label(
     ink, halo = ("white", "#10141b") if on_dark else (INK, "white")
     ax.text(
         x, y, text, ha="center", va="bottom" if above else "center", fontsize=size, color=ink, linespacing=1.1,
-        path_effects=[withStroke(linewidth=2.4, foreground=halo)],
+        path_effects=[withStroke(linewidth=2.4, foreground=halo)], family=list(font_families()), parse_math=False,
     )  # fmt: skip
+
+
+def patch_label(row: dict[str, Any]) -> str:
+    """What figures write beside a patch."""
+    number = f"patch {row['label']}"
+    return figure_label(str(row.get("name") or number), number)
+
+
+def plate_label(plate: dict[str, Any], number: int) -> str:
+    """What the truth's figure writes beside a plate; `number` counts plates from 1."""
+    return figure_label(str(plate["name"]), f"plate {number}")
 
 
 def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> None:
@@ -204,7 +216,7 @@ def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> None:
         x0, _, x1, y1 = row["box_mm"]
         if row.get("outline_mm"):
             ax.add_patch(Polygon(row["outline_mm"], closed=True, fill=False, edgecolor=INK, linewidth=0.9))
-        text = str(row.get("name") or f"patch {row['label']}")
+        text = patch_label(row)
         if row.get("confidence") is not None:
             text += f"\n{100 * row['confidence']:.0f} %"
         _label(ax, (x0 + x1) / 2, y1 + 0.5, text, size, above=True)
@@ -235,14 +247,15 @@ def draw_truth(ax: Axes, ctx: ReportContext, size: float = 7.5) -> None:
     colours = colours_of(ctx)
     _crop(ax, ctx)
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    for plate in ctx.truth or []:
+    for number, plate in enumerate(ctx.truth or [], 1):
         x0, y0, x1, y1 = plate["box_mm"]
+        name = plate_label(plate, number)
         colour = colours[str(plate["name"])]
         ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=colour, edgecolor=INK, linewidth=0.9))
         if y1 < top:
-            _label(ax, (x0 + x1) / 2, y1 + 0.5, str(plate["name"]), size, above=True)
+            _label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
         else:  # larger than the image: a name above it would be far outside the picture
-            _label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, str(plate["name"]), size)
+            _label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
 
 
 def map_figure(ctx: ReportContext, draw: Callable[[Axes, ReportContext], None], title: str) -> bytes:
@@ -270,8 +283,7 @@ def permittivity_figure(ctx: ReportContext) -> bytes | None:
     ax.set_ylabel("loss ε″", fontsize=9, color=MUTED)
     for row in rows:
         e = row["permittivity"]
-        name = str(row.get("name") or f"patch {row['label']}")
-        colour = colours.get(name, UNKNOWN_COLOUR)
+        colour = colours.get(str(row.get("name")), UNKNOWN_COLOUR)
         re, loss = e["real"], -e["imag"]
         (r0, r1), (i0, i1) = e["real_p30_p70"], e["imag_p30_p70"]
         ax.errorbar(
@@ -283,8 +295,8 @@ def permittivity_figure(ctx: ReportContext) -> bytes | None:
             ax.plot([re, truth["real"]], [loss, -truth["imag"]], color=MUTED, linewidth=0.8, zorder=2)
             ax.plot(truth["real"], -truth["imag"], "x", color=INK, markersize=7, markeredgewidth=1.5, zorder=4)
         ax.annotate(
-            name, (re, loss), textcoords="offset points", xytext=(7, 6), fontsize=7.5, color=INK, zorder=5,
-            path_effects=[withStroke(linewidth=2, foreground="white")],
+            patch_label(row), (re, loss), textcoords="offset points", xytext=(7, 6), fontsize=7.5, color=INK, zorder=5,
+            path_effects=[withStroke(linewidth=2, foreground="white")], family=list(font_families()), parse_math=False,
         )  # fmt: skip
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, -0.1), high)

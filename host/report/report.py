@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from polysight.host.products import write_atomically
 from polysight.host.report.context import ReportContext
-from polysight.host.report.figures import FIGURES, UNKNOWN_COLOUR, colours_of, figures
+from polysight.host.report.figures import FIGURES, UNKNOWN_COLOUR, colours_of, figures, patch_label, plate_label
 from polysight.host.report.tables import coverage_sentence, key_numbers, masked_positions, quality_tables, text
 
 DASH = "–"
@@ -59,12 +59,20 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         keys=key_numbers(ctx, rows),
         centre=centre,
         rows=rows,
+        replaced=_replaced_names(ctx),
         missed=[str(t["name"]) for t in ctx.truth or [] if str(t["name"]) not in seen] if rows else [],
         quality=quality_tables(ctx.quality),
         coverage=coverage_sentence(masked_positions(ctx)),
         config=[(k, text(v)) for k, v in ctx.config.items()],
         provenance=[(k, text(v)) for k, v in ctx.provenance.items()],
     )
+
+
+def _replaced_names(ctx: ReportContext) -> list[str]:
+    """`patch 1: ?? is NAME` for each name that the figures' fonts do not have."""
+    pairs = [(patch_label(r), str(r["name"])) for r in ctx.materials if r.get("name")]
+    pairs += [(plate_label(t, k), str(t["name"])) for k, t in enumerate(ctx.truth or [], 1)]
+    return [f"{label} is {name}" for label, name in pairs if label != name]
 
 
 def _lead(ctx: ReportContext) -> str:

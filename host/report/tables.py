@@ -6,6 +6,7 @@ are masked.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,29 @@ def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
         return "Every position of every board has data."
     told = [f"{name} {int(m.sum())} of {m.size} ({m.mean():.2%})" for name, m in masks.items()]
     return f"Positions without data, left out of the images: {', '.join(told)}."
+
+
+def recorded_sentence(coverage: Mapping[str, Any]) -> str:
+    """Rows and frames of quality.json's `coverage` against the plan, for the terminal."""
+    planned, absent = coverage["positions_planned"], coverage["positions_absent"]
+    out = f"rows: {coverage['rows_recorded']} of {coverage['rows_planned']} recorded"
+    if absent:
+        out += f" ({100 * absent / planned:.1f} % of positions absent)"
+    received, frames = coverage["frames_received"], coverage["frames_planned"]
+    return f"{out}; frames: {_share(received, frames, 1)} of {frames} planned"
+
+
+def manifest_sentence(coverage: Mapping[str, Any]) -> str:
+    """What is wrong with the manifest; "" when nothing is."""
+    faults = coverage["manifest"]
+    return f"The manifest is damaged: {'; '.join(faults)}. `polysight validate` says what is lost." if faults else ""
+
+
+def _share(part: int, whole: int, digits: int) -> str:
+    """A share in percent; 100 % only when nothing is missing."""
+    if part >= whole:
+        return "100 %"
+    return f"{min(100 * part / whole, 100 - 10**-digits):.{digits}f} %"
 
 
 def coverage_figure(ctx: ReportContext, masks: dict[str, npt.NDArray[np.bool_]]) -> Figure:
@@ -164,21 +188,31 @@ def key_numbers(ctx: ReportContext, rows: list[dict[str, Any]]) -> list[dict[str
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")
-    boards = ctx.quality.get("boards")
-    if isinstance(boards, dict) and boards:
-        expected = sum(int(b.get("frames_expected", 0)) for b in boards.values())
-        received = sum(int(b.get("frames_received", 0)) for b in boards.values())
-        if expected:
-            share = 100 * received / expected
-            add(
-                "100 %" if received == expected else f"{min(share, 99.99):.2f} %",
-                f"of {text(expected)} frames received",
-            )
+    for value, what in _received(ctx.quality):
+        add(value, what)
     seconds = _stage_seconds(ctx.quality)
     if isinstance(seconds, dict) and seconds:
         total = sum(float(s) for s in seconds.values() if isinstance(s, int | float))
         add(f"{total:.1f} s" if total < 100 else f"{total / 60:.1f} min", "of processing, all stages")
     return out
+
+
+def _received(quality: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows and frames received: of the plan, or of the recorded rows for products of releases that do not tell it."""
+    coverage, boards = quality.get("coverage"), quality.get("boards")
+    if coverage:
+        rows, planned = coverage["rows_planned"], coverage["frames_planned"]
+        share = _share(coverage["frames_received"], planned, 2)
+        out = [(share, f"of {text(planned)} planned frames received")]
+        recorded = (f"{coverage['rows_recorded']} of {rows}", "rows recorded")
+        return [recorded, *out] if coverage["rows_absent"] else out
+    if not isinstance(boards, dict) or not boards:
+        return []
+    expected = sum(int(b.get("frames_expected", 0)) for b in boards.values())
+    received = sum(int(b.get("frames_received", 0)) for b in boards.values())
+    return (
+        [(_share(received, expected, 2), f"of {text(expected)} frames of recorded rows received")] if expected else []
+    )
 
 
 def quality_tables(quality: dict[str, Any]) -> list[Table]:
@@ -216,7 +250,7 @@ def _boards(boards: Any) -> Table | None:
     flat = {name: _numbers_of(board) for name, board in boards.items()}
     keys = dict.fromkeys(k for board in flat.values() for k in board)
     rows = [_cells(pretty(k), *(text(board.get(k)) for board in flat.values())) for k in keys]
-    caption = "Frames by board. What is missing is masked, never invented."
+    caption = "Frames by board, of the rows that were recorded. What is missing is masked, never invented."
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
 
 

@@ -7,7 +7,7 @@ hold data, `read_row` and facts about the recording; `raw_source` asks for one w
 from polysight.host.store import manifest
 from polysight.host.store.append_only import sync_folder
 from polysight.host.store.events import EventWriter, read_events
-from polysight.host.store.manifest import Fact, Manifest, ManifestWriter
+from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.raw import Digests, drop, droppable, require_raw
 from polysight.host.store.scan_folder import (
     EVENTS,
@@ -36,6 +36,7 @@ __all__ = [
     "EventWriter",
     "Fact",
     "Manifest",
+    "ManifestFault",
     "ManifestWriter",
     "RawSource",
     "RowData",

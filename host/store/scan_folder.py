@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import platform
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,7 +21,7 @@ import numpy as np
 from polysight.host.capture import read_index
 from polysight.host.store import manifest
 from polysight.host.store.append_only import crc32, sync_folder
-from polysight.host.store.manifest import Fact, Manifest, ManifestWriter
+from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.source import RowData
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
@@ -239,12 +239,12 @@ class ScanFolder:
     def _committed(self) -> dict[int, CommittedRow]:
         """The same, made once for the facts at hand: reading a scan asks for every row."""
         if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
-            self._rows = (self.content, len(self.content.facts), self._count_rows())
+            self._rows = (self.content, len(self.content.facts), self._count_rows(self.content.facts))
         return self._rows[2]
 
-    def _count_rows(self) -> dict[int, CommittedRow]:
+    def _count_rows(self, facts: Iterable[Fact]) -> dict[int, CommittedRow]:
         rows: dict[int, CommittedRow] = {}
-        for fact in self.content.facts:
+        for fact in facts:
             if fact["fact"] == "row_withdrawn":
                 rows.pop(fact["row"], None)
             if fact["fact"] != "row_committed":
@@ -254,6 +254,26 @@ class ScanFolder:
             )
             rows[row.row] = row
         return dict(sorted(rows.items()))
+
+    @property
+    def manifest_faults(self) -> tuple[ManifestFault, ...]:
+        """Lines of the manifest that are damaged or missing, and an end that counts more rows than there are."""
+        content = self.content
+        end = next((k for k in reversed(range(len(content.facts))) if content.facts[k]["fact"] == "scan_ended"), None)
+        told = None if end is None else content.facts[end].get("rows_committed")
+        if end is None or not isinstance(told, int) or told <= len(self._committed()):
+            return tuple(content.faults)
+        known = {*self._count_rows(content.facts[:end]), *self._committed()}  # later withdrawn, or taken again
+        lost = told - len(known)
+        if lost <= sum(fault.lost for fault in content.faults):
+            return tuple(content.faults)
+        what = f"scan_ended counts {told} rows, the lines before it commit {len(known)}"
+        return (*content.faults, ManifestFault(content.numbers[end], what, lost))
+
+    @property
+    def rows_absent(self) -> list[int]:
+        """Rows of the plan that are not committed."""
+        return [row for row in range(self.plan.rows) if row not in self._committed()]
 
     def recording_facts(self) -> dict[str, Any]:
         """For quality.json: `rows_retaken`, takes of all runs that did not count; `rows_incomplete`, rows kept so."""

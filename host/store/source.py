@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.store.manifest import ManifestFault
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan
@@ -107,6 +108,11 @@ class Source(Scan, Protocol):
     @property
     def synchronised(self) -> bool:
         """Whether another program has synchronised it already: the chirps are not in it."""
+        ...
+
+    @property
+    def manifest_faults(self) -> tuple[ManifestFault, ...]:
+        """Damaged and missing lines of the manifest; empty for a recording that keeps none."""
         ...
 
     def rows(self) -> Iterator[int]:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from polysight.host.capture import read_index
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
+from polysight.host.store.manifest import ManifestFault
 from polysight.host.store.raw import dropped_files
 from polysight.host.store.scan_folder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
 from polysight.shared.errors import DeviceError, PolysightError
@@ -19,6 +20,7 @@ from polysight.shared.raster import plan_raster
 
 _CHUNK = 1 << 22
 _COPY = "restore it from a copy, or resume takes its row again"
+_ALL_THERE = "every row is committed"
 _FETCHED = "resume fetches the rest from the Pi's journal"
 
 
@@ -48,8 +50,9 @@ def validate(path: Path) -> list[Finding]:
         scan = ScanFolder(path, content)
         rows = scan.committed()
     except PolysightError as e:
-        return [*found, *_damaged_lines(content, True), Finding("error", MANIFEST, e.what, e.remedy)]
-    found += _damaged_lines(content, not scan.complete)
+        lost = [_lost_lines(fault, "its facts are lost") for fault in content.faults]
+        return [*found, *lost, Finding("error", MANIFEST, e.what, e.remedy)]
+    found += [_lost_lines(fault, _what_is_lost(scan)) for fault in scan.manifest_faults]
     if scan.plan != plan_raster(scan.instrument.grid):
         found.append(Finding("error", MANIFEST, "the plan is not that of the rig file's grid"))
     for row in rows.values():
@@ -82,13 +85,18 @@ def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
     return {row: [str(f) for f in faults] for row, faults in found.items() if faults}
 
 
-def _damaged_lines(content: manifest.Manifest, matters: bool) -> list[Finding]:
-    """Damaged lines lose a fact. When every row is committed all the same, nothing is missing."""
-    remedy = "its fact is lost; resume takes a row again" if matters else "every row is committed"
-    return [
-        Finding("error" if matters else "note", f"{MANIFEST} line {n}", "damaged: its CRC is wrong", remedy)
-        for n in content.damaged
-    ]
+def _lost_lines(fault: ManifestFault, lost: str) -> Finding:
+    """A fault of the manifest; a note where nothing is `lost`."""
+    return Finding("error" if lost else "note", f"{MANIFEST} line {fault.line}", fault.what, lost or _ALL_THERE)
+
+
+def _what_is_lost(scan: ScanFolder) -> str:
+    """Which rows are not committed; "" when every row is, whatever a lost line said."""
+    absent = scan.rows_absent
+    if not absent:
+        return ""
+    rows = f"row {absent[0]} is" if len(absent) == 1 else f"rows {', '.join(map(str, absent))} are"
+    return f"facts are lost: {rows} not committed; `polysight resume {scan.path}` takes them again"
 
 
 def _row(scan: ScanFolder, row: CommittedRow) -> list[Finding]:

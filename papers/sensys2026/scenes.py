@@ -14,8 +14,9 @@ import numpy.typing as npt
 import tomli_w
 
 from polysight.host.jobs.demo import run_simulator
-from polysight.host.jobs.process import EDGE_MM, TRUTH
+from polysight.host.jobs.process import EDGE_MM
 from polysight.host.materials import (
+    TRUTH,
     KnownScene,
     MaterialsResult,
     MetalChoice,

@@ -6,6 +6,7 @@ The byte format is docs/spec/scan-folder.md; written here independently of the h
 from __future__ import annotations
 
 import json
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol
 from zlib import crc32
@@ -73,6 +74,7 @@ class OwnLayout:
         self._path, self._rig, self._plan = path, rig, plan
         self._scan_id, self._started_utc = scan_id, started_utc
         self._seq, self._now_ns = 0, NS_PER_S
+        self._lines, self._digest, self._rows = 0, "", 0
 
     def start(self) -> None:
         """Make the folder; note the start in manifest and events. Raises DataError when it is not empty."""
@@ -122,18 +124,21 @@ class OwnLayout:
         self._fact(
             "row_committed", row=row.index, take=1, direction=row.direction, boards=boards, pulses=row.points * pulses
         )
+        self._rows += 1
 
     def end(self) -> None:
         """Note the end."""
         self._event(RunStopped(exit_status="success", **self._stamp()))
-        self._fact("scan_ended", exit_status="success", reason="")
+        self._fact("scan_ended", exit_status="success", reason="", rows_committed=self._rows)
 
     def _fact(self, fact: str, **content: Any) -> None:
-        record = {"fact": fact, **content}
+        record = {"fact": fact, **content, "count": self._lines, "previous": self._digest}
         plain = json.dumps(record, sort_keys=True, separators=(",", ":"))
         record["crc"] = f"{crc32(plain.encode()):08x}"
+        line = json.dumps(record, sort_keys=True, separators=(",", ":"))
         with (self._path / "manifest.jsonl").open("a", encoding="utf-8") as f:
-            f.write(json.dumps(record, sort_keys=True, separators=(",", ":")) + "\n")
+            f.write(line + "\n")
+        self._lines, self._digest = self._lines + 1, sha256(line.encode()).hexdigest()[:16]
 
     def _event(self, *events: AnyEvent) -> None:
         with (self._path / "events.msgpack").open("ab") as f:

@@ -21,6 +21,7 @@ class Missed:
     """The clean scan, of which every row of both boards misses pulses; `place` says whether its frames are placed."""
 
     mirrored = synchronised = False
+    manifest_faults = ()
 
     def __init__(self, clean: ScanFolder, place: bool) -> None:
         self._clean, self._place = clean, place

@@ -70,6 +70,39 @@ def test_metal_is_one_at_every_angle_and_the_pole_of_eq3():
     assert abs(ratio_from_permittivity(1.29e5 - 3.05e5j, np.radians(55.0)) - 1) < 0.01
 
 
+NAN, INF = float("nan"), float("inf")
+any_part = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@given(any_part, any_part, st.sampled_from([0.9, NAN]))
+def test_what_is_not_a_number_stays_so_and_only_infinite_permittivity_is_metal(re, im, theta):
+    """complex(inf, nan) too: which infinity it is does not matter, but nan says that nobody knows."""
+    eps = np.array([complex(re, im), 4 - 0.1j])
+    unknown = np.isnan([re, im, theta]).any()
+    with np.errstate(all="ignore"):
+        r_s, r_p = fresnel(eps, theta)
+        p = ratio_from_permittivity(eps, theta)
+    for value, metal in ((r_s, -1), (r_p, -1), (p, 1)):
+        assert np.isnan(value[0]) or not unknown
+        assert np.isnan(value[1]) == np.isnan(theta)
+        if not unknown and np.isinf([re, im]).any():
+            assert value[0] == metal
+
+
+@pytest.mark.parametrize("eps", [NAN, complex(NAN, 1), complex(1, NAN), complex(NAN, NAN), complex(INF, NAN)])
+@pytest.mark.parametrize("function", [fresnel, ratio_from_permittivity])
+def test_unknown_permittivity_gives_unknown_reflection_without_warnings(eps, function):
+    with np.errstate(all="raise"):
+        assert np.isnan(function(eps, 0.9)).all()
+
+
+@pytest.mark.parametrize("eps", [4 - 0.1j, 1.0, INF])
+@pytest.mark.parametrize("function", [fresnel, ratio_from_permittivity])
+def test_an_unknown_angle_gives_unknown_reflection_of_metal_too(eps, function):
+    with np.errstate(all="raise"):
+        assert np.isnan(function(eps, NAN)).all()
+
+
 def test_normal_incidence_and_published_example():
     n = np.sqrt(3.78)
     for r in fresnel(3.78, 0.0):

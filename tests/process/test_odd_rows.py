@@ -21,6 +21,7 @@ class Cut:
     """A scan of which some positions are lost."""
 
     mirrored = synchronised = False
+    manifest_faults = ()
 
     def __init__(self, scan: ScanFolder) -> None:
         self._scan = scan

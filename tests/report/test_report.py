@@ -188,7 +188,7 @@ def test_results_stand_beside_the_truth(page):
     assert "-2.5 %" in words
     assert "(3.80 … 4.00)" in words
     assert "metal-like" in words
-    assert "99.80 % of 1000 frames received" in words
+    assert "99.80 % of 1000 frames of recorded rows received" in words
     assert "RH phase (rad)" in words
     assert "frames masked 2" in words
     assert "averaged 31 0.005" in words

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.store.manifest import ManifestFault
 from polysight.host.store.source import CubeRow, RowData
 from polysight.host.store.sources.published_packets import (
     Bursts,
@@ -63,6 +64,7 @@ class _Published:
     """What both of the authors' folders tell."""
 
     synchronised = False
+    manifest_faults: tuple[ManifestFault, ...] = ()
 
     def __init__(self, path: Path, base: Instrument) -> None:
         self.path = path

@@ -1,0 +1,72 @@
+"""A truth.json that is not one of ours is a note; only training, which needs the truth, refuses it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+
+from polysight import open_scan
+from polysight.host.cli.main import main
+from polysight.host.jobs.process import truth_of
+from polysight.host.materials import read_truth
+from polysight.shared.errors import DataError
+from tests.support.commands import content
+from tests.support.paths import RIG_FILE
+
+PLATE = {"name": "PET", "centre_mm": [0, 0], "size_mm": [30, 30], "permittivity": [3.0, 0.1]}
+FOREIGN = {
+    "other keys": b'{"answer": 42}',
+    "not JSON": b"the plate is copper\n",
+    "a list": b"[1, 2]",
+    "a number": b"3",
+    "null": b"null",
+    "empty": b"",
+    "not UTF-8": b'{"plates": "\xff\xfe"}',
+    "plates that are text": b'{"plates": "copper"}',
+    "plates of other form": b'{"plates": [{"name": "PET"}]}',
+    "plates that are null": b'{"plates": [null]}',
+    "infinite": json.dumps({"plates": [{**PLATE, "size_mm": [float("inf"), 3]}]}).encode(),
+    "not a number": json.dumps({"plates": [{**PLATE, "centre_mm": [float("nan"), 3]}]}).encode(),
+    "larger than any float": json.dumps({"plates": [{**PLATE, "thickness_mm": 10**400}]}).encode(),
+    "nested deep": b"[" * 200_000,
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_a_foreign_truth_is_a_note_and_no_plates(tmp_path, capsys, kind):
+    (tmp_path / "truth.json").write_bytes(FOREIGN[kind])
+    assert truth_of(tmp_path) == ()
+    told = capsys.readouterr().err
+    assert told.startswith("note: ")
+    assert str(tmp_path / "truth.json") in told
+    assert len(told.splitlines()) == 1
+    with pytest.raises(DataError, match=r"truth\.json"):
+        read_truth(tmp_path / "truth.json")
+
+
+def test_a_folder_of_that_name_is_a_note_too(tmp_path, capsys):
+    (tmp_path / "truth.json").mkdir()
+    assert truth_of(tmp_path) == ()
+    assert "note: " in capsys.readouterr().err
+
+
+def test_no_truth_is_no_note(tmp_path, capsys):
+    assert truth_of(tmp_path) == ()
+    assert capsys.readouterr().err == ""
+
+
+def test_a_scan_with_a_foreign_truth_is_processed_and_not_learnt_from(two_plates, tmp_path, capsys):
+    scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
+    (scan / "truth.json").write_bytes(FOREIGN["other keys"])
+    assert main(["process", str(scan), "--out", str(out), "--metal", "-40,10,30,30"]) == 0
+    assert "note: " in capsys.readouterr().err
+    assert content(out / "materials.json")["segments"]
+    assert main(["export", str(out), "--csv"]) == 0
+    capsys.readouterr()
+    status = main(["train", str(scan), "--config", str(RIG_FILE), "--out", str(tmp_path / "library.npz")])
+    assert status != 0
+    assert "truth.json" in capsys.readouterr().err
+    with pytest.warns(UserWarning, match=r"truth\.json"):
+        assert open_scan(scan, metal_box_mm=(-55, -5, -25, 25)).materials().sizes

@@ -1,0 +1,90 @@
+"""Names in any script: figures draw them without warnings, and the page has every one of them in full."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from html import unescape
+
+import numpy as np
+import pytest
+from matplotlib.font_manager import findfont, get_font
+
+from polysight.host.report import fonts
+from polysight.host.report.context import ReportContext
+from polysight.host.report.figures import banner_png, figures
+from polysight.host.report.fonts import figure_label, font_families, is_drawable
+from polysight.host.report.report import render, write_report
+
+NAMES = ["木板", "ガラス", "유리 3", "стекло", "Plexiglas®", "\U0001f9f1 brick", "tab\there", "a $b$ c_{", "زجاج"]
+PERMITTIVITY = {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]}
+
+
+def row(label: int, name: str, truth: str) -> dict:
+    return {
+        "label": label, "name": name, "confidence": 0.9, "metal_reference": False, "metal_like": False,
+        "centre_mm": [0, 0], "box_mm": [-20, -20, 20, 20], "outline_mm": [], "permittivity": PERMITTIVITY,
+        "ratio": {"real": 4.4, "imag": 0.6}, "interior_pixels": 9, "metal_distance": 1.0,
+        "truth": {"name": truth, "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
+    }  # fmt: skip
+
+
+def context(names: list[str]) -> ReportContext:
+    image = np.full((12, 12), 0.5 + 0.1j, np.complex64)
+    axis = np.linspace(-0.05, 0.05, 12)
+    return ReportContext(
+        title=names[0], simulated=True, x_m=axis, y_m=axis, h=image, v=image / 2, p=image * 2,
+        valid=np.ones((12, 12), bool), segments=np.ones((12, 12), np.int32),
+        materials=[row(k, name, name) for k, name in enumerate(names, 1)],
+        truth=[{"name": name, "box_mm": (-20, -20, 20, 20), "permittivity": 4 - 0.4j} for name in names],
+    )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def strict():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_figures_and_page_of_a_name_are_made_without_warnings(tmp_path, name):
+    html = unescape(write_report(tmp_path, context([name])).read_text(encoding="utf-8"))
+    assert name in html
+    if not is_drawable(name):
+        assert f"patch 1: {figure_label(name, 'x').removeprefix('x: ')}" in html
+    banner_png(tmp_path / "banner.png", context([name]))
+
+
+def test_a_name_that_no_font_has_is_a_number_and_ascii():
+    assert figure_label("PET", "patch 3") == "PET"
+    odd = "\U0010fffd木 PET"  # a private character: no font has it
+    assert figure_label(odd, "patch 3") == "patch 3: ?? PET"
+
+
+def test_the_page_says_which_name_a_label_stands_for():
+    odd = "\U0010fffd木"
+    html = render(context([odd, "PET"]), {})
+    assert f"patch 1: ?? is {odd}" in html
+    assert f"plate 1: ?? is {odd}" in html
+    assert "is PET" not in html
+    assert "fonts do not have" not in render(context(["PET"]), {})
+
+
+def test_an_installed_font_that_has_the_glyph_draws_the_name(monkeypatch):
+    """A font of mathematical signs stands in for one of CJK: both are tried after matplotlib's own."""
+    own, other = (set(get_font(findfont(f)).get_charmap()) for f in (fonts.OWN, "STIXGeneral"))
+    glyph = chr(min(other - own))
+    assert not is_drawable(glyph)
+    monkeypatch.setattr(fonts, "FALLBACKS", ("no such family", "STIXGeneral"))
+    caches = (fonts.font_families, fonts._glyphs)
+    try:
+        for cached in caches:
+            cached.cache_clear()
+        assert font_families() == (fonts.OWN, "STIXGeneral")
+        assert figure_label(glyph, "patch 1") == glyph
+        drawn = figures(context([glyph]))["materials"]
+        assert drawn != figures(replace(context(["?"]), title=glyph))["materials"]
+    finally:
+        for cached in caches:
+            cached.cache_clear()

@@ -1,0 +1,193 @@
+"""The chain of a manifest: every line carries its count and the digest of the line before, so that none goes unseen."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from polysight.host.capture.segment import write_index
+from polysight.host.store import manifest
+from polysight.host.store.manifest import ManifestWriter, encode_line, parse
+from polysight.host.store.scan_folder import MANIFEST, ScanFolder
+from polysight.host.store.validation import validate
+from polysight.shared.raster import plan_raster
+from polysight.simulators.scene import decode_scene, simulate
+from tests.support.acquisition.fake_rig import small_instrument
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, PET, scene_of
+
+SOME = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
+
+
+def chained(path: Path, facts=SOME) -> list[bytes]:
+    """The lines that a writer makes of facts."""
+    with ManifestWriter(path / MANIFEST, create=True) as writer:
+        for fact in facts:
+            writer.append(fact)
+    return (path / MANIFEST).read_bytes().splitlines(keepends=True)
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory) -> list[bytes]:
+    return chained(tmp_path_factory.mktemp("chain"))
+
+
+def test_every_line_carries_its_count_and_the_digest_of_the_line_before(lines):
+    before = ""
+    for count, line in enumerate(lines):
+        told = json.loads(line)
+        assert (told["count"], told["previous"]) == (count, before)
+        before = hashlib.sha256(line.rstrip(b"\n")).hexdigest()[:16]
+
+
+def test_a_whole_chain_has_no_faults_and_facts_are_without_it(lines):
+    found = parse(b"".join(lines))
+    assert (found.facts, found.faults) == (SOME, [])
+
+
+@given(st.integers(0, len(SOME) - 2), st.integers(1, 3))
+def test_lines_taken_out_are_missed_and_the_others_stand(lines, at, many):
+    left = [*lines[:at], *lines[min(at + many, len(SOME) - 1) :]]
+    found = parse(b"".join(left))
+    assert len(found.facts) == len(left)
+    assert [(f.line, f.lost) for f in found.faults] == [(at + 1, len(lines) - len(left))]
+
+
+def test_a_line_that_was_replaced_is_missed(lines):
+    other = json.loads(lines[3])
+    other["row"] = 77
+    del other["crc"]
+    found = parse(b"".join([*lines[:3], encode_line(other), *lines[4:]]))
+    assert [f.line for f in found.faults] == [5]
+    assert "line before" in found.faults[0].what
+
+
+def test_repeated_lines_are_noticed(lines):
+    assert [f.line for f in parse(b"".join([*lines[:4], *lines[2:]])).faults] == [5]
+
+
+@pytest.mark.parametrize("damage", [b"{}\n", b"\x00\xff\n", b""])
+def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, damage):
+    lines = chained(tmp_path)
+    left = [*lines[:3], damage, *lines[4:]]
+    (tmp_path / MANIFEST).write_bytes(b"".join(left))
+    with ManifestWriter(tmp_path / MANIFEST, create=False) as writer:
+        writer.append({"fact": "scan_resumed"})
+    found = manifest.read(tmp_path / MANIFEST)
+    assert found.facts[-1] == {"fact": "scan_resumed"}
+    assert [f.line for f in found.faults] == [4]
+
+
+@given(st.data())
+def test_after_a_torn_tail_the_chain_goes_on(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("torn")
+    raw = b"".join(chained(path))
+    (path / MANIFEST).write_bytes(raw[: data.draw(st.integers(0, len(raw)))])
+    for fact in ({"fact": "scan_resumed"}, {"fact": "scan_ended"}):
+        with ManifestWriter(path / MANIFEST, create=False) as writer:
+            writer.append(fact)
+    found = manifest.read(path / MANIFEST)
+    assert (found.faults, found.torn) == ([], False)
+    counts = [json.loads(line)["count"] for line in (path / MANIFEST).read_bytes().splitlines()]
+    assert counts == list(range(len(counts)))
+
+
+def test_a_manifest_without_chain_reads_as_before_and_goes_on_with_one(tmp_path):
+    path = tmp_path / MANIFEST
+    path.write_bytes(b"".join(map(encode_line, SOME)))
+    assert (manifest.read(path).facts, manifest.read(path).faults) == (SOME, [])
+    with ManifestWriter(path, create=False) as writer:
+        writer.append({"fact": "scan_resumed"})
+        writer.append({"fact": "scan_ended"})
+    lines = path.read_bytes().splitlines(keepends=True)
+    assert manifest.read(path).faults == []
+    assert json.loads(lines[-1])["count"] == len(SOME) + 1
+    assert parse(b"".join([*lines[:2], *lines[3:]])).faults != []
+
+
+# --- a scan folder --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def scan(tmp_path) -> Path:
+    """Four rows of a small rig, and the end that counts them."""
+    instrument = small_instrument()
+    scan = ScanFolder.create(tmp_path / "scan", instrument, plan_raster(instrument.grid), simulated=True)
+    frames = instrument.grid.columns * instrument.burst.pulses
+    with scan.writer() as writer:
+        for row in scan.plan:
+            boards = {}
+            for name in ("RH", "RV"):
+                path = scan.row_path(name, row.index)
+                data = np.full(instrument.row_bytes, row.index, dtype=np.uint8)
+                data.tofile(path)
+                index = write_index(path.with_suffix(".idx"), {"missing": []}, np.zeros((2, 2), dtype=np.int64))
+                boards[name] = {
+                    "file": str(path.relative_to(scan.path)), "bytes": data.size, "frames_expected": frames,
+                    "frames_received": frames, "missing_bytes": 0, "index_crc32": f"{index:08x}",
+                    "crc32": f"{manifest.zlib.crc32(data.tobytes()):08x}",
+                }  # fmt: skip
+            committed = {"fact": "row_committed", "row": row.index, "take": 1, "direction": row.direction}
+            writer.append({**committed, "boards": boards, "pulses": frames})
+        writer.append({"fact": "scan_ended", "exit_status": "success", "reason": "", "rows_committed": 4})
+    (scan.path / "events.msgpack").write_bytes(b"")
+    return scan.path
+
+
+def without(folder: Path, *numbers: int) -> None:
+    """Take lines (from 1) out of a manifest."""
+    lines = (folder / MANIFEST).read_bytes().splitlines(keepends=True)
+    (folder / MANIFEST).write_bytes(b"".join(line for n, line in enumerate(lines, 1) if n not in numbers))
+
+
+def errors(folder: Path) -> str:
+    return "\n".join(str(f) for f in validate(folder) if f.severity == "error")
+
+
+def test_a_row_s_line_that_is_gone_is_an_error_that_names_line_and_row(scan):
+    assert validate(scan) == []
+    without(scan, 4)
+    assert "manifest.jsonl line 4" in errors(scan)
+    assert "row 2 " in errors(scan)
+    found = ScanFolder.load(scan)
+    assert list(found.rows()) == [0, 1, 3]
+    assert {f.line for f in found.manifest_faults} == {4}
+
+
+def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
+    lines = (scan / MANIFEST).read_bytes().splitlines()
+    facts = [json.loads(line) for line in lines]
+    plain = [{k: v for k, v in f.items() if k not in ("crc", "count", "previous")} for f in facts]
+    (scan / MANIFEST).write_bytes(b"".join(encode_line(f) for f in plain if f.get("row") != 3))
+    assert "scan_ended counts 4 rows" in errors(scan)
+    assert "row 3 " in errors(scan)
+
+
+def test_a_row_taken_again_makes_the_gap_a_note(scan):
+    lost = ScanFolder.load(scan).facts("row_committed")[2]
+    without(scan, 4)
+    with ScanFolder.load(scan).writer() as writer:
+        writer.append({"fact": "scan_resumed", "rows_missing": 1})
+        writer.append({**lost, "take": 2})
+        writer.append({"fact": "scan_ended", "exit_status": "success", "reason": "", "rows_committed": 4})
+    assert errors(scan) == ""
+    assert "line 4" in "\n".join(map(str, validate(scan)))
+
+
+def test_a_row_withdrawn_after_the_end_is_no_fault_of_the_manifest(scan):
+    with ScanFolder.load(scan).writer() as writer:
+        writer.append({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["its file changed"]})
+    assert ScanFolder.load(scan).manifest_faults == ()
+
+
+def test_simulated_scans_are_chained_and_counted(tmp_path):
+    folder = simulate(published_rig(), decode_scene(scene_of(COPPER, PET, columns=2, rows=3), "t"), tmp_path / "scan")
+    assert ScanFolder.load(folder).manifest_faults == ()
+    without(folder, 3)
+    assert {f.line for f in ScanFolder.load(folder).manifest_faults} == {3}

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import optimize
 
-from polysight.host.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
+from polysight.host.polarimetry import fresnel, permittivity_from_ratio
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -55,12 +55,15 @@ class Seen:
         V / H.
     std
         Standard deviation of its real part and of its imaginary part: noise, speckle, edges.
+    theta_rad
+        Incidence angle, as far as it is known.
     brightness
-        |H|; None when it is not to be used (a box given by hand, a layered plate).
+        |H|; None when it is not to be used.
     """
 
     inverse_ratio: complex
     std: float
+    theta_rad: float
     brightness: float | None = None
 
 
@@ -70,8 +73,8 @@ class Uncertain:
 
     Attributes
     ----------
-    theta_rad, theta_std_rad
-        Incidence angle.
+    theta_std_rad
+        Standard deviation of the incidence angle's error, the same for all patches.
     leakage
         Of p in H and of s in V: as measured, or zero.
     leakage_std
@@ -84,7 +87,6 @@ class Uncertain:
         Of ln |H| beside what Eq. 2 says, one patch beside another.
     """
 
-    theta_rad: float
     theta_std_rad: float
     leakage: tuple[complex, complex] = (0j, 0j)
     leakage_std: float = 0.041
@@ -137,8 +139,8 @@ class Inversion:
         Standard deviation of each: root of the mean variance of its two parts.
     prior_std
         The same before this scene was seen.
-    theta_rad, theta_std_rad
-        The angle, likewise.
+    theta_error_rad, theta_std_rad
+        How much larger the angle is than it was taken for, and the standard deviation of that.
     misfit
         Brightness beside the model's, in standard deviations, one a patch; NaN where it was not used.
     brightness_std
@@ -151,7 +153,7 @@ class Inversion:
     leakage: tuple[complex, complex]
     leakage_std: tuple[float, float]
     prior_std: float
-    theta_rad: float
+    theta_error_rad: float
     theta_std_rad: float
     misfit: Real
     brightness_std: float
@@ -197,13 +199,14 @@ class _Model:
         self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_LIKE)
         self.log_level = np.log(np.where(self.bright, level, 1.0))
         self.start = true_ratio(self.q, *prior.leakage)
+        self.theta = np.array([s.theta_rad for s in seen], np.float64)
 
     def nuisances(self, x: Real) -> tuple[complex, complex, complex, float]:
-        """a, b, rho and the angle."""
+        """a, b, rho and the angle's error."""
         p = self.prior
         a = p.leakage[0] + p.leakage_std * complex(x[0], x[1])
         b = p.leakage[1] + p.leakage_std * complex(x[2], x[3])
-        return a, b, p.reference_std * complex(x[4], x[5]), p.theta_rad + p.theta_std_rad * float(x[6])
+        return a, b, p.reference_std * complex(x[4], x[5]), p.theta_std_rad * float(x[6])
 
     def ratios(self, x: Real) -> Complex:
         """t of every patch."""
@@ -212,8 +215,8 @@ class _Model:
 
     def misfit(self, x: Real) -> Real:
         """Brightness beside the model's in standard deviations, [patch]; 0 where it is not used."""
-        a, _, _, theta = self.nuisances(x)
-        t = self.ratios(x)
+        a, _, _, error = self.nuisances(x)
+        t, theta = self.ratios(x), self.theta + error
         r_s = fresnel(permittivity_from_ratio(t, theta), theta)[0]
         with np.errstate(divide="ignore", invalid="ignore"):
             model = np.log(np.abs(r_s * (1 + a * t) / (1 + a)))
@@ -253,32 +256,33 @@ def invert(seen: Sequence[Seen], prior: Uncertain) -> Inversion:
     -------
     Inversion
     """
-    level, found, model = prior.brightness_std, None, _Model(seen, prior, prior.brightness_std)
-    for _ in range(2):
-        model = _Model(seen, prior, level)
-        start = np.zeros(_NUISANCES + 2 * model.n) if found is None else found.x
-        found = optimize.least_squares(model.residuals, start, method="lm", xtol=1e-10, ftol=1e-10)
-        off = np.minimum(np.abs(model.misfit(found.x)[model.bright]), OUTLIER) * level
-        freedom = BRIGHTNESS_FREEDOM + max(off.size - 4, 0)  # four numbers of leakage are fitted to them
-        level = float(np.sqrt((BRIGHTNESS_FREEDOM * prior.brightness_std**2 + np.sum(off**2)) / freedom))
-        level = min(level, 3 * prior.brightness_std)
-    assert_found = found if found is not None else optimize.OptimizeResult()
-    return _solution(model, assert_found)
+    first = _Model(seen, prior, prior.brightness_std)
+    start = _least_squares(first, np.zeros(_NUISANCES + 2 * first.n))
+    off = np.minimum(np.abs(first.misfit(start.x)[first.bright]), OUTLIER) * prior.brightness_std
+    freedom = BRIGHTNESS_FREEDOM + max(off.size - 4, 0)  # four numbers of leakage are fitted to them
+    level = float(np.sqrt((BRIGHTNESS_FREEDOM * prior.brightness_std**2 + np.sum(off**2)) / freedom))
+    model = _Model(seen, prior, level)
+    found = _least_squares(model, start.x)
+    return _solution(model, found)
+
+
+def _least_squares(model: _Model, start: Real) -> optimize.OptimizeResult:
+    return optimize.least_squares(model.residuals, start, method="lm", xtol=1e-10, ftol=1e-10)
 
 
 def _solution(model: _Model, found: optimize.OptimizeResult) -> Inversion:
     x, jac, prior, n = found.x, found.jac, model.prior, model.n
     covariance = np.linalg.inv(jac.T @ jac)
-    a, b, _, theta = model.nuisances(x)
+    a, b, _, error = model.nuisances(x)
     spread = prior.leakage_std * np.sqrt(np.diag(covariance)[:4])
     t = model.ratios(x)
-    patches = tuple(_estimate(model, x, jac, covariance, i, complex(t[i]), theta) for i in range(n))
+    patches = tuple(_estimate(model, x, jac, covariance, i, complex(t[i]), float(model.theta[i] + error)) for i in range(n))
     return Inversion(
         patches,
         (a, b),
         (float(np.hypot(*spread[:2]) / np.sqrt(2)), float(np.hypot(*spread[2:]) / np.sqrt(2))),
         prior.leakage_std,
-        theta,
+        error,
         float(prior.theta_std_rad * np.sqrt(covariance[6, 6])),
         np.where(model.bright, model.misfit(x), np.nan),
         model.brightness_std,
@@ -335,7 +339,7 @@ def _drawn(t: complex, theta: float, covariance: Real, unit: float, theta_std: f
 
 
 def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real:
-    """Standard deviation of 1 / P that leakage and reference leave at any t, as root of the mean of both parts.
+    """Standard deviation of 1 / P that leakage and reference leave at any t, root of the mean of both parts' variance.
 
     d t = -(1 - t) (b + a t) - t rho to first order.
     """
@@ -350,8 +354,3 @@ def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real
             both = by[i] * np.conj(by[j])
             total += both.real * (block[0, 0] + block[1, 1]) + both.imag * (block[0, 1] - block[1, 0])
     return np.sqrt(np.maximum(total, 0.0) / 2)
-
-
-def expected_ratio(permittivity: npt.ArrayLike, theta_rad: float) -> Complex:
-    """1 / P of a half space."""
-    return 1 / ratio_from_permittivity(permittivity, theta_rad)

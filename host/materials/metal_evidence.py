@@ -110,17 +110,19 @@ class _Explanation:
         self.bright = np.isfinite(levels) & (levels > 0)
         self.log_level = np.log(np.where(self.bright, levels, 1.0))
         self.loose = np.array([s.std for s in seen])
+        self.theta = np.array([s.theta_rad for s in seen], np.float64)
 
     def residuals(self, x: Real) -> Real:
         """Priors, brightness, and how possible each other patch is."""
         p = self.prior
         a = p.leakage[0] + p.leakage_std * complex(x[0], x[1])
         b = p.leakage[1] + p.leakage_std * complex(x[2], x[3])
-        theta = p.theta_rad + p.theta_std_rad * float(x[4])
+        theta = self.theta + p.theta_std_rad * float(x[4])
+        middle = float(theta.mean())
         own, own_s, bounds = 1.0 + 0j, -1.0 + 0j, []
         if x.size > 8:
             eps = complex(np.exp(min(x[8], 4.0)), -np.exp(min(x[9], 4.0)))
-            own, own_s = 1 / complex(ratio_from_permittivity(eps, theta)), complex(fresnel(eps, theta)[0])
+            own, own_s = 1 / complex(ratio_from_permittivity(eps, middle)), complex(fresnel(eps, middle)[0])
             bounds = [max(0.0, x[8] - np.log(15)) / 0.1, max(0.0, x[9] - np.log(20)) / 0.1, max(0.0, -x[8]) / 0.1]
         c = self.q * (own + b) / (1 + a * own) / (1 + p.reference_std * complex(x[5], x[6]))
         t = (c - b) / (1 - a * c)

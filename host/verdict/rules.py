@@ -1,0 +1,222 @@
+"""From evidence to reasons: each rule looks at one kind of evidence and says what it found, why, and what to do.
+
+A rule returns no reason where all is well. Limits are named constants here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from polysight.host.verdict.verdict import Reason
+
+FEW_POSITIONS = 0.5
+"""Share of absent or masked positions from which nothing can be said of the scene."""
+SOME_POSITIONS = 0.02
+"""Share of absent or masked positions that is worth a word."""
+DIRECT_SNR_NONE_DB = 6.0
+"""Direct path over noise, all chirps and receivers of a position together, below which there is none."""
+DIRECT_SNR_CARE_DB = 27.0
+"""The published rig has 35 dB; 27 dB leave a phase error of 0.03 rad."""
+DIRECT_LEVELS = (0.4, 3.0)
+"""Metal's brightness beside the direct path: the published rig's echo and direct path lie within a factor of 1.5."""
+DIRECT_PHASE_CARE_RAD = 0.05
+"""Phase of the object referenced to the direct path, from position to position; 0.004 is usual."""
+PLANE_FAR_MM, PLANE_TILT_DEG = 3.0, 0.5
+PLANE_GATE_MM = 13.0
+LEAKAGE_SHARE = 0.02
+"""Relative error of a permittivity by leakage that is worth a word."""
+LIBRARY_ANGLE_DEG = 0.3
+"""The ratio of a material changes by 3 % in 0.3 degrees."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Rows and frames beside the plan: counts, and what is wrong with the manifest."""
+
+    rows_planned: int
+    rows_recorded: int
+    frames_planned: int
+    frames_received: int
+    manifest: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, coverage: Mapping[str, object]) -> Coverage:
+        """From `coverage` of quality.json."""
+        manifest = coverage.get("manifest", ())
+        return cls(
+            *(int(str(coverage[k])) for k in ("rows_planned", "rows_recorded", "frames_planned", "frames_received")),
+            tuple(map(str, manifest)) if isinstance(manifest, list | tuple) else (),
+        )
+
+
+def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Reason]:
+    """Rows, frames and manifest against the plan. `masked_share` counts positions masked in recorded rows."""
+    out = []
+    absent = 1 - coverage.rows_recorded / coverage.rows_planned if coverage.rows_planned else 1.0
+    if coverage.rows_recorded < coverage.rows_planned:
+        level = "none" if absent > FEW_POSITIONS else "care"
+        missing = coverage.rows_planned - coverage.rows_recorded
+        out.append(Reason(
+            level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * absent:.1f} % of the positions)",
+            "the scan was stopped, or rows were lost; plates there are missing or distorted",
+            "`polysight resume SCAN` takes the missing rows", 5 + absent,
+        ))  # fmt: skip
+    out += [
+        Reason("care", fault, "a row that was recorded is not in the images", "`polysight validate SCAN` says more", 6.0)
+        for fault in coverage.manifest
+    ]
+    frames = 1 - coverage.frames_received / coverage.frames_planned if coverage.frames_planned else 1.0
+    lost = max(masked_share, frames - absent)
+    if lost > SOME_POSITIONS:
+        out.append(Reason(
+            "none" if lost > FEW_POSITIONS else "care", f"{100 * lost:.1f} % of the recorded positions or frames are masked",
+            "packets were lost, or the direct path was not found there",
+            "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost,
+        ))  # fmt: skip
+    return out
+
+
+def direct_path_reasons(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Reason]:
+    """One board's direct path: its level over noise, what synchronisation leaves, and where it was found."""
+    if found_share < FEW_POSITIONS or (snr_db is not None and snr_db < DIRECT_SNR_NONE_DB):
+        return [Reason(
+            "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
+            "without it no position is synchronised, and the images mean nothing",
+            "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
+        )]  # fmt: skip
+    out = []
+    if snr_db is not None and snr_db < DIRECT_SNR_CARE_DB:
+        out.append(Reason(
+            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise (35 dB are usual)",
+            "it is partly blocked, or the antennas look elsewhere; it is the reference of every phase",
+            "clear the line of sight; check the antennas' aim", 3.0,
+        ))  # fmt: skip
+    if phase_rad is not None and phase_rad > DIRECT_PHASE_CARE_RAD:
+        out.append(Reason(
+            "care", f"{board}: synchronisation leaves {phase_rad:.3f} rad from position to position (0.004 is usual)",
+            "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
+        ))  # fmt: skip
+    return out
+
+
+def level_reasons(levels: Mapping[str, float | None]) -> list[Reason]:
+    """Metal's brightness beside the direct path in each channel (None: not known)."""
+    out = []
+    for channel, level in levels.items():
+        if level is not None and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
+            weak = level > DIRECT_LEVELS[1]
+            what = f"{channel}: metal is {20 * np.log10(level):+.0f} dB beside the direct path"
+            why = (
+                "the direct path is weakened by something in its way; the object reaches into its estimate"
+                if weak
+                else "the object is far weaker than the direct path: the antennas look elsewhere, or this is not metal"
+            )
+            do = "clear the line of sight from transmitter to receivers, and check the antennas' aim"
+            out.append(Reason("care", what, why, do, 3.5))
+    return out
+
+
+def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
+    """Patches that are no plates (noise, several kinds together): number to why."""
+    if patches == 0:
+        return [Reason(
+            "none", "no patch was found", "nothing in the image stands out from its background",
+            "check that the object lies on the plane and in the image (polysight image)", 9.0,
+        )]  # fmt: skip
+    if len(refused) == patches:
+        why = sorted(set(refused.values()))
+        return [Reason(
+            "none", f"none of the {patches} patches is a plate: {'; '.join(why)}",
+            "there is no flat object on the plane, or the data are noise",
+            "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
+        )]  # fmt: skip
+    return [
+        Reason("care", f"patch {label} is not judged: {why}", "what is said of a patch holds for one flat plate", "move the plates apart, or draw its box (--labels)", 2.0)
+        for label, why in refused.items()
+    ]  # fmt: skip
+
+
+def metal_reasons(how: str, enough: bool, given: bool, score: float, others: int) -> list[Reason]:
+    """The metal reference: shown to be metal by the scene, given by the user, or neither."""
+    if enough:
+        return []
+    give = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
+    if given and score > -20:
+        if others == 0 or score > -6:
+            return []
+        return [Reason(
+            "care", "the given metal reference does not look like metal",
+            "relative to it the other patches are no possible materials", give, 4.0,
+        )]  # fmt: skip
+    if others == 0 and not given:
+        why = "it is the only patch: nothing else in the scene can show that it is metal"
+    elif given:
+        why = "relative to it the other patches are no possible materials, and it does not return both polarisations alike"
+    else:
+        why = "seen from it the other patches are no possible materials, or too few of them tell"
+    return [Reason("none", f"no metal reference: the patch {how} is not shown to be metal", why, give, 8.0)]
+
+
+def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Reason]:
+    """Leakage that was not measured: `relative_error` is the median error that it leaves in the permittivities."""
+    if measured or relative_error < LEAKAGE_SHARE:
+        return []
+    source = "estimated from the scene" if determined else "never measured; its prior is used"
+    return [Reason(
+        "care", f"leakage was {source}: it leaves {100 * relative_error:.0f} % in the permittivities",
+        "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
+        "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
+    )]  # fmt: skip
+
+
+def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Reason]:
+    """Where the plates lie beside the rig file's plane."""
+    if not known:
+        return [Reason(
+            "care", f"nothing tells where the plane is; the angle is taken as the rig file says, +-{theta_std_deg:.2f} degrees",
+            "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
+        )]  # fmt: skip
+    if abs(offset_mm) > PLANE_GATE_MM:
+        return [Reason(
+            "none", f"the plates lie {offset_mm:+.0f} mm off the rig file's plane", "they are at the edge of the range gate",
+            "measure geometry.object_distance_mm and correct the rig file", 7.0,
+        )]  # fmt: skip
+    out, tilt = [], max(abs(t) for t in tilt_deg)
+    if abs(offset_mm) > PLANE_FAR_MM:
+        out.append(Reason(
+            "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
+            "the object was put elsewhere, or object_distance_mm is wrong",
+            "correct geometry.object_distance_mm in the rig file", 1.6,
+        ))  # fmt: skip
+    if tilt > PLANE_TILT_DEG:
+        out.append(Reason(
+            "care", f"the plates' plane is tilted by {tilt:.1f} degrees", "tilted plates shine past the scanned positions",
+            "lay the plates parallel to the stage", 1.4,
+        ))  # fmt: skip
+    return out
+
+
+def passivity_reasons(gaining: Mapping[int, str]) -> list[Reason]:
+    """Patches whose permittivity has gain beyond its error: number to the value as text."""
+    return [
+        Reason(
+            "care", f"patch {label} would amplify ({value}): not printed as a material",
+            "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place",
+            "measure leakage; if the plate is thin, fit it as a layer (polysight permittivity --layer)", 2.2,
+        )
+        for label, value in gaining.items()
+    ]  # fmt: skip
+
+
+def incidence_reasons(angle_deg: float, library_deg: float | None) -> list[Reason]:
+    """The angle that was found beside the library's."""
+    if library_deg is None or abs(angle_deg - library_deg) <= LIBRARY_ANGLE_DEG:
+        return []
+    return [Reason(
+        "care", f"the scan looks at {angle_deg:.2f} degrees, the library was made at {library_deg:.2f}",
+        "the ratio of a material changes by a tenth in a degree: names may be wrong",
+        "make a library at this angle, or move the plane", 1.8,
+    )]  # fmt: skip

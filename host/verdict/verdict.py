@@ -1,0 +1,105 @@
+"""The verdict's structure: a level, and reasons in order of weight."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from polysight.shared.errors import PolysightError
+
+Level = Literal["good", "care", "none"]
+LEVELS: dict[Level, str] = {"good": "good", "care": "usable with care", "none": "no result"}
+"""Level to the words it is shown with."""
+_ORDER: tuple[Level, ...] = ("none", "care", "good")
+
+
+class NoResult(PolysightError):
+    """The data do not support any material or permittivity; images are kept. Commands exit with this status."""
+
+    exit_status = 7
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One piece of evidence that counts: what was found, why it matters, what to do.
+
+    Attributes
+    ----------
+    level
+        The best level that a result with this reason can have.
+    what, why, do
+        One plain sentence each, without a full stop.
+    weight
+        Reasons of one level are shown in order of falling weight.
+    """
+
+    level: Level
+    what: str
+    why: str
+    do: str
+    weight: float = 1.0
+
+    def to_dict(self) -> dict[str, str]:
+        """What JSON holds of it."""
+        return {"what": self.what, "why": self.why, "do": self.do}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How far a result may be trusted, and why."""
+
+    level: Level
+    reasons: tuple[Reason, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """`good`, `usable with care` or `no result`."""
+        return LEVELS[self.level]
+
+    @property
+    def usable(self) -> bool:
+        """Whether names and permittivities may be shown."""
+        return self.level != "none"
+
+    def to_dict(self) -> dict[str, Any]:
+        """`{"level": ..., "reasons": [{"what", "why", "do"}, ...]}` for JSON."""
+        return {"level": self.level, "reasons": [r.to_dict() for r in self.reasons]}
+
+    def lines(self, most: int | None = None) -> list[str]:
+        """Text for a terminal: the level, then each reason with what to do; at most so many reasons."""
+        shown = self.reasons[:most]
+        out = [f"verdict:  {self.text}"]
+        for r in shown:
+            out.append(f"  - {r.what}: {r.why}" if r.why else f"  - {r.what}")
+            if r.do:
+                out.append(f"    do: {r.do}")
+        if len(shown) < len(self.reasons):
+            out.append(f"  - and {len(self.reasons) - len(shown)} more, see the report")
+        return out
+
+    def error(self, kept: str = "") -> NoResult:
+        """The error that ends a command without a result. `kept` says where the images are."""
+        first = self.reasons[0] if self.reasons else Reason("none", "no result", "", "")
+        remedy = "; ".join(part for part in (first.do, kept) if part)
+        return NoResult(f"no result: {first.what}", first.why, remedy)
+
+
+def verdict_of(reasons: Iterable[Reason]) -> Verdict:
+    """The verdict from all reasons: its level is the worst of theirs, `good` without any."""
+    ordered = sorted(reasons, key=lambda r: (_ORDER.index(r.level), -r.weight))
+    return Verdict(ordered[0].level if ordered else "good", tuple(ordered))
+
+
+def read_verdict(content: Mapping[str, Any]) -> Verdict | None:
+    """The verdict in the content of quality.json or materials.json; None in products of earlier releases."""
+    raw = content.get("verdict")
+    if not isinstance(raw, Mapping) or raw.get("level") not in LEVELS:
+        return None
+    level: Level = raw["level"]
+    reasons = [
+        Reason(level, str(r.get("what", "")), str(r.get("why", "")), str(r.get("do", "")))
+        for r in raw.get("reasons") or ()
+        if isinstance(r, Mapping)
+    ]
+    return Verdict(level, tuple(reasons))

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.scene.draws import pulse_uniform, stream_key
 from polysight.simulators.scene.field import ObjectField, build_field, node_matrix
 from polysight.simulators.scene.optics import antennas, direct_factor
-from polysight.simulators.scene.receiver import high_pass, per_chirp, power_on, pulse_uniform, stream_key, sync_delay_s
+from polysight.simulators.scene.receiver import high_pass, per_chirp, power_on, sync_delay_s
 from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 _BATCH = 64  # chirps worked on at once: their arrays fit the cache
@@ -46,7 +47,7 @@ class _ReceivingBoard:
         tau, centre = ant.direct_m / SPEED_OF_LIGHT_M_S, self.field.centre_path_m / SPEED_OF_LIGHT_M_S
         self.middle_hz = float(chirp.slope_hz_per_s * (tau.mean() + centre) / 2)
         amplitude = direct_factor(board, scene) * ant.direct_m[0] / ant.direct_m
-        amplitude = amplitude * 10 ** (-scene.disturbances.direct_loss_db / 20)
+        amplitude = amplitude * scene.disturbances.direct_gain
         direct = amplitude[:, None] * np.exp(
             2j * np.pi * (f[0] * tau[:, None] + chirp.slope_hz_per_s * np.outer(tau, t))
         )

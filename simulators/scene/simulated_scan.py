@@ -18,10 +18,10 @@ from polysight.shared.config import Board, Grid, Instrument
 from polysight.shared.geometry import incidence_deg, specular_midpoint_m
 from polysight.shared.raster import RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight.shared.tables import to_builtins
+from polysight.simulators.scene.draws import stream_key
 from polysight.simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
 from polysight.simulators.scene.published_layout import AuthorsLayout, Skipped
 from polysight.simulators.scene.radar import SimulatedRig
-from polysight.simulators.scene.receiver import stream_key
 from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 Progress = Callable[[int, int], None]

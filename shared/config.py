@@ -204,7 +204,7 @@ class Polarimetry(Section, frozen=True):
 
     leakage_h: tuple[float, float] = (0.0, 0.0)
     leakage_v: tuple[float, float] = (0.0, 0.0)
-    leakage_std: NonNegative | None = None
+    leakage_std: NonNegative | None = None  # standard error of each part of the leakage as measured; None: not measured
     # rms magnitude of leakage that was never measured, any phase: 0.058 is what amplitudes spread evenly up to 0.1 have
     leakage_prior: NonNegative = 0.058
     smooth_px: NonNegative = 1.5

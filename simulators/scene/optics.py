@@ -2,7 +2,7 @@
 
 Reflection is at 76..81 GHz, in both polarisations, and the simulators' own: independent of the host's. Media are
 eps' - j eps'' (time dependence exp(+j omega t)). Signs are those of the paper's Eq. 2: a perfect conductor has
-r_s = r_p = -1, so that P = r_s / r_p = 1. The echo is physical optics on a plane parallel to the stage.
+r_s = r_p = -1, so that P = r_s / r_p = 1. The echo is physical optics on flat plates, each at its own height and tilt.
 
 A wave that comes later has an IF of phase +2 pi f tau: a receiver's samples are the conjugate of the wave (time
 dependence exp(+j omega t), so a delay is exp(-j 2 pi f tau)), and all that lies on its way is conjugated with it: what
@@ -25,6 +25,7 @@ from polysight.shared.config import Board, Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene.scene_file import Layer, Plate, Scene
+from polysight.simulators.scene.specimens import draw_specimens, facets, slopes
 
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
@@ -149,17 +150,22 @@ class Antennas:
         """TX to each RX, metres, [rx]."""
         return np.linalg.norm(self.rx_m - self.tx_m, axis=1)
 
-    def legs(self, x_m: Real, y_m: Real, rx: int) -> tuple[Real, Real, Real, Real]:
+    def legs(
+        self, x_m: Real, y_m: Real, rx: int, z_m: Real | float | None = None, slope: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[Real, Real, Real, Real]:
         """Geometry of object points (x, y) relative to the stage: r1, r2 (m), local incidence (rad), obliquity.
 
-        Local incidence is half the angle between the directions to TX and RX; obliquity is the mean cosine of both
-        directions to the plane's normal.
+        The points lie at z_m (None: on the object plane of the rig file), on a surface whose z grows by `slope` along
+        x and y. Local incidence is half the angle between the directions to TX and RX, whatever the surface's normal.
+        Obliquity is the mean cosine of both directions to that normal, times the surface's area over dx dy.
         """
-        z = self.plane_z_m
+        z = self.plane_z_m if z_m is None else z_m
         ax, ay, az = x_m - self.tx_m[0], y_m - self.tx_m[1], z - self.tx_m[2]
         bx, by, bz = x_m - self.rx_m[rx, 0], y_m - self.rx_m[rx, 1], z - self.rx_m[rx, 2]
         r1, r2 = np.sqrt(ax**2 + ay**2 + az**2), np.sqrt(bx**2 + by**2 + bz**2)
         theta = 0.5 * np.arccos(np.clip((ax * bx + ay * by + az * bz) / (r1 * r2), -1.0, 1.0))
+        if any(slope):
+            az, bz = az - slope[0] * ax - slope[1] * ay, bz - slope[0] * bx - slope[1] * by
         return r1, r2, theta, 0.5 * (az / r1 + bz / r2)
 
 
@@ -219,7 +225,9 @@ def field_exact(
 ) -> Complex:
     """Object field by direct quadrature, point by point: slow, for tests and small jobs.
 
-    Gauss-Legendre over each plate, with an order high enough for the phase's change across it.
+    Gauss-Legendre over each facet of each plate (a smooth plate is one), with an order high enough for the phase's
+    change across it. Every point of the surface has its true height, so legs and incidence are exact, and the plate's
+    own normal for its obliquity; facets of a rough plate are steps parallel to it.
 
     Parameters
     ----------
@@ -237,25 +245,35 @@ def field_exact(
     complex128 [n, k], amplitude relative to the direct path, phase +2 pi f (r1 + r2) / c.
     """
     ant, reflect = antennas(rig, board), board_reflectivity(board, scene)
+    scene = draw_specimens(scene)
     out = np.zeros((len(offsets_m), len(frequencies_hz)), dtype=np.complex128)
-    for plate in scene.plates:
+    for i, plate in enumerate(scene.plates):
         cx, cy = ant.centre_m[:2] + np.array(plate.centre_mm) / 1e3
-        sx, sy = np.array(plate.size_mm) / 1e3
-        # The phase changes at most by 2 k per metre; Gauss-Legendre needs about half a point per radian, plus a few.
-        wave = 2 * np.pi * float(np.max(frequencies_hz)) / SPEED_OF_LIGHT_M_S
-        (nx, ax), (ny, ay) = (np.polynomial.legendre.leggauss(int(wave * s * 0.6) + 16) for s in (sx, sy))
-        x, y = np.meshgrid(cx + nx * sx / 2, cy + ny * sy / 2)
-        area = np.outer(ay * sy / 2, ax * sx / 2)
-        for n, (ox, oy) in enumerate(offsets_m):
-            r1, r2, theta, oblique = ant.legs(x - ox, y - oy, rx)
-            common = area * oblique / (r1 * r2)
-            for k, f in enumerate(frequencies_hz):
-                phase = np.exp(2j * np.pi * f / SPEED_OF_LIGHT_M_S * (r1 + r2))
-                out[n, k] += plate_scale(ant, scene, f) * np.sum(common * reflect(plate, f, theta) * phase)
+        slope, parts = slopes(plate), facets(plate, i, scene.seed)
+        x, y, area = _quadrature(parts.size_m, float(np.max(frequencies_hz)))
+        for row, column in np.ndindex(parts.height_m.shape):
+            px, py = x + parts.x_m[column], y + parts.y_m[row]
+            z = ant.plane_z_m + plate.height_mm / 1e3 + slope[0] * px + slope[1] * py + parts.height_m[row, column]
+            for n, (ox, oy) in enumerate(offsets_m):
+                r1, r2, theta, oblique = ant.legs(cx + px - ox, cy + py - oy, rx, z, slope)
+                common = area * oblique / (r1 * r2)
+                for k, f in enumerate(frequencies_hz):
+                    phase = np.exp(2j * np.pi * f / SPEED_OF_LIGHT_M_S * (r1 + r2))
+                    out[n, k] += plate_scale(ant, scene, f) * np.sum(common * reflect(plate, f, theta) * phase)
     for point in scene.points:
         px, py = ant.centre_m[:2] + np.array(point.position_mm) / 1e3
-        r1, r2, _, _ = ant.legs(px - offsets_m[:, 0], py - offsets_m[:, 1], rx)
+        z = ant.plane_z_m + point.height_mm / 1e3
+        r1, r2, _, _ = ant.legs(px - offsets_m[:, 0], py - offsets_m[:, 1], rx, z)
         spread = sampled(complex(*point.amplitude)) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
         phase = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(r1 + r2, frequencies_hz))
         out += spread[:, None] * phase
     return out
+
+
+def _quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
+    """Points x, y about the centre of a rectangle and the area each stands for."""
+    # The phase changes at most by 2 k per metre; Gauss-Legendre needs about half a point per radian, plus a few.
+    wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
+    (nx, ax), (ny, ay) = (np.polynomial.legendre.leggauss(int(wave * s * 0.6) + 16) for s in size_m)
+    x, y = np.meshgrid(nx * size_m[0] / 2, ny * size_m[1] / 2)
+    return x, y, np.outer(ay * size_m[1] / 2, ax * size_m[0] / 2)

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import Row
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.scene.cubes import reference_cube
 from polysight.simulators.scene.layouts import Gaps, blank, new_folder, packet_payload_bytes
 from polysight.simulators.scene.optics import antennas, direct_factor, half_space
-from polysight.simulators.scene.radar import reference_cube, sample_frequencies_hz
+from polysight.simulators.scene.radar import sample_frequencies_hz
 from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 Complex = NDArray[np.complexfloating]

@@ -1,4 +1,4 @@
-"""The three radars: from stage offsets to the frames they send, and the ideal cube a perfect synchronisation would see.
+"""The three radars: from stage offsets to the frames they send.
 
 A chirp is the sum of direct path and object, times a factor that is new for every chirp, through the filter:
 
@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.config import Board, Instrument
-from polysight.shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm, plan_raster
+from polysight.shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.scene.draws import pulse_uniform, stream_key
 from polysight.simulators.scene.field import ObjectField, build_field, node_matrix
 from polysight.simulators.scene.optics import antennas, direct_factor
-from polysight.simulators.scene.receiver import high_pass, per_chirp, power_on, pulse_uniform, stream_key, sync_delay_s
+from polysight.simulators.scene.receiver import high_pass, per_chirp, power_on, sync_delay_s
 from polysight.simulators.scene.scene_file import Scene, apply_scene
 
 _BATCH = 64  # chirps worked on at once: their arrays fit the cache
@@ -46,7 +47,7 @@ class _ReceivingBoard:
         tau, centre = ant.direct_m / SPEED_OF_LIGHT_M_S, self.field.centre_path_m / SPEED_OF_LIGHT_M_S
         self.middle_hz = float(chirp.slope_hz_per_s * (tau.mean() + centre) / 2)
         amplitude = direct_factor(board, scene) * ant.direct_m[0] / ant.direct_m
-        amplitude = amplitude * 10 ** (-scene.disturbances.direct_loss_db / 20)
+        amplitude = amplitude * scene.disturbances.direct_gain
         direct = amplitude[:, None] * np.exp(
             2j * np.pi * (f[0] * tau[:, None] + chirp.slope_hz_per_s * np.outer(tau, t))
         )
@@ -250,46 +251,6 @@ class SimulatedRig:
 def sample_frequencies_hz(rig: Instrument) -> NDArray[np.floating]:
     """Transmit frequency at each ADC sample, Hz [sample]."""
     return rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(rig.chirp.samples)
-
-
-def reference_cube(rig: Instrument, scene: Scene, remove_direct: bool = True) -> dict[str, NDArray[np.complex64]]:
-    """The object's echo as perfect synchronisation would leave it, at the plan's true positions.
-
-    Every disturbance is off, whatever the scene says: no leakage, gains, noise or direct path. Each position is the
-    mean of its burst (x + direction x mean travel).
-
-    Parameters
-    ----------
-    rig, scene
-        Rig file and scene; the scene's overrides are applied.
-    remove_direct
-        Take the phase of each RX's own direct path away, so that the phase is 2 pi f (tau - tau_direct); otherwise it
-        is 2 pi f tau.
-
-    Returns
-    -------
-    complex64 [rx, row, column, sample] for each receiving board's name; column 0 is the smallest x. A full published
-    grid is 573 MB a board.
-    """
-    ideal = scene.with_disturbances(ideal=True)
-    rig = apply_scene(rig, ideal)
-    f, plan = sample_frequencies_hz(rig), plan_raster(rig.grid)
-    travel = mean_burst_travel_mm(rig.burst, rig.stage)
-    cubes = {}
-    for board in rig.receivers:
-        field = build_field(rig, ideal, board, f)
-        direct_m = antennas(rig, board).direct_m
-        base, _ = node_matrix(field, f)
-        away = field.centre_path_m - (direct_m if remove_direct else 0.0 * direct_m)
-        expand = base * np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(away, f))[:, None]
-        cube = np.empty((len(direct_m), plan.rows, plan.columns, len(f)), dtype=np.complex64)
-        for row in plan:
-            x = np.array(row.x_mm) + row.direction * travel
-            nodes = field.at(x / 1e3, np.full(len(x), row.y_mm / 1e3))
-            order = [row.column(i) for i in range(row.points)]
-            cube[:, row.index, order] = np.einsum("prq,rqk->rpk", nodes, expand.astype(np.complex64), optimize=True)
-        cubes[board.name] = cube
-    return cubes
 
 
 class SignalSource(Protocol):

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 
 from polysight.shared.config import Burst, Grid, Image, Instrument, Stage
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, read_toml, to_builtins
+from polysight.simulators.scene.draws import stream_key
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=0.5)]
 Pair = tuple[float, float]
+Degrees = Annotated[float, msgspec.Meta(ge=-10, le=10)]  # of tilt: the fast field is checked up to 2
+Tilt = tuple[Degrees, Degrees]
+Height = Annotated[float, msgspec.Meta(ge=-50, le=50)]
+Decibels = Annotated[float, msgspec.Meta(ge=-40, le=200)]
+Spread = Annotated[float, msgspec.Meta(ge=0, le=2)]
 _OVERRIDES: dict[str, type] = {"grid": Grid, "burst": Burst, "image": Image, "stage": Stage}
 
 
@@ -55,6 +62,10 @@ class Plate(_Table, frozen=True):
     [eps', eps''] of eps' - j eps''; without `thickness_mm` the plate is a half space (one interface). Instead of it,
     `layers` is a stack in the order the wave meets them, a liquid behind a wall say; air follows the last one unless
     it is a half space. Metal with `strips_deg` is ideal thin strips, turned by so much from the vertical towards +x.
+
+    `height_mm` moves the plate away from the radars (+z), out of the object plane. `tilt_deg` [ax, ay] turns it about
+    its own centre: height grows along +x by tan(ax) and along +y by tan(ay). `rough_mm` is the standard deviation of
+    its surface's height, in facets of `rough_length_mm`.
     """
 
     name: str
@@ -65,6 +76,10 @@ class Plate(_Table, frozen=True):
     thickness_mm: Positive | None = None
     layers: tuple[Layer, ...] = ()
     strips_deg: float | None = None
+    tilt_deg: Tilt = (0.0, 0.0)
+    height_mm: Height = 0.0
+    rough_mm: Annotated[float, msgspec.Meta(ge=0, le=5)] = 0.0
+    rough_length_mm: Positive = 6.0
 
     def __post_init__(self) -> None:
         _require(self.strips_deg is None or self.metal, "strips_deg goes with metal = true")
@@ -93,11 +108,13 @@ class Point(_Table, frozen=True):
     """An isotropic point scatterer, the same in both polarisations.
 
     `amplitude` [re, im] is relative to the direct path, reached when the point lies at the specular midpoint.
+    `height_mm` moves it away from the radars, out of the object plane.
     """
 
     position_mm: Pair
     amplitude: Pair = (1.0, 0.0)
     name: str = ""
+    height_mm: Height = 0.0
 
 
 class PerRole(_Table, frozen=True):
@@ -132,7 +149,13 @@ class Disturbances(_Table, frozen=True):
     packet_loss: Fraction = 0.0
     backlash_mm: float = 0.0
     sync_skew_ns: PerRole = PerRole()
-    direct_loss_db: NonNegative = 0.0
+    direct_loss_db: Decibels | Literal["absent"] = 0.0
+    leakage_measured: NonNegative | None = None
+
+    @property
+    def direct_gain(self) -> float:
+        """Amplitude of the direct path relative to a free one; 0 where there is none."""
+        return 0.0 if isinstance(self.direct_loss_db, str) else 10 ** (-self.direct_loss_db / 20)
 
 
 OFF: dict[str, Any] = {
@@ -156,6 +179,7 @@ OFF: dict[str, Any] = {
     "backlash_mm": 0.0,
     "sync_skew_ns": {},
     "direct_loss_db": 0.0,
+    "leakage_measured": None,
 }
 
 
@@ -164,12 +188,19 @@ class Scene(_Table, frozen=True):
 
     `object_gain` stands for the antenna patterns: gain of every object path over the direct path, which leaves and
     arrives at the edge of the patterns. By default a 45 mm metal plate at the midpoint has 0.75 of the direct path.
+
+    `plane_shift_mm` and `plane_tilt_deg` move and tilt the plane that holds all plates and points, about the image
+    centre; signs as of a plate. The rig file keeps its own `object_distance_mm`: nobody measured the true one.
+    `specimen_spread` [real, loss] are relative standard deviations of the plates' permittivities from those written.
     """
 
     name: str
     seed: int = 1
     object_distance_mm: Positive | None = None
     object_gain: Positive = 1.35
+    plane_shift_mm: Height = 0.0
+    plane_tilt_deg: Tilt = (0.0, 0.0)
+    specimen_spread: tuple[Spread, Spread] = (0.0, 0.0)
     grid: dict[str, Any] = {}
     burst: dict[str, Any] = {}
     image: dict[str, Any] = {}
@@ -241,7 +272,8 @@ def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
     """The rig with the scene's own grid, burst, image, stage and object distance.
 
     What the scene switches off, the filter and leakage, this rig does not have: its file says so, or processing would
-    take away what was never there. Applying the same scene again changes nothing.
+    take away what was never there. With `leakage_measured` it holds leakage as a calibration would have found it: the
+    truth with an error drawn from the scene's seed. Applying the same scene again changes nothing.
 
     Raises
     ------
@@ -255,7 +287,17 @@ def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
         table["geometry"] = {**table["geometry"], "object_distance_mm": scene.object_distance_mm}
     if not scene.disturbances.hpf:
         table["chirp"] = {**table["chirp"], "hpf1_khz": 0.0, "hpf2_khz": 0.0}
-    for key in ("leakage_h", "leakage_v"):
-        if not any(getattr(scene.disturbances, key)):
-            table["polarimetry"] = {**table["polarimetry"], key: [0.0, 0.0]}
+    table["polarimetry"] = {**table["polarimetry"], **_known_leakage(scene)}
     return decode(table, Instrument, f"{rig.name} with scene {scene.name}")
+
+
+def _known_leakage(scene: Scene) -> dict[str, Any]:
+    """Keys of the rig file's [polarimetry] that a scene sets: leakage as measured, or none at all."""
+    d, parts = scene.disturbances, ("leakage_h", "leakage_v")
+    if d.leakage_measured is not None:
+        rng = np.random.default_rng(stream_key(scene.seed, "leakage"))
+        error = rng.standard_normal((2, 2)) * d.leakage_measured
+        found = (np.array([d.leakage_h, d.leakage_v]) + error).tolist()
+        return {**dict(zip(parts, found, strict=True)), "leakage_std": d.leakage_measured}
+    none = {key: [0.0, 0.0] for key in parts if not any(getattr(d, key))}
+    return {**none, "leakage_std": 0.0} if len(none) == len(parts) else none

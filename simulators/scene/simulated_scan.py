@@ -15,47 +15,37 @@ import tomli_w
 from numpy.typing import NDArray
 
 from polysight.shared.config import Board, Grid, Instrument
-from polysight.shared.geometry import incidence_deg, specular_midpoint_m
+from polysight.shared.geometry import Vector, incidence_deg, specular_midpoint_m
 from polysight.shared.raster import RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight.shared.tables import to_builtins
+from polysight.simulators.scene.draws import stream_key
 from polysight.simulators.scene.layouts import Gaps, Layout, OwnLayout, packet_payload_bytes, versions
 from polysight.simulators.scene.published_layout import AuthorsLayout, Skipped
 from polysight.simulators.scene.radar import SimulatedRig
-from polysight.simulators.scene.receiver import stream_key
-from polysight.simulators.scene.scene_file import Scene, apply_scene
+from polysight.simulators.scene.scene_file import Pair, Plate, Scene, apply_scene
+from polysight.simulators.scene.specimens import draw_specimens
 
 Progress = Callable[[int, int], None]
 
 
 def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
-    """What a simulated scan holds: plates and points with their true places and materials, scene, seed, versions.
+    """What a simulated scan holds: plates and points as they really are, disturbances, scene, seed, versions.
 
-    `rig` has the scene applied. `centre_m` is in the rig frame; permittivity is [eps', eps''] or null (metal,
-    layers).
+    `rig` has the scene applied. `centre_m` is in the rig frame, at the plate's true height; permittivity is
+    [eps', eps''] as drawn, or null (metal, layers), beside the nominal one of the scene file. Tilt and height are from
+    the plane of the rig file, those of the true plane included.
     """
-    centre = specular_midpoint_m(rig, rig.by_role("receive_h"))
-    plates = [
-        {
-            "name": p.name,
-            "centre_mm": list(p.centre_mm),
-            "centre_m": [centre[0] + p.centre_mm[0] / 1e3, centre[1] + p.centre_mm[1] / 1e3, centre[2]],
-            "size_mm": list(p.size_mm),
-            "permittivity": None if p.permittivity is None else list(p.permittivity),
-            "metal": p.metal and p.strips_deg is None,
-            "strips_deg": p.strips_deg,
-            "thickness_mm": p.thickness_mm,
-            "layers": [msgspec.to_builtins(layer) for layer in p.layers],
-        }
-        for p in scene.plates
-    ]
+    centre, actual = specular_midpoint_m(rig, rig.by_role("receive_h")), draw_specimens(scene)
+    plates = [_plate_truth(p, n, centre) for p, n in zip(actual.plates, scene.plates, strict=True)]
     points = [
         {
             "name": p.name,
             "position_mm": list(p.position_mm),
-            "position_m": [centre[0] + p.position_mm[0] / 1e3, centre[1] + p.position_mm[1] / 1e3, centre[2]],
+            "position_m": _in_rig(p.position_mm, p.height_mm, centre),
+            "height_mm": p.height_mm,
             "amplitude": list(p.amplitude),
         }
-        for p in scene.points
+        for p in actual.points
     ]
     return {
         "simulated": True,
@@ -66,8 +56,35 @@ def truth(rig: Instrument, scene: Scene, seed: int) -> dict[str, Any]:
         "mean_burst_travel_mm": mean_burst_travel_mm(rig.burst, rig.stage),
         "plates": plates,
         "points": points,
+        "direct_path": scene.disturbances.direct_gain > 0,
         "scene": {**to_builtins(scene), "disturbances": msgspec.to_builtins(scene.disturbances)},
     }
+
+
+def _plate_truth(plate: Plate, nominal: Plate, centre_m: Vector) -> dict[str, Any]:
+    """A plate as it was drawn, and what the scene file says of its material."""
+    return {
+        "name": plate.name,
+        "centre_mm": list(plate.centre_mm),
+        "centre_m": _in_rig(plate.centre_mm, plate.height_mm, centre_m),
+        "size_mm": list(plate.size_mm),
+        "permittivity": None if plate.permittivity is None else list(plate.permittivity),
+        "nominal_permittivity": None if nominal.permittivity is None else list(nominal.permittivity),
+        "metal": plate.metal and plate.strips_deg is None,
+        "strips_deg": plate.strips_deg,
+        "thickness_mm": plate.thickness_mm,
+        "layers": [msgspec.to_builtins(layer) for layer in plate.layers],
+        "nominal_layers": [msgspec.to_builtins(layer) for layer in nominal.layers],
+        "tilt_deg": list(plate.tilt_deg),
+        "height_mm": plate.height_mm,
+        "rough_mm": plate.rough_mm,
+        "rough_length_mm": plate.rough_length_mm,
+    }
+
+
+def _in_rig(at_mm: Pair, height_mm: float, centre_m: Vector) -> list[float]:
+    """A place on the plane, and its height above it, in the rig frame, metres."""
+    return [centre_m[0] + at_mm[0] / 1e3, centre_m[1] + at_mm[1] / 1e3, centre_m[2] + height_mm / 1e3]
 
 
 def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating], NDArray[np.floating]]:

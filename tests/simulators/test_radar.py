@@ -10,9 +10,11 @@ import pytest
 from polysight.shared.config import load_instrument
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene.cubes import reference_cube
+from polysight.simulators.scene.draws import pulse_uniform
 from polysight.simulators.scene.optics import antennas, field_exact
-from polysight.simulators.scene.radar import SimulatedRig, reference_cube, sample_frequencies_hz
-from polysight.simulators.scene.receiver import high_pass, power_on, pulse_uniform, sync_delay_s
+from polysight.simulators.scene.radar import SimulatedRig, sample_frequencies_hz
+from polysight.simulators.scene.receiver import high_pass, power_on, sync_delay_s
 
 ROOT = Path(__file__).parents[2]
 RIG = load_instrument(ROOT / "instrument.toml")

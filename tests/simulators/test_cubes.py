@@ -1,0 +1,102 @@
+"""Samples without raw data equal those of a raw scan that the host synchronised, up to one factor and the noise."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polysight.host.pipeline import Pipeline
+from polysight.host.store.scan_folder import ScanFolder
+from polysight.shared.config import load_instrument
+from polysight.simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
+from polysight.simulators.scene.radar import sample_frequencies_hz
+
+ROOT = Path(__file__).parents[2]
+RIG = load_instrument(ROOT / "instrument.toml")
+SCENE = decode_scene(
+    {
+        "name": "t",
+        "grid": {"columns": 11, "rows": 6, "step_x_mm": 14.0, "step_y_mm": 12.0},
+        "plates": [
+            {"name": "copper", "centre_mm": [-40.0, 10.0], "size_mm": [50.0, 50.0], "metal": True},
+            {
+                "name": "PET",
+                "centre_mm": [40.0, -10.0],
+                "size_mm": [50.0, 50.0],
+                "permittivity": [3.78, 0.7],
+                "tilt_deg": [0.5, -0.3],
+                "height_mm": 1.0,
+                "rough_mm": 0.1,
+            },
+        ],
+    },
+    "t",
+)
+
+
+def rows_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
+    """Linear samples of a raw scan, synchronised, [rx, row, column, sample] in ADC counts."""
+    pipeline = Pipeline(ScanFolder.load(simulate(RIG, scene, folder / "scan")))
+    found: dict[str, list[np.ndarray]] = {"RH": [], "RV": []}
+    a, b = pipeline.source.instrument.chirp.linear_samples
+    for index in pipeline.source.rows():
+        for board, row in pipeline.add_row(index).items():
+            assert row.valid.all()
+            samples = row.samples[:, ::-1] if index % 2 else row.samples
+            found[board].append(samples[..., a:b])
+    return {board: np.stack(rows, axis=1) for board, rows in found.items()}
+
+
+def off_by(raw: np.ndarray, cube: np.ndarray) -> np.ndarray:
+    """What one common factor cannot explain, relative to the cube."""
+    cube = cube[..., : raw.shape[-1]]
+    return raw / (np.vdot(cube, raw) / np.vdot(cube, cube)) - cube
+
+
+def test_a_synced_cube_is_what_the_host_makes_of_the_raw_scan(tmp_path: Path) -> None:
+    scene = SCENE.with_disturbances(direct_snr_db="off", leakage_h=[0.1, 0.15], leakage_v=[-0.1, 0.1])
+    assert RIG.chirp.linear_samples[0] == 0
+    for board, raw in rows_by_the_host(scene, tmp_path).items():
+        cube, other = (
+            synced_cube(RIG, s, board) for s in (scene, scene.with_disturbances(leakage_h="off", leakage_v="off"))
+        )
+        own, unlike = (np.sqrt(np.mean(np.abs(off_by(raw, c)) ** 2) / np.mean(np.abs(c) ** 2)) for c in (cube, other))
+        assert own < 0.01
+        assert unlike > 3 * own, "the bound cannot tell leakage from none"
+
+
+def test_its_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
+    for board, raw in rows_by_the_host(SCENE, tmp_path).items():
+        quiet = synced_cube(RIG, SCENE, board, noise=0.0)
+        drawn = (synced_cube(RIG, SCENE, board) - quiet)[..., : raw.shape[-1]]
+        power = np.mean(np.abs(off_by(raw, quiet)) ** 2)
+        assert power == pytest.approx(np.mean(np.abs(drawn) ** 2), rel=0.05)
+        ideal = SCENE.with_disturbances(ideal=True)
+        given = synced_cube(RIG, ideal, board, noise=0.3) - synced_cube(RIG, ideal, board)
+        assert np.mean(np.abs(given) ** 2) == pytest.approx(0.09, rel=0.05)
+
+
+@pytest.mark.parametrize("count", [3, 20])
+def test_few_frequencies_and_channels_are_a_part_of_the_whole(count: int) -> None:
+    at = np.linspace(0, 191, count).astype(int)
+    whole = synced_cube(RIG, SCENE, "RV", noise=0.0)[[2]][..., at]
+    part = synced_cube(RIG, SCENE, "RV", sample_frequencies_hz(RIG)[at], rx=[2], noise=0.0)
+    assert part.shape == (1, 6, 11, count)
+    assert np.abs(part - whole).max() < 1e-3 * np.abs(whole).max()
+
+
+def test_an_ideal_rig_has_the_reference_cube_and_the_direct_path_is_a_constant() -> None:
+    ideal = SCENE.with_disturbances(ideal=True)
+    echo = synced_cube(RIG, ideal, "RH", direct=False)
+    assert np.abs(echo - reference_cube(RIG, SCENE)["RH"]).max() < 1e-5
+    direct = synced_cube(RIG, ideal, "RH") - echo
+    assert np.abs(direct[0] - 1).max() < 1e-5
+    assert np.abs(synced_cube(RIG, ideal.with_disturbances(direct_loss_db="absent"), "RH") - echo).max() < 1e-6
+
+
+def test_the_same_seed_gives_the_same_bytes_and_a_power_cycle_keeps_the_specimens() -> None:
+    first, again, cycle = (synced_cube(RIG, SCENE, "RH", seed=s) for s in (5, 5, 6))
+    assert first.tobytes() == again.tobytes()
+    assert first.tobytes() != cycle.tobytes()
+    ideal = SCENE.with_disturbances(ideal=True)
+    assert np.array_equal(synced_cube(RIG, ideal, "RH", seed=5), synced_cube(RIG, ideal, "RH", seed=6))

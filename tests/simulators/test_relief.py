@@ -1,0 +1,153 @@
+"""Plates that lie tilted, higher or rough: the fast field equals the exact sum, and both follow the laws of optics."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.geometry import incidence_deg
+from polysight.shared.raster import mean_burst_travel_mm, plan_raster
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.scene import Scene, apply_scene, decode_scene, synced_cube
+from polysight.simulators.scene.field import build_field, node_matrix
+from polysight.simulators.scene.optics import antennas, field_exact
+from polysight.simulators.scene.radar import sample_frequencies_hz
+
+RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+GRID = {"columns": 21, "rows": 15, "step_x_mm": 10.0, "step_y_mm": 10.0}
+PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "permittivity": [4.0, 0.4]}
+SIX = [
+    {**PLATE, "centre_mm": [60.0 * a, 60.0 * b], "size_mm": [45.0, 45.0], "height_mm": 2.5 * a + b}
+    for a in (-1, 0, 1)
+    for b in (-1, 1)
+]
+WAVE = 2 * np.pi * 78.5e9 / SPEED_OF_LIGHT_M_S
+
+
+def setup(**tables: Any) -> tuple[Instrument, Scene]:
+    scene = decode_scene({"name": "t", "object_distance_mm": 499.0, "grid": GRID, **tables}, "t")
+    return apply_scene(RIG, scene), scene
+
+
+def fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The fast and the exact field at random offsets and three frequencies."""
+    rig, scene = setup(**tables)
+    board, samples = rig.by_role(role), sample_frequencies_hz(rig)
+    field = build_field(rig, scene, board, samples)
+    offsets = np.random.default_rng(0).uniform(-1, 1, (n, 2)) * [0.1, 0.07]
+    at = [0, 128, 255]
+    carrier = np.exp(2j * np.pi * samples[at] * field.centre_path_m / SPEED_OF_LIGHT_M_S)
+    fast = field.at(offsets[:, 0], offsets[:, 1])[:, rx] @ node_matrix(field, samples)[0][:, at] * carrier
+    return fast, field_exact(rig, scene, board, offsets, samples[at], rx)
+
+
+def rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.abs(fast - exact) ** 2) / np.mean(np.abs(exact) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("tables", "bound"),
+    [
+        ({"plates": [{**PLATE, "tilt_deg": [1.0, 0.0]}]}, 0.002),
+        ({"plates": [{**PLATE, "tilt_deg": [0.0, 1.0]}]}, 0.002),
+        ({"plates": [{**PLATE, "tilt_deg": [2.0, -2.0]}]}, 0.004),
+        ({"plates": [{**PLATE, "height_mm": -7.0}]}, 2e-4),
+        ({"plates": SIX, "points": [{"position_mm": [0.0, 0.0], "height_mm": 3.0}]}, 0.002),
+        ({"plates": SIX, "plane_tilt_deg": [0.7, -0.5], "plane_shift_mm": -2.0}, 0.003),
+    ],
+    ids=["tilt x", "tilt y", "two degrees", "height", "many heights", "tilted plane"],
+)
+@pytest.mark.parametrize("role", ["receive_h", "receive_v"])
+def test_the_fast_field_equals_the_exact_sum(tables: dict[str, Any], bound: float, role: str) -> None:
+    assert rms_error(*fields(role=role, **tables)) < bound
+
+
+def test_a_rough_plate_is_the_same_in_both() -> None:
+    rough = {**PLATE, "size_mm": [45.0, 36.0], "rough_mm": 0.3, "tilt_deg": [0.5, 0.2]}
+    assert rms_error(*fields(n=6, plates=[rough])) < 0.002
+
+
+def test_zero_relief_changes_no_bit() -> None:
+    flat = setup(plates=[PLATE])[1]
+    zero = setup(
+        plates=[{**PLATE, "tilt_deg": [0.0, 0.0], "height_mm": 0.0}], plane_tilt_deg=[0.0, 0.0], plane_shift_mm=0.0
+    )[1]
+    rig = apply_scene(RIG, flat)
+    first, second = (build_field(rig, s, rig.receivers[0], sample_frequencies_hz(rig)).values for s in (flat, zero))
+    assert first.tobytes() == second.tobytes()
+
+
+def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
+    rig, _ = setup()
+    board, f = rig.receivers[0], np.array([78.5e9])
+    cos = np.cos(np.radians(incidence_deg(rig, board)))
+    flat, high = (
+        field_exact(rig, setup(plates=[{**PLATE, "height_mm": h}])[1], board, np.zeros((1, 2)), f)[0, 0]
+        for h in (0.0, 0.2)
+    )
+    assert np.angle(high / flat) == pytest.approx(2 * WAVE * cos * 0.2e-3, abs=0.01)  # positive is farther: later
+
+
+def test_a_shifted_plane_is_another_object_distance_that_the_rig_file_does_not_know() -> None:
+    rig, shifted = setup(plates=[PLATE], plane_shift_mm=1.5)
+    assert rig.geometry.object_distance_mm == 499.0
+    there, distant = setup(plates=[PLATE], object_distance_mm=500.5)
+    board, offsets, f = rig.receivers[0], np.array([[0.01, -0.02], [0.04, 0.03]]), np.array([77e9, 80e9])
+    got = field_exact(rig, shifted, board, offsets, f)
+    # The image centre does not depend on the distance: both boards' antennas lie at z = 0.
+    assert np.abs(got - field_exact(there, distant, board, offsets, f)).max() < 1e-3 * np.abs(got).max()
+
+
+def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitude() -> None:
+    rig, _ = setup()
+    board, samples = rig.receivers[0], np.array([78.5e9])
+    cos = np.cos(np.radians(incidence_deg(rig, board)))
+    offsets = np.zeros(1)
+
+    def amplitude(rough_mm: float, seed: int) -> complex:
+        plate = {**PLATE, "metal": True, "rough_mm": rough_mm, "rough_length_mm": 3.0}
+        plate.pop("permittivity")
+        scene = setup(plates=[plate], seed=seed, grid={**GRID, "columns": 1, "rows": 1})[1]
+        return complex(build_field(rig, scene, board, samples, rx=[0]).at(offsets, offsets)[0, 0, 0])
+
+    smooth = amplitude(0.0, 1)
+    for rough_mm in (0.15, 0.3):
+        coherent = np.mean([amplitude(rough_mm, seed) for seed in range(24)]) / smooth
+        expected = np.exp(-2 * (WAVE * rough_mm / 1e3 * cos) ** 2)
+        assert coherent.real == pytest.approx(expected, abs=0.04)
+        assert abs(coherent.imag) < 0.04
+
+
+def test_a_tilted_plates_image_stays_where_it_is() -> None:
+    """The direct sum over the aperture, at the true plane, has its middle at the plate's centre whatever the tilt."""
+    centre = np.array([20.0, -12.0])
+    found = [middle_of_image({**PLATE, "centre_mm": centre.tolist(), "tilt_deg": [t, t]}) for t in (0.0, 1.0)]
+    for middle in found:
+        assert np.abs(middle - centre).max() < 3.0
+    assert np.abs(found[1] - found[0]).max() < 2.0
+
+
+def middle_of_image(plate: dict[str, Any]) -> np.ndarray:
+    """Centroid of the part of the image above half its peak, mm from the image centre."""
+    grid = {"columns": 49, "rows": 61, "step_x_mm": 8.0, "step_y_mm": 4.0}
+    rig, scene = setup(plates=[{**plate, "size_mm": [30.0, 30.0]}], grid=grid)
+    scene = scene.with_disturbances(ideal=True)
+    board, f = rig.receivers[0], sample_frequencies_hz(rig)[[0, 40, 80, 120, 160]]
+    cube = synced_cube(rig, scene, board.name, f, rx=[0], direct=False)[0]
+    ant, plan, travel = antennas(rig, board), plan_raster(rig.grid), mean_burst_travel_mm(rig.burst, rig.stage)
+    axis = np.arange(-24.0, 25.0, 2.0)
+    px, py = np.meshgrid(axis + plate["centre_mm"][0], axis + plate["centre_mm"][1])
+    image = np.zeros(px.shape, complex)
+    for row in plan:
+        for i, x in enumerate(row.x_mm):
+            stage = np.array([x + row.direction * travel, row.y_mm]) / 1e3
+            at_x, at_y = (ant.centre_m[k] + p / 1e3 - stage[k] for k, p in enumerate((px, py)))
+            r1, r2, _, _ = ant.legs(at_x, at_y, 0)
+            excess = r1 + r2 - ant.direct_m[0]
+            phase = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * excess[..., None] * f)
+            image += phase @ cube[row.index, row.column(i)]
+    power = np.abs(image) ** 2
+    power[power < power.max() / 4] = 0
+    return np.array([(power * px).sum(), (power * py).sum()]) / power.sum()

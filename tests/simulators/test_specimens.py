@@ -1,0 +1,172 @@
+"""What a scene's seed draws is drawn once, within its law, and written down in truth.json."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError
+from polysight.simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, draw_specimens, simulate, truth
+from polysight.simulators.scene.specimens import facets
+
+RIG = load_instrument(Path(__file__).parents[2] / "instrument.toml")
+PLATE = {"name": "a", "centre_mm": [30.0, -20.0], "size_mm": [45.0, 30.0], "permittivity": [4.0, 0.4]}
+SMALL = {"columns": 3, "rows": 2, "step_x_mm": 10.0, "step_y_mm": 10.0}
+
+
+def scene(**tables: Any) -> Scene:
+    return decode_scene({"name": "t", "grid": SMALL, "plates": [PLATE], **tables}, "t")
+
+
+# --- specimens -------------------------------------------------------------------------------------------------------
+
+
+def test_permittivities_have_the_spread_that_was_asked_for() -> None:
+    many = draw_specimens(scene(plates=[PLATE] * 2000, specimen_spread=[0.03, 0.5]))
+    real, loss = np.array([p.permittivity for p in many.plates]).T
+    assert real.mean() == pytest.approx(4.0, rel=0.005)
+    assert real.std() / 4.0 == pytest.approx(0.03, rel=0.1)
+    assert loss.mean() == pytest.approx(0.4, rel=0.05)
+    assert loss.std() / 0.4 == pytest.approx(0.5, rel=0.15)
+    assert loss.min() > 0
+
+
+def test_drawing_is_of_the_seed_and_the_place_in_the_list_and_twice_is_once() -> None:
+    two = scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], plane_tilt_deg=[0.5, 0.2], plane_shift_mm=2.0)
+    drawn = draw_specimens(two)
+    assert draw_specimens(drawn) == drawn == draw_specimens(two)
+    assert drawn.plates[0].permittivity != drawn.plates[1].permittivity
+    other = scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], seed=2)
+    assert draw_specimens(other).plates[0].permittivity != drawn.plates[0].permittivity
+    assert draw_specimens(scene()) == scene()
+
+
+def test_layers_vary_but_air_and_metal_do_not() -> None:
+    layers = [
+        {"permittivity": [5.5, 0.05], "thickness_mm": 3.0},
+        {"permittivity": [1.0, 0.0], "thickness_mm": 2.0},
+        {"permittivity": [9.0, 18.0]},
+    ]
+    bare = {key: value for key, value in PLATE.items() if key != "permittivity"}
+    plates = [{**bare, "layers": layers}, {**bare, "metal": True}]
+    stack, metal = draw_specimens(scene(plates=plates, specimen_spread=[0.05, 0.3])).plates
+    assert stack.layers[1].permittivity == (1.0, 0.0)
+    assert stack.layers[0].permittivity != (5.5, 0.05)
+    assert stack.layers[2].permittivity != (9.0, 18.0)
+    assert metal.metal
+
+
+def test_a_planes_shift_and_tilt_are_those_of_its_plates_and_points() -> None:
+    point = {"position_mm": [100.0, 0.0], "height_mm": 1.0}
+    drawn = draw_specimens(scene(points=[point], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0))
+    x, y = np.tan(np.radians([1.0, -0.5]))
+    assert drawn.plates[0].tilt_deg == pytest.approx((1.0, -0.5))
+    assert drawn.plates[0].height_mm == pytest.approx(2.0 + 30.0 * x - 20.0 * y)
+    assert drawn.points[0].height_mm == pytest.approx(3.0 + 100.0 * x)
+    turned = {**PLATE, "tilt_deg": [-1.0, 0.5], "height_mm": -2.0}
+    flat = draw_specimens(scene(plates=[turned], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0)).plates[0]
+    assert flat.tilt_deg == pytest.approx((0.0, 0.0))
+
+
+def test_facets_fill_the_plate_and_have_the_roughness_that_was_asked_for() -> None:
+    plate = scene(plates=[{**PLATE, "rough_mm": 0.2, "rough_length_mm": 1.0}]).plates[0]
+    found = facets(plate, 0, 1)
+    assert found.height_m.shape == (30, 45)
+    assert found.height_m.std() == pytest.approx(0.2e-3, rel=0.05)
+    assert np.allclose([found.x_m[-1] + found.size_m[0] / 2, found.y_m[0] - found.size_m[1] / 2], [22.5e-3, -15e-3])
+    assert not np.array_equal(found.height_m, facets(plate, 1, 1).height_m)
+    assert np.array_equal(found.height_m, facets(plate, 0, 1).height_m)
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    real = {"plates": [{**PLATE, "rough_mm": 0.2, "tilt_deg": [0.5, 0.1]}], "specimen_spread": [0.03, 0.3]}
+    x = np.array([0.0, 5.0])
+    one, two = (SimulatedRig(RIG, scene(**real)).chirps("RH", x, x, 0) for _ in range(2))
+    assert one.tobytes() == two.tobytes()
+    assert one.tobytes() != SimulatedRig(RIG, scene()).chirps("RH", x, x, 0).tobytes()
+
+
+@pytest.mark.parametrize(
+    "plate", [{"tilt_deg": [30.0, 0.0]}, {"height_mm": 400.0}, {"rough_mm": -0.1}, {"rough_length_mm": 0.0}]
+)
+def test_a_plate_that_cannot_lie_there_is_refused(plate: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(plate))):
+        scene(plates=[{**PLATE, **plate}])
+
+
+# --- truth -----------------------------------------------------------------------------------------------------------
+
+
+def test_truth_tells_what_was_drawn(tmp_path: Path) -> None:
+    real = scene(
+        plates=[{**PLATE, "tilt_deg": [0.4, 0.0], "rough_mm": 0.1}],
+        specimen_spread=[0.05, 0.5],
+        plane_shift_mm=1.0,
+        disturbances={"direct_loss_db": "absent", "leakage_h": [0.0, 0.07]},
+    )
+    folder = simulate(RIG, real, tmp_path / "scan")
+    told = json.loads((folder / "truth.json").read_text())
+    plate, drawn = told["plates"][0], draw_specimens(real).plates[0]
+    assert plate["permittivity"] == list(drawn.permittivity or ())
+    assert plate["nominal_permittivity"] == [4.0, 0.4] != plate["permittivity"]
+    assert (plate["tilt_deg"], plate["height_mm"]) == ([0.4, 0.0], 1.0)
+    assert (plate["rough_mm"], plate["rough_length_mm"]) == (0.1, 6.0)
+    assert plate["centre_m"][2] == pytest.approx(told["image_centre_m"][2] + 1e-3)
+    assert told["direct_path"] is False
+    assert told["scene"]["disturbances"]["leakage_h"] == [0.0, 0.07]
+    assert told["scene"]["disturbances"]["direct_loss_db"] == "absent"
+    assert told["scene"]["plane_shift_mm"] == 1.0
+    assert truth(RIG, scene(), 1)["plates"][0]["permittivity"] == [4.0, 0.4]
+
+
+# --- leakage and direct path -----------------------------------------------------------------------------------------
+
+
+def polarimetry(rig: Instrument = RIG, **disturbances: Any) -> tuple[Any, Any, Any]:
+    p = apply_scene(rig, scene(disturbances=disturbances)).polarimetry
+    return p.leakage_h, p.leakage_v, p.leakage_std
+
+
+def test_a_rig_file_knows_leakage_only_as_well_as_it_was_measured() -> None:
+    was = (RIG.polarimetry.leakage_h, RIG.polarimetry.leakage_v, RIG.polarimetry.leakage_std)
+    assert polarimetry(leakage_h=[0.0, 0.08]) == was, "never measured: the rig file stays as it is"
+    assert polarimetry(ideal=True) == ((0.0, 0.0), (0.0, 0.0), 0.0), "an ideal rig is known"
+    h, v, std = polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.003)
+    assert std == 0.003
+    error = np.array([*h, *v]) - [0.0, 0.08, 0.03, 0.0]
+    assert 0 < np.abs(error).max() < 5 * 0.003
+    assert polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.0)[:2] == (
+        (0.0, 0.08),
+        (0.03, 0.0),
+    )
+
+
+def test_measured_leakage_errs_by_its_standard_error() -> None:
+    errors = []
+    for seed in range(200):
+        one = scene(seed=seed, disturbances={"ideal": True, "leakage_measured": 0.01})
+        p = apply_scene(RIG, one).polarimetry
+        assert apply_scene(apply_scene(RIG, one), one).polarimetry == p
+        errors += [*p.leakage_h, *p.leakage_v]
+    assert np.std(errors) == pytest.approx(0.01, rel=0.1)
+
+
+@pytest.mark.parametrize(("loss_db", "gain"), [(-6.0, 10 ** (6 / 20)), (6.0, 10 ** (-6 / 20)), ("absent", 0.0)])
+def test_the_direct_path_is_stronger_weaker_or_absent(loss_db: Any, gain: float) -> None:
+    def direct(loss: Any) -> np.ndarray:
+        disturbances = {"ideal": True, "direct_loss_db": loss}
+        return SimulatedRig(RIG, scene(plates=[], disturbances=disturbances)).signals("RH", np.zeros(1), np.zeros(1))
+
+    assert np.allclose(direct(loss_db), gain * direct(0.0), atol=1e-5)
+
+
+@pytest.mark.parametrize("loss_db", ["gone", -100.0, True])
+def test_a_direct_path_that_makes_no_sense_is_refused_or_on(loss_db: Any) -> None:
+    if loss_db is True:  # "on" is the default, as of every disturbance
+        assert scene(disturbances={"direct_loss_db": loss_db}).disturbances.direct_gain == 1.0
+        return
+    with pytest.raises(ConfigError, match="direct_loss_db"):
+        scene(disturbances={"direct_loss_db": loss_db})

@@ -19,7 +19,9 @@ class Pipeline:
     that many sub-bands of the sweep are imaged too.
     """
 
-    def __init__(self, source: store.Source, live: bool = False, depth_m: float = 0.0, bands: int = 1) -> None:
+    def __init__(
+        self, source: store.Source, live: bool = False, depth_m: float = imaging.PLANE_REACH_M, bands: int = 1
+    ) -> None:
         self.source, self.calibration = source, calibration.of_scan(source)
         rig = self.calibration.rig(source.instrument)
         self.rig = store.mirrored(rig) if source.mirrored else rig  # of the images: x from TX to RX
@@ -27,6 +29,7 @@ class Pipeline:
         self.images = imaging.ImageBuilder(rig, live=live, depth_m=depth_m)
         self.sub_bands = imaging.SubBandImages(rig, bands)
         self.quality = process.Quality(rig, source)
+        self.plane = imaging.UNKNOWN_PLANE
 
     def add_row(self, row: int) -> dict[str, sync.SyncedRow]:
         """Read, synchronise and reduce one row of every board for the images; returns the synchronised rows."""
@@ -50,6 +53,20 @@ class Pipeline:
             self.quality.note(imaging=imaging.imaging_facts(self.images, images))
         self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
+
+    def place_plane(self, images: imaging.ChannelImages, move: bool = True) -> imaging.ChannelImages:
+        """Find the plane that the plates lie on (`self.plane`); the images on it, where it is not the rig file's.
+
+        With `move` False the images stay as they are: they are to be divided by metal on the rig file's plane.
+        """
+        with self.quality.timed("plane"):
+            patches = materials.segment(images.h, images.v, images.x_m, images.y_m, images.valid).patches
+            masks = [p.interior.T if self.source.mirrored else p.interior for p in patches]
+            self.plane = imaging.find_plane(self.images, masks)
+            if move and self.plane.worth_moving:
+                images = self.images.finish(self.plane.offset_m)
+                images = images.transposed() if self.source.mirrored else images
+        return images
 
     def band_images(self) -> tuple[imaging.ChannelImages, ...]:
         """Both channels in every sub-band, flattened; none when they were not asked for."""
@@ -77,23 +94,33 @@ class Pipeline:
     ) -> materials.MaterialsResult:
         """Patches (found, unless known), metal reference, leakage, permittivity, names; sub-bands where imaged."""
         with self.quality.timed("materials"):
-            angles = polarimetry.incidence_choice(self.rig, images.x_m, images.y_m, incidence)
-            optics = materials.Optics.of(self.rig, angles)
+            rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
+            angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, incidence)
+            optics = materials.Optics.of(self.rig, angles, std, self.synchroniser.direct_path_known)
             found = materials.analyse(materials.ImagePair.of(images), optics, metal, known, classifier)
             self.quality.note_materials(found, angles, images.valid, metal.plane)
         with self.quality.timed("sub-bands"):
             return materials.with_bands(found, self.sub_bands.bands, self.band_images(), optics, metal.plane)
 
-    def finish(self, out: Path, options: process.Options, plates: materials.Plates = ()) -> process.Products:
-        """Images, materials and report into `out`. The images are written even when no metal reference is found."""
-        images = self.form_images()
-        process.save_images(out, self.source, self.rig, images, self.quality)
+    def examine(
+        self, images: imaging.ChannelImages, options: process.Options, plates: materials.Plates = ()
+    ) -> process.Findings:
+        """From the images to the verdict: plane, metal, patches, names. Without a result nothing is named."""
         classifier, boxes = options.classifier(self.rig), options.drawn(images.x_m, images.y_m)
         plane = self.metal_plane(options, boxes.metal is not None)
+        images = self.place_plane(images, move=plane is None)
         if plane is not None:
             images = replace(images, valid=images.valid & plane.valid_on(images.x_m, images.y_m))
         metal = materials.MetalChoice(options.metal_box_mm, boxes.metal, plane)
         known = materials.KnownScene(boxes.segmentation, plates)
-        found = self.find_materials(images, metal, known, classifier, options.incidence)
-        findings = process.Findings(images, replace(found, boxes=boxes.names), classifier, plates=plates)
+        found = replace(self.find_materials(images, metal, known, classifier, options.incidence), boxes=boxes.names)
+        verdict = process.judge(self.quality, found, self.plane, classifier)
+        shown = found if verdict.usable else found.without_result()
+        return process.Findings(images, shown, verdict, self.plane, classifier, plates)
+
+    def finish(self, out: Path, options: process.Options, plates: materials.Plates = ()) -> process.Products:
+        """Images, materials, verdict and report into `out`; the images are written first, and stay in any case."""
+        images = self.form_images()
+        process.save_images(out, self.source, self.rig, images, self.quality)
+        findings = self.examine(images, options, plates)
         return process.save_materials(out, self.source, self.rig, findings, options.unnamed(self.rig), self.quality)

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.materials import KnownScene, MetalChoice, pixel_accuracy, truth_beside
+from polysight.host.materials import pixel_accuracy, truth_beside
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
 from polysight.host.products import ProcessedScan, plain, scan_facts
 from polysight.host.store import ScanFolder, Source, require_raw
-from polysight.shared.errors import DataError, advice
+from polysight.shared.errors import DataError
 
 
 class Processing:
@@ -73,26 +72,19 @@ class Processing:
             when no metal is found, a row is damaged, or library or metal reference do not fit the scan.
         """
         pipeline, options = self.pipeline, self.options
-        classifier, unnamed = options.classifier(pipeline.rig), options.unnamed(pipeline.rig)
-        plane = pipeline.metal_plane(options)
-        images = self._images
-        if plane is not None:
-            images = replace(images, valid=images.valid & plane.valid_on(images.x_m, images.y_m))
+        unnamed = options.unnamed(pipeline.rig)
         plates, note = truth_beside(self.folder)
         if note:
             warnings.warn(note, stacklevel=2)
-        try:
-            metal, known = MetalChoice(options.metal_box_mm, None, plane), KnownScene(plates=plates)
-            found = pipeline.find_materials(images, metal, known, classifier, options.incidence)
-        except DataError as e:
-            raise DataError(e.what, e.why, advice(e.remedy, "metal_referenced=False shows images without")) from e
-        pipeline.quality.note(pixel_accuracy=pixel_accuracy(found))
+        findings = pipeline.examine(self._images, options, plates)
+        found, images = findings.found, findings.images
+        pipeline.quality.note(pixel_accuracy=pixel_accuracy(found), verdict=findings.verdict.to_dict())
         c, labels = found.calibrated, found.segmentation.labels
         interior = np.zeros(labels.shape, bool)
         for patch in found.segmentation.patches:
             interior |= patch.interior
-        materials = plain(materials_content(self.source, found, classifier, unnamed))
-        pixels = {"h": c.h, "v": c.v, "p": c.p, "valid": images.valid}
+        materials = plain(materials_content(self.source, findings, unnamed))
+        pixels = {"h": c.h, "v": c.v, "p": c.p, "valid": images.valid, "p_sigma": found.p_sigma(images.valid)}
         return self._processed(images, pixels, materials, labels, interior)
 
     def _processed(self, images: ChannelImages, pixels, materials, labels, interior) -> ProcessedScan:

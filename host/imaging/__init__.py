@@ -12,12 +12,14 @@ from polysight.host.imaging.focus import focus_sweep
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
 from polysight.host.imaging.images import TAPERS, ChannelImages, ImageBuilder, SubBand, SubBandImages, sub_bands
-from polysight.host.imaging.plane import PlaneEstimate, find_plane
+from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane
 from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
 
 __all__ = [
+    "PLANE_REACH_M",
     "TAPERS",
+    "UNKNOWN_PLANE",
     "Antennas",
     "Aperture",
     "ChannelImages",
@@ -30,8 +32,8 @@ __all__ = [
     "SubBandImages",
     "Window",
     "backproject",
-    "focus_sweep",
     "find_plane",
+    "focus_sweep",
     "image_grid",
     "imaging_facts",
     "point_response",

@@ -135,9 +135,13 @@ class ImageBuilder:
         """Complex gain of each RX of a board, [rx]."""
         return self.boards[board_name].rx_calibration()
 
-    def finish(self) -> ChannelImages:
-        """Both images from the rows added so far, all at once; more rows may follow."""
-        return self._channels({name: board.image() for name, board in self.boards.items()})
+    def finish(self, offset_m: float = 0.0) -> ChannelImages:
+        """Both images from the rows added so far, all at once; more rows may follow.
+
+        `offset_m`: on a plane that lies so much farther than the rig file's.
+        """
+        grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
+        return self._channels({name: board.image(grid) for name, board in self.boards.items()})
 
     def current(self) -> ChannelImages:
         """The same within 1e-6 of the peak, for looking on: at once where the builder is `live`."""

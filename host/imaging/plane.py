@@ -14,12 +14,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.imaging.images import ImageBuilder
 from polysight.host.imaging.samples import BoardSamples
+from polysight.shared.config import Instrument
+from polysight.shared.geometry import incidence_deg
 
+PLANE_REACH_M = 0.015
+"""How far from the rig file's plane plates are looked for."""
+MOUNT_STD_M = 1e-3
+"""Standard deviation of the antennas' places beside the rig file's: what the plane's distance cannot tell."""
+PRIOR_STD_M = 5.8e-3
+"""Standard deviation of the plane's distance where nothing in the scene tells it: anywhere within 10 mm."""
+_WORTH_M = 5e-4
 _STEP_M = 2e-4
 """Height by which a mirror is moved to find how range and phase change with height."""
 _COHERENT = 0.7
@@ -65,6 +75,27 @@ class PlaneEstimate:
         """Whether anything in the scene tells where the plane is."""
         return self.plates > 0
 
+    @property
+    def worth_moving(self) -> bool:
+        """Whether the plane lies off the rig file's by so much that images and angles are made anew."""
+        return self.known and abs(self.offset_m) > _WORTH_M and abs(self.offset_m) < PLANE_REACH_M
+
+    def applied_to(self, rig: Instrument) -> Instrument:
+        """A rig with its object plane where the plates lie."""
+        if not self.worth_moving:
+            return rig
+        distance = rig.geometry.object_distance_mm + 1e3 * self.offset_m
+        return msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=distance))
+
+    def incidence_std_rad(self, rig: Instrument) -> float:
+        """Standard deviation of the incidence angle: by the plane's distance and the antennas' places, radians.
+
+        d theta / d z = sin theta cos theta / z.
+        """
+        theta = np.radians(incidence_deg(rig, rig.receivers[0]))
+        known = float(np.hypot(self.offset_std_m, MOUNT_STD_M)) if self.known else PRIOR_STD_M
+        return float(np.sin(theta) * np.cos(theta) / (rig.geometry.object_distance_mm / 1e3) * known)
+
     def transposed(self) -> PlaneEstimate:
         """The same with x and y swapped."""
         return replace(self, tilt_rad=self.tilt_rad[::-1], tilt_std_rad=self.tilt_std_rad[::-1])
@@ -82,6 +113,10 @@ class PlaneEstimate:
             "by": "phase" if self.by_phase else "range",
             "plates": self.plates,
         }
+
+
+UNKNOWN_PLANE = PlaneEstimate(0.0, np.inf, (0.0, 0.0), (np.inf, np.inf), np.zeros(0), False, 0)
+"""Nothing tells: the rig file's plane stands."""
 
 
 def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> PlaneEstimate:
@@ -104,8 +139,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     stds = np.sqrt(1 / np.where(total > 0, total, np.nan))
     tells = np.isfinite(heights)
     if not tells.any():
-        nowhere = np.full(len(masks), np.nan)
-        return PlaneEstimate(0.0, np.inf, (0.0, 0.0), (np.inf, np.inf), nowhere, False, 0)
+        return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
     places = np.array([(x[m.any(axis=0)].mean(), y[m.any(axis=1)].mean()) if m.any() else (0.0, 0.0) for m in masks])
     plane, covariance = _fit(places[tells], heights[tells], np.hypot(stds[tells], _LEAST_STD_M))
     phase = _heights_by_phase(next(iter(builder.boards.values())), masks, places, plane)
@@ -129,9 +163,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     )
 
 
-def _ranges(
-    board: BoardSamples, masks: Sequence[NDArray[np.bool_]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ranges(board: BoardSamples, masks: Sequence[NDArray[np.bool_]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Height of each patch above the rig file's plane by the range of its echo, and its standard deviation, metres."""
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
@@ -183,7 +215,7 @@ def _heights_by_phase(
     # The range leaves some turns of doubt, the same for all plates but for the tilt: try planes about it.
     for tilt_x in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
         for tilt_y in np.linspace(-2, 2, 17) * 0.5 * _TILT_PRIOR_RAD:
-            guess = _at(plane + [0, tilt_x, tilt_y], places[known])
+            guess = _at(plane + np.array([0.0, tilt_x, tilt_y]), places[known])
             heights = phases[known] / rate
             common = np.angle(np.mean(np.exp(2j * np.pi * (heights - guess) / turn))) / (2 * np.pi) * turn
             heights = heights + turn * np.round((guess + common - heights) / turn)
@@ -207,11 +239,11 @@ def _fit(
     """
     rows = np.column_stack([np.ones(len(places)), places]) / stds[:, None]
     information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
-    plane = np.linalg.solve(information, rows.T @ (heights / stds))
+    plane = np.asarray(np.linalg.solve(information, rows.T @ (heights / stds)), np.float64)
     covariance = np.linalg.inv(information)
     off = (heights - _at(plane, places)) / stds
     freedom = max(len(places) - 3, 1)
-    return plane, covariance * max(1.0, float(np.sum(off**2)) / freedom)
+    return plane, np.asarray(covariance * max(1.0, float(np.sum(off**2)) / freedom), np.float64)
 
 
 def _at(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -139,7 +139,9 @@ def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
     if result.exit_status != "success":
         raise ScanError(f"{folder}: {result.reason}", "", f"polysight resume {folder}")
     if live.pipeline is not None:
-        sys.stdout.write(make_products(live.pipeline, folder / PRODUCTS, options, truth_of(folder)).summary())
+        products = make_products(live.pipeline, folder / PRODUCTS, options, truth_of(folder))
+        sys.stdout.write(products.summary())
+        return products.exit_status
     return 0
 
 

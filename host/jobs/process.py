@@ -109,8 +109,8 @@ def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None
 def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
     """All products, which take the place of those in `out`.
 
-    When no material can be found, the images alone do, unless `out` holds a report; the error says where they are.
-    Raises PolysightError.
+    When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
+    are. Raises PolysightError.
     """
     with making_products(out, pipeline.source.scan_id) as new:
         try:
@@ -184,8 +184,9 @@ def process(request: ProcessRequest) -> int:
     plates = truth_of(data)
     check_products_folder(out, source.scan_id)
     pipeline = _all_rows(source, data, bands=options.bands, options=options)
-    sys.stdout.write(make_products(pipeline, out, options, plates).summary())
-    return 0
+    products = make_products(pipeline, out, options, plates)
+    sys.stdout.write(products.summary())
+    return products.exit_status
 
 
 def image(data: Path, out: Path, config: Path | None) -> int:

@@ -6,20 +6,7 @@ scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patch
 between scans is in `patch_files`; `published` reads the published data set's material and label files.
 """
 
-from polysight.host.materials.analyse import (
-    FOUND,
-    UNKNOWN_SCENE,
-    ImagePair,
-    KnownScene,
-    MaterialsResult,
-    MetalChoice,
-    Optics,
-    PatchResult,
-    analyse,
-    image_centre_mm,
-    permittivity_change,
-    pixel_accuracy,
-)
+from polysight.host.materials.analyse import analyse, image_centre_mm, permittivity_change, pixel_accuracy
 from polysight.host.materials.classify import (
     DISCRIMINANT,
     MODELS,
@@ -36,10 +23,14 @@ from polysight.host.materials.concentration import (
     fit_concentration,
     polarisation_angle_rad,
 )
+from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, ImagePair, KnownScene, MetalChoice, Optics
+from polysight.host.materials.inversion import Inversion, PatchEstimate, Seen, Uncertain, invert, ratio_error
 from polysight.host.materials.knn import Fit, Weights, fit_weights
 from polysight.host.materials.layers import Layer, LayerFit, fit_layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
+from polysight.host.materials.measure import Refused
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
+from polysight.host.materials.metal_evidence import MetalEvidence, metal_evidence
 from polysight.host.materials.patch_files import (
     PATCHES,
     MatchedPatch,
@@ -66,6 +57,7 @@ from polysight.host.materials.published import (
     reading_of,
     told_angle,
 )
+from polysight.host.materials.result import MaterialsResult, PatchResult
 from polysight.host.materials.samples import CHANNELS, Samples, feature_matrix
 from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, box_mask, segment
 from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row, with_bands
@@ -83,6 +75,7 @@ from polysight.host.materials.truth import (
     TRUTH,
     Plates,
     TruthPlate,
+    match_truth,
     read_truth,
     truth_beside,
     truth_labels,
@@ -110,6 +103,7 @@ __all__ = [
     "Entry",
     "Fit",
     "ImagePair",
+    "Inversion",
     "KnownScene",
     "LabelledScan",
     "Layer",
@@ -118,20 +112,25 @@ __all__ = [
     "MatchedPatch",
     "MaterialsResult",
     "MetalChoice",
+    "MetalEvidence",
     "MetalReference",
     "NamedPatch",
     "Optics",
     "Patch",
+    "PatchEstimate",
     "PatchResult",
     "Permittivity",
     "Plates",
+    "Refused",
     "Samples",
     "Score",
+    "Seen",
     "SeenPatches",
     "SegmentSettings",
     "Segmentation",
     "TrainingScan",
     "TruthPlate",
+    "Uncertain",
     "Verdict",
     "Weights",
     "analyse",
@@ -151,13 +150,16 @@ __all__ = [
     "fit_weights",
     "format_permittivity",
     "image_centre_mm",
+    "invert",
     "is_metal",
     "label_folders",
     "labels_of",
     "make_library",
     "match_patches",
+    "match_truth",
     "median_ratio",
     "metal_by_label",
+    "metal_evidence",
     "metal_in_box",
     "pack_patches",
     "patches_from_labels",
@@ -165,6 +167,7 @@ __all__ = [
     "permittivity_change",
     "pixel_accuracy",
     "polarisation_angle_rad",
+    "ratio_error",
     "read_labelled_scan",
     "read_labels",
     "read_material",

@@ -1,204 +1,42 @@
-"""From the two images to named patches: segmentation, metal reference, permittivity, classification."""
+"""From the two images to named patches: segmentation, metal reference, joint inversion, classification."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.imaging import ChannelImages
-from polysight.host.materials.classify import Classifier, Verdict, features_of
-from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
-from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, inverse_spread
-from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
-from polysight.host.materials.truth import TruthPlate, match
+from polysight.host.materials.classify import Classifier, NamedPatch, features_of
+from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
+from polysight.host.materials.inversion import Inversion, Uncertain, feature_errors, invert
+from polysight.host.materials.measure import Refused, all_refused, background, reference_std, seen
+from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box, no_metal
+from polysight.host.materials.metal_evidence import metal_evidence
+from polysight.host.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
+from polysight.host.materials.result import MaterialsResult, PatchResult
+from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
+from polysight.host.materials.truth import match_truth
 from polysight.host.polarimetry import (
     Calibrated,
     IncidenceChoice,
     PlaneReference,
     calibrate,
+    calibrate_by_reference,
     correct_leakage,
+    fresnel,
     permittivity_from_ratio,
     ratio,
     smooth,
 )
-from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
 
-Image = npt.NDArray[np.complexfloating]
 FILLED = 0.1
 """|H| relative to metal over an image without edges from which on one material fills it, rather than none."""
-
-
-@dataclass(frozen=True)
-class PatchResult:
-    """One patch with everything found about it; `names` are those of the interior's pixels, in image order."""
-
-    patch: Patch
-    permittivity: Permittivity
-    verdict: Verdict | None
-    names: npt.NDArray[np.str_] | None
-    truth: TruthPlate | None
-
-
-@dataclass(frozen=True)
-class MaterialsResult:
-    """Everything found in one image pair.
-
-    Attributes
-    ----------
-    calibrated
-        Metal-referenced, leakage-corrected channels [ny, nx], not smoothed.
-    h, v, p
-        The same after the Gaussian filter inside each patch: the features of classification and permittivity. Not a
-        number outside the patches' interiors, so that no edge and no neighbour gets into a material's pixels.
-    metal
-        The reference and how it was chosen.
-    segmentation
-        Patches and label image.
-    patches
-        What each patch is.
-    theta_rad
-        Incidence angle, a number or [ny, nx].
-    bands
-        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.sub_bands`); empty when not
-        asked for.
-    boxes
-        Patch number to the name of the box drawn by hand; empty when the patches were found.
-    """
-
-    calibrated: Calibrated
-    h: Image
-    v: Image
-    p: Image
-    metal: MetalReference
-    segmentation: Segmentation
-    patches: tuple[PatchResult, ...]
-    theta_rad: npt.NDArray[np.float64]
-    bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
-    boxes: dict[int, str] = field(default_factory=dict)
-
-    def rows(self) -> list[dict[str, Any]]:
-        """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""
-        return [self._row(r) for r in self.patches]
-
-    def incidence_deg(self, patch: Patch) -> float:
-        """Mean incidence angle over a patch's interior, degrees."""
-        inside = self.theta_rad[patch.interior] if self.theta_rad.ndim and patch.interior.any() else self.theta_rad
-        return float(np.degrees(np.mean(inside)))
-
-    def _row(self, r: PatchResult) -> dict[str, Any]:
-        row = _row(r, self.metal, self.incidence_deg(r.patch))
-        level = np.abs(self.h[r.patch.interior])
-        level = level[np.isfinite(level)]
-        row["amplitude_h"] = round(float(np.median(level)), 6) if level.size else None
-        if r.patch.label in self.bands:
-            row["bands"] = self.bands[r.patch.label]
-        if r.patch.label in self.boxes:
-            row["box"] = self.boxes[r.patch.label]
-        return row
-
-
-@dataclass(frozen=True)
-class ImagePair:
-    """The two channel images that are analysed.
-
-    Attributes
-    ----------
-    h, v
-        complex [ny, nx], flattened by the footprint of a mirror, not yet metal-referenced.
-    x_m, y_m
-        Pixel centres, metres, [nx] and [ny].
-    valid
-        bool [ny, nx]; None: all of it.
-    """
-
-    h: Image
-    v: Image
-    x_m: npt.ArrayLike
-    y_m: npt.ArrayLike
-    valid: npt.NDArray[np.bool_] | None = None
-
-    @classmethod
-    def of(cls, images: ChannelImages) -> ImagePair:
-        """The pair of channel images as imaging makes them."""
-        return cls(images.h, images.v, images.x_m, images.y_m, images.valid)
-
-    def within(self, area: npt.NDArray[np.bool_]) -> ImagePair:
-        """The same, valid only inside `area`, bool [ny, nx]."""
-        return replace(self, valid=area if self.valid is None else self.valid & area)
-
-
-@dataclass(frozen=True)
-class Optics:
-    """What turns images into permittivity.
-
-    Attributes
-    ----------
-    theta_rad
-        Incidence angle, a number or [ny, nx].
-    leakage
-        Cross-polar leakage (p in H, s in V) to remove.
-    smooth_px
-        Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
-        inside each patch.
-    """
-
-    theta_rad: npt.ArrayLike
-    leakage: tuple[complex, complex] = (0.0, 0.0)
-    smooth_px: float = 2.0
-
-    @classmethod
-    def of(cls, rig: Instrument, angles: IncidenceChoice) -> Optics:
-        """A rig's leakage and filter, under the angles that were chosen."""
-        p = rig.polarimetry
-        return cls(angles.used_rad, (complex(*p.leakage_h), complex(*p.leakage_v)), p.smooth_px)
-
-
-@dataclass(frozen=True)
-class MetalChoice:
-    """Which metal is the reference: a box, a known patch, a plate scanned on its own; none of them: the metal is found.
-
-    Attributes
-    ----------
-    box_mm
-        x0, y0, x1, y1 in millimetres from the image centre.
-    label
-        Number of one of the known patches.
-    plane
-        A metal plate over the whole plane, instead of metal in this scene; where it is not valid nothing is looked at.
-    """
-
-    box_mm: Box | None = None
-    label: int | None = None
-    plane: PlaneReference | None = None
-
-
-@dataclass(frozen=True)
-class KnownScene:
-    """What is known of the scene.
-
-    Attributes
-    ----------
-    segmentation
-        Patches that are known (boxes drawn by hand); None: they are found.
-    plates
-        The truth, where known: only carried along to the results, never used for them.
-    settings
-        How to find patches.
-    """
-
-    segmentation: Segmentation | None = None
-    plates: Sequence[TruthPlate] = ()
-    settings: SegmentSettings | None = None
-
-
-FOUND = MetalChoice()
-"""The metal reference is found in the scene."""
-UNKNOWN_SCENE = KnownScene()
+ACTIVE = 2.0
+"""Standard deviations of gain, or of a real part below 1, beyond which a permittivity is that of no material."""
 
 
 def analyse(
@@ -210,39 +48,102 @@ def analyse(
 ) -> MaterialsResult:
     """Find the patches of an image pair and say what they are; without a classifier they are not named.
 
+    A scene without patches or without metal is no error: its result has none, and says so (`metal`, `refused`).
+
     Raises
     ------
     DataError
-        when there is no metal reference, or the image is empty.
+        when the image has no valid pixel, or a box or number given for the metal is none.
     """
     plane = metal.plane
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
     found = _patches(images, plane, known)
-    reference = _reference(images, optics, metal, found)
-    calibrated = to_metal(images.h, images.v, reference, optics.leakage, plane)
+    reference = _reference(images, metal, found)
+    raw = to_metal(images.h, images.v, reference, plane)
+    rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
+    refused = all_refused(found.patches, rh, rv, background(raw.h, raw.v, found, images.usable))
+    prior = optics.prior(reference_std(reference_spread(rh, rv, reference, plane)))
+    judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
+    theta = np.asarray(optics.theta_rad, np.float64)
+    measured = [seen(p, rh, rv, _angle(theta, p)) for p in judged]
+    if plane is None:
+        channel = _channel_ratio(images, reference) if optics.channel_ratio_known else None
+        reference = replace(reference, evidence=metal_evidence(measured, prior, channel))
+    inversion = invert(measured, prior)
+    calibrated = without_leakage(raw, inversion.leakage)
     sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
-    theta = np.asarray(optics.theta_rad, np.float64)
-    truth = match(found.patches, known.plates)
-    reference_std = reference_error(sh, sv, reference, plane)
-    inside = [patch.interior for patch in found.patches]
-    named = classifier.scan([features_of(sh[at], sv[at], sp[at]) for at in inside]) if classifier else None
-    results = []
-    for i, patch in enumerate(found.patches):
+    estimates = dict(zip((p.label for p in judged), inversion.patches, strict=True))
+    patches = {
+        p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
+        for p in found.patches
+    }
+    refused |= {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
+    named = _names(classifier, found, (sh, sv, sp), (inversion, prior), judged, float(np.mean(theta)))
+    truth = match_truth(found.patches, known.plates)
+    results = tuple(
+        PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
+        for p in found.patches
+    )
+    return MaterialsResult(calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior)
+
+
+def _names(
+    classifier: Classifier | None,
+    found: Segmentation,
+    channels: tuple[Image, Image, Image],
+    errors: tuple[Inversion, Uncertain],
+    judged: list[Patch],
+    theta_rad: float,
+) -> dict[int, NamedPatch]:
+    """Patch number to its name, with the error budget's share in it; the metal reference is not named by itself."""
+    if classifier is None or not judged:
+        return {}
+    h, v, p = channels
+    features = []
+    for patch, estimate in zip(judged, errors[0].patches, strict=True):
         at = patch.interior
-        angle = theta[at] if theta.ndim else theta
-        results.append(
-            PatchResult(
-                patch,
-                estimate_permittivity(sh[at], sv[at], angle, reference_std),
-                named[i].verdict if named else None,
-                named[i].names if named else None,
-                truth.get(patch.label),
-            )
-        )
-    return MaterialsResult(calibrated, sh, sv, sp, reference, found, tuple(results), theta)
+        by_h, by_q = _to_angle(estimate.permittivity, theta_rad + errors[0].theta_error_rad, classifier.angles_deg)
+        features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
+    covariances = np.stack([feature_errors(*errors, i) for i in range(len(judged))])
+    named = classifier.scan(features, covariances)
+    return dict(zip((patch.label for patch in judged), named, strict=True))
+
+
+def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequence[float]) -> tuple[float, complex]:
+    """Factors of |H| and of V / H that bring a half space from one angle to the library's."""
+    if permittivity is None or len(angles_deg) != 1 or permittivity.real < 1:
+        return 1.0, 1.0 + 0j
+    (s, p), (own_s, own_p) = (fresnel(permittivity, angle) for angle in (np.radians(angles_deg[0]), theta_rad))
+    return float(abs(s / own_s)), complex((p / s) / (own_p / own_s))
+
+
+def _no_material(e: Permittivity) -> Refused | None:
+    """Why a permittivity is that of no passive material beyond its error; None when it may be one."""
+    if e.value is None or e.real_std is None or e.loss_std is None:
+        return None
+    move = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
+    points = "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place"
+    if e.value.imag > ACTIVE * e.loss_std + 0.02:
+        return Refused("it would amplify beyond its error bar", points, move)
+    if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
+        return Refused("its permittivity would be below that of air", points, move)
+    return None
+
+
+def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
+    """Mean incidence angle over a patch, radians."""
+    inside = theta[patch.interior] if theta.ndim and patch.interior.any() else theta
+    return float(np.mean(inside))
+
+
+def _channel_ratio(images: ImagePair, metal: MetalReference) -> complex | None:
+    """V / H of the metal reference in the images themselves."""
+    h, v = images.h[metal.mask], images.v[metal.mask]
+    power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
+    return complex(np.vdot(h.astype(np.complex128), v)) / power if power > 0 else None
 
 
 def _patches(images: ImagePair, plane: PlaneReference | None, known: KnownScene) -> Segmentation:
@@ -260,28 +161,40 @@ def _patches(images: ImagePair, plane: PlaneReference | None, known: KnownScene)
     return found
 
 
-def _reference(images: ImagePair, optics: Optics, metal: MetalChoice, found: Segmentation) -> MetalReference:
-    """The metal that was chosen, or the patch that must be metal. Raises DataError when there is none."""
+def _reference(images: ImagePair, metal: MetalChoice, found: Segmentation) -> MetalReference:
+    """The metal that was chosen, or the patch that must be metal; none without patches."""
     if metal.plane is not None:
-        return MetalReference(metal.plane.valid, None, metal.plane.how)
+        return MetalReference(metal.plane.valid, None, metal.plane.how, given=True)
     if metal.box_mm is not None:
         return metal_in_box(metal.box_mm, found, images.x_m, images.y_m, images.valid)
     if metal.label is not None:
         return metal_by_label(metal.label, found)
-    return find_metal(images.h, images.v, found, float(np.mean(np.asarray(optics.theta_rad))), optics.leakage)
+    return find_metal(images.h, images.v, found) or no_metal(images.usable)
 
 
-def to_metal(
-    h: Image, v: Image, metal: MetalReference, leakage: tuple[complex, complex], reference: PlaneReference | None
-) -> Calibrated:
-    """Both channels relative to metal, in the scene or scanned on its own, with leakage removed."""
-    raw = calibrate(h, v, metal.mask) if reference is None else reference.apply(h, v)
-    ch, cv = correct_leakage(raw.h, raw.v, *leakage)
-    return Calibrated(ch, cv, ratio(ch, cv), raw.metal_h, raw.metal_v)
+def to_metal(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> Calibrated:
+    """Both channels relative to metal, in the scene or scanned on its own; leakage is still in them.
+
+    Where there is no signal to divide by, the images stay as they are.
+    """
+    if reference is not None:
+        return reference.apply(h, v)
+    try:
+        return calibrate(h, v, metal.mask)
+    except DataError:
+        if metal.given:
+            raise
+        return calibrate_by_reference(h, v, 1.0 + 0j, 1.0 + 0j)
 
 
-def reference_error(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
-    """Relative standard error of the metal reference: how far its own pixels lie from it."""
+def without_leakage(c: Calibrated, leakage: tuple[complex, complex]) -> Calibrated:
+    """Metal-referenced channels with leakage removed."""
+    h, v = correct_leakage(c.h, c.v, *leakage)
+    return Calibrated(h, v, ratio(h, v), c.metal_h, c.metal_v)
+
+
+def reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
+    """Spread of the metal's own pixels about it, relative."""
     spread = inverse_spread(h[metal.mask], v[metal.mask]) if reference is None else reference.spread
     return spread if np.isfinite(spread) else 0.0
 
@@ -318,52 +231,6 @@ def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, floa
     """Rig-frame position, in millimetres, of the image centre from which boxes and outlines count."""
     x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
     return float(x[0] * 1e3 - axis_mm(x)[0]), float(y[0] * 1e3 - axis_mm(y)[0])
-
-
-def _complex(z: complex | None) -> dict[str, float] | None:
-    if z is None or not (math.isfinite(z.real) and math.isfinite(z.imag)):
-        return None
-    return {"real": z.real, "imag": z.imag}
-
-
-def _row(r: PatchResult, metal: MetalReference, incidence_deg: float) -> dict[str, Any]:
-    e, v = r.permittivity, r.verdict
-    permittivity = None
-    if e.value is not None and e.real_range is not None and e.imag_range is not None:
-        permittivity = {
-            "real": e.value.real,
-            "imag": e.value.imag,
-            "real_p30_p70": list(e.real_range),
-            "imag_p30_p70": list(e.imag_range),
-            "real_std": e.real_std,
-            "imag_std": e.loss_std,
-        }
-    truth = None
-    if r.truth is not None:
-        truth = {
-            "name": r.truth.name,
-            "metal": r.truth.metal,
-            "permittivity": _complex(r.truth.permittivity),
-            "thickness_mm": r.truth.thickness_mm,
-        }
-    return {
-        "label": r.patch.label,
-        "name": v.name if v else None,
-        "confidence": v.confidence if v else None,
-        "votes": v.votes if v else {},
-        "distance": v.distance if v and math.isfinite(v.distance) else None,
-        "metal_reference": r.patch.label == metal.label,
-        "box_mm": [round(b, 3) for b in r.patch.box_mm],
-        "outline_mm": [[round(float(x), 2), round(float(y), 2)] for x, y in r.patch.outline_mm],
-        "pixels": r.patch.pixels,
-        "interior_pixels": e.pixels,
-        "incidence_deg": incidence_deg,
-        "ratio": _complex(e.ratio),
-        "inverse_ratio_std": e.inverse_std if math.isfinite(e.inverse_std) else None,
-        "permittivity": permittivity,
-        "metal_like": not e.determinable and bool(np.isfinite(e.ratio)),  # a box without a valid pixel is nothing
-        "truth": truth,
-    }
 
 
 def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:

@@ -176,7 +176,7 @@ class Classifier:
         self._model.fit(samples)
         self._width = max(len(UNKNOWN), *(len(n) for n in library.names))
 
-    def scan(self, patches: Sequence[Real]) -> list[NamedPatch]:
+    def scan(self, patches: Sequence[Real], errors: Real | None = None) -> list[NamedPatch]:
         """Name the patches of one scan, or of several scans of the same patches, together.
 
         Parameters
@@ -184,12 +184,17 @@ class Classifier:
         patches
             Features of each patch's pixels, [n, 4 * angles] (:func:`polysight.host.materials.samples.feature_matrix`);
             pixels that are not finite are unknown.
+        errors
+            float64 [patch, 3, 3]: covariance of each patch's ln|H|, ln|V| and arg P by the error budget; None, and for
+            several angles: none.
         """
+        if errors is not None and len(self.angles_deg) > 1:
+            errors = None
         good = [usable(x) for x in patches]
         number = np.concatenate([np.full(int(g.sum()), i) for i, g in enumerate(good)] or [np.zeros(0, int)])
         if number.size == 0:
             return [self._named(g, None, None, UNKNOWN, 0.0, np.inf) for g in good]
-        found = self._model.by_scan(np.concatenate([x[g] for x, g in zip(patches, good, strict=True)]), number)
+        found = self._model.by_scan(np.concatenate([x[g] for x, g in zip(patches, good, strict=True)]), number, errors)
         out = []
         for i, g in enumerate(good):
             row = int(np.searchsorted(found.patches, i))

@@ -111,8 +111,11 @@ class ErrorDiscriminant(Model):
         q, _ = self._costs(self._deviations(x), self._pixel_covariances())
         return np.sqrt(q[np.arange(len(x)), np.searchsorted(self.names, names)] / self.pixel_level)
 
-    def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
-        """Names in one scan: the reference's error is found from all patches, and what is named is freed of it."""
+    def by_scan(self, x: Real, patches: npt.NDArray, errors: Real | None = None) -> NamedScan:
+        """Names in one scan: the reference's error is found from all patches, and what is named is freed of it.
+
+        `errors` [patch, d, d] are covariances that come to each patch's own, in ln|H|, ln|V| and arg P.
+        """
         ids, patch = np.unique(patches, return_inverse=True)
         d = self._deviations(x)
         mean = np.stack([d[patch == i].mean(axis=0) for i in range(len(ids))])
@@ -120,7 +123,8 @@ class ErrorDiscriminant(Model):
         tells = ~self._metal_like(x, patch)
         own = [self._patch_covariance(k, pixels) for k in range(len(self.names))]
         offset, spread = self._reference_error(mean[tells], own)
-        q, cost = self._costs(self._wrapped(mean - offset), [c + spread for c in own])
+        more = np.zeros((len(ids), *spread.shape)) if errors is None or self.channels != "H+V+P" else errors[ids]
+        q, cost = self._costs(self._wrapped(mean - offset), [c + spread for c in own], more)
         at = np.arange(len(ids)), cost.argmin(axis=1)
         alone = [self._patch_covariance(k, 1.0) + spread for k in range(len(self.names))]
         pixel_q, pixel_cost = self._costs(self._wrapped(d - offset), alone)
@@ -192,12 +196,16 @@ class ErrorDiscriminant(Model):
         return [self._patch_covariance(k, 1.0) + self.scan for k in range(len(self.names))]
 
     @staticmethod
-    def _costs(d: Real, covariances: list[Real]) -> tuple[Real, Real]:
-        """Squared distances and minus twice the log likelihoods (less a constant), [n, materials]."""
-        inverse = np.linalg.inv(np.stack(covariances))
-        q = np.einsum("nkd,kde,nke->nk", d, inverse, d)
+    def _costs(d: Real, covariances: list[Real], more: Real | None = None) -> tuple[Real, Real]:
+        """Squared distances and minus twice the log likelihoods (less a constant), [n, materials].
+
+        `more` [n, d, d] comes to the covariance of each of n.
+        """
+        own = np.stack(covariances)
+        inverse = np.linalg.inv(own if more is None else own + more[:, None])
+        q = np.einsum("nkd,kde,nke->nk" if more is None else "nkd,nkde,nke->nk", d, inverse, d)
         log_det = -np.linalg.slogdet(inverse)[1]
-        return q, q + (log_det - log_det.mean())
+        return q, q + (log_det - log_det.mean(axis=-1, keepdims=True))
 
     def _set_thresholds(self, patches: Real, material: npt.NDArray, pixels: Real, of: npt.NDArray, dof: float) -> None:
         """Squared distances that known materials pass with probability REJECTED.

@@ -81,6 +81,8 @@ class Uncertain:
         Standard deviation of each real and imaginary part.
     leakage_measured
         Whether that is a measurement, or the prior of the mount.
+    channels_known
+        Whether the images' amplitudes are relative to the direct path.
     reference_std
         Relative standard deviation of metal's V / H, each part.
     brightness_std
@@ -91,6 +93,7 @@ class Uncertain:
     leakage: tuple[complex, complex] = (0j, 0j)
     leakage_std: float = 0.041
     leakage_measured: bool = False
+    channels_known: bool = False
     reference_std: float = 0.01
     brightness_std: float = BRIGHTNESS_STD
 
@@ -167,7 +170,7 @@ class Inversion:
 
 
 def true_ratio(inverse: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j) -> Complex:
-    """t of a measured V / H: the first formula of the module's text, solved for t."""
+    """T of a measured V / H: the first formula of the module's text, solved for t."""
     c = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + rho))
     return (c - b) / (1 - a * c)
 
@@ -179,7 +182,7 @@ def measured_ratio(t: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j) 
 
 
 def slope(t: npt.ArrayLike, theta_rad: float) -> Complex:
-    """d eps / d t of Eq. 3 by t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
+    """D eps / d t of Eq. 3 by t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
     t = np.asarray(t, np.complex128)
     return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
 
@@ -209,7 +212,7 @@ class _Model:
         return a, b, p.reference_std * complex(x[4], x[5]), p.theta_std_rad * float(x[6])
 
     def ratios(self, x: Real) -> Complex:
-        """t of every patch."""
+        """T of every patch."""
         own = x[_NUISANCES:].reshape(2, -1)
         return self.start + self.std * (own[0] + 1j * own[1])
 
@@ -276,7 +279,9 @@ def _solution(model: _Model, found: optimize.OptimizeResult) -> Inversion:
     a, b, _, error = model.nuisances(x)
     spread = prior.leakage_std * np.sqrt(np.diag(covariance)[:4])
     t = model.ratios(x)
-    patches = tuple(_estimate(model, x, jac, covariance, i, complex(t[i]), float(model.theta[i] + error)) for i in range(n))
+    patches = tuple(
+        _estimate(model, x, jac, covariance, i, complex(t[i]), float(model.theta[i] + error)) for i in range(n)
+    )
     return Inversion(
         patches,
         (a, b),
@@ -291,9 +296,7 @@ def _solution(model: _Model, found: optimize.OptimizeResult) -> Inversion:
     )
 
 
-def _estimate(
-    model: _Model, x: Real, jac: Real, covariance: Real, i: int, t: complex, theta: float
-) -> PatchEstimate:
+def _estimate(model: _Model, x: Real, jac: Real, covariance: Real, i: int, t: complex, theta: float) -> PatchEstimate:
     """One patch: its ratio and permittivity with covariance, and where that comes from."""
     at = [_NUISANCES + i, _NUISANCES + model.n + i]
     unit = model.std[i]
@@ -304,9 +307,11 @@ def _estimate(
     value = complex(permittivity_from_ratio(t, theta))
     by_t = complex(slope(t, theta)) * unit
     step = 1e-5
-    by_theta = complex(
-        permittivity_from_ratio(t, theta + step) - permittivity_from_ratio(t, theta - step)
-    ) / (2 * step) * model.prior.theta_std_rad
+    by_theta = (
+        complex(permittivity_from_ratio(t, theta + step) - permittivity_from_ratio(t, theta - step))
+        / (2 * step)
+        * model.prior.theta_std_rad
+    )
     # The permittivity's real and imaginary part by all parameters, [2, parameter].
     gradient = np.zeros((2, x.size))
     gradient[:, at[0]], gradient[:, at[1]] = (by_t.real, by_t.imag), (-by_t.imag, by_t.real)
@@ -354,3 +359,26 @@ def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real
             both = by[i] * np.conj(by[j])
             total += both.real * (block[0, 0] + block[1, 1]) + both.imag * (block[0, 1] - block[1, 0])
     return np.sqrt(np.maximum(total, 0.0) / 2)
+
+
+def feature_errors(found: Inversion, prior: Uncertain, i: int) -> Real:
+    """Covariance that leakage and metal reference leave in ln|H|, ln|V| and arg P of a patch, float64 [3, 3].
+
+    To first order in leakage about the solution: with s = r_s and t = r_p / r_s, h' = h - da p - ... (Eq. 8 and 9).
+    """
+    t = found.patches[i].inverse_ratio
+    c = found.nuisance_covariance[:6, :6]
+    # d ln h' = da (1 - t), d ln v' = db (1 - 1 / t): what p leaks into H, s into V, and metal at 1 in both; d ln q = rho.
+    own_t = t if abs(t) > 0.02 else 0.02 * np.exp(1j * np.angle(t))
+    by_h, by_v = np.array([1 - t, 0, 0]), np.array([0, 1 - 1 / own_t, 1])
+    scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
+
+    def both(by: Complex) -> tuple[Real, Real]:
+        """Real and imaginary part of sum(by * (x + j y)) by the six real parameters."""
+        real = np.stack([(by * scale).real, -(by * scale).imag], axis=1).ravel()
+        imag = np.stack([(by * scale).imag, (by * scale).real], axis=1).ravel()
+        return real, imag
+
+    (h, h_angle), (v, v_angle) = both(by_h), both(by_v)
+    rows = np.stack([h, v, h_angle - v_angle])
+    return rows @ c @ rows.T

@@ -27,7 +27,9 @@ CHANNEL_RATIO_STD_DB = 2.5
 """How far V over H of metal may lie from that of the direct path: the boards' antenna patterns differ off their axis."""
 _LARGEST = 10.0  # |eps| of common materials; beyond it costs
 _NEAR_METAL = 0.12  # |t - 1|: another piece of metal need not be a possible dielectric
-_STARTS = [complex(real, -real * loss) for real in (2.0, 2.6, 3.2, 4.0, 5.0, 7.0, 10.0) for loss in (0.01, 0.15, 0.4, 1.2)]
+_STARTS = [
+    complex(real, -real * loss) for real in (2.0, 2.6, 3.2, 4.0, 5.0, 7.0, 10.0) for loss in (0.01, 0.15, 0.4, 1.2)
+]
 _REFINED = 3
 _DEAR = 1e3
 

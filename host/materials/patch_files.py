@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from polysight.host.materials.analyse import MaterialsResult
 from polysight.host.materials.classify import features_of
+from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.samples import Real
 from polysight.host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
 from polysight.host.materials.truth import TruthPlate

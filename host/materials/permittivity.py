@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from polysight.host.materials.inversion import PatchEstimate
 from polysight.host.polarimetry import permittivity_from_ratio
 
 METAL_LIKE = 0.25
@@ -39,6 +41,10 @@ class Permittivity:
         |P - 1| of it, or |1/P - 1| if less.
     pixels
         Pixels used.
+    covariance
+        float64 [2, 2] of the real and the imaginary part by the scene's error budget; None where there is none.
+    shares
+        Source of error to its share of that covariance's trace.
     """
 
     value: complex | None
@@ -50,6 +56,23 @@ class Permittivity:
     inverse_std: float
     metal_distance: float
     pixels: int
+    covariance: npt.NDArray[np.float64] | None = None
+    shares: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def dominated_by(self) -> str | None:
+        """The source with the largest share of the error."""
+        return max(self.shares, key=lambda s: self.shares[s]) if self.shares else None
+
+    @property
+    def text(self) -> str:
+        """The value as a person reads it; empty without one."""
+        return "" if self.value is None else format_permittivity(self.value)
+
+    @property
+    def metal_like(self) -> bool:
+        """Whether P is known and too close to 1 for a permittivity."""
+        return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_LIKE
 
     @property
     def determinable(self) -> bool:
@@ -71,6 +94,10 @@ def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
     """
     real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))  # + 0.0: no -0.00
     return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
+
+
+NOTHING = Permittivity(None, None, None, None, None, complex(np.nan, np.nan), float("nan"), float("nan"), 0)
+"""Of a patch of which nothing is said."""
 
 
 def median_ratio(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> complex:
@@ -154,6 +181,44 @@ def estimate_permittivity(
         inverse_std,
         float(distance),
         n,
+    )
+
+
+def permittivity_of_patch(
+    h: npt.NDArray[np.complexfloating],
+    v: npt.NDArray[np.complexfloating],
+    theta_rad: float,
+    estimate: PatchEstimate | None,
+) -> Permittivity:
+    """Permittivity of one patch with the error budget of the joint inversion.
+
+    Parameters
+    ----------
+    h, v
+        complex [n], pixels of the interior, metal-referenced and leakage-corrected: they give the percentiles.
+    theta_rad
+        Incidence angle.
+    estimate
+        What the inversion found; None for a patch that it left out: no permittivity is given then.
+    """
+    alone = estimate_permittivity(h, v, theta_rad)
+    if estimate is None or estimate.permittivity is None or estimate.covariance is None:
+        return replace(alone, value=None, real_range=None, imag_range=None, real_std=None, loss_std=None)
+    ratio = 1 / estimate.inverse_ratio if estimate.inverse_ratio else complex(np.inf, 0.0)
+    real_std, loss_std = (float(s) for s in np.sqrt(np.diag(estimate.covariance)))
+    own = estimate.inverse_ratio_covariance
+    ranges = alone.real_range or (np.nan, np.nan), alone.imag_range or (np.nan, np.nan)
+    return replace(
+        alone,
+        value=estimate.permittivity,
+        real_range=ranges[0],
+        imag_range=ranges[1],
+        real_std=real_std,
+        loss_std=loss_std,
+        ratio=ratio,
+        inverse_std=float(np.sqrt(np.trace(own) / 2)),
+        covariance=estimate.covariance,
+        shares=estimate.shares,
     )
 
 

@@ -163,8 +163,11 @@ class Model(ABC):
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name of each pixel by nothing but itself, [n], and its distance over the threshold."""
 
-    def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
-        """Names in one scan, whose pixels lie in `patches` [n]; a patch is what most of its pixels are called."""
+    def by_scan(self, x: Real, patches: npt.NDArray, errors: Real | None = None) -> NamedScan:
+        """Names in one scan, whose pixels lie in `patches` [n]; a patch is what most of its pixels are called.
+
+        `errors` [patch, d, d] are covariances of the patches' features, for models that weigh them.
+        """
         return majority(*self.by_pixel(x), patches)
 
 

@@ -11,9 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages, SubBand
-from polysight.host.materials.analyse import MaterialsResult, Optics, reference_error, smooth_inside, to_metal
+from polysight.host.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
+from polysight.host.materials.inputs import Optics
 from polysight.host.materials.layers import Bands, Spectrum
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
+from polysight.host.materials.result import MaterialsResult
 from polysight.host.polarimetry import PlaneReference
 from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError
@@ -37,7 +39,7 @@ def with_bands(
     if not bands:
         return found
     parts = None if plane is None else plane.bands
-    return replace(found, bands=band_rows(found, bands, images, optics.leakage, optics.smooth_px, parts))
+    return replace(found, bands=band_rows(found, bands, images, found.inversion.leakage, optics.smooth_px, parts))
 
 
 def band_rows(
@@ -105,9 +107,9 @@ def _relative_to_metal(
         nothing = np.full(made.valid.shape, complex(np.nan, np.nan))
         return nothing, nothing, float("nan")
     h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (made.h, made.v))
-    relative = to_metal(h, v, metal, leakage, reference)
+    relative = without_leakage(to_metal(h, v, metal, reference), leakage)
     h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
-    return h, v, reference_error(h, v, metal, reference)
+    return h, v, reference_spread(h, v, metal, reference)
 
 
 def _seen(h: Image, v: Image, error: float) -> dict[str, Any]:

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.analyse import MaterialsResult
 from polysight.host.materials.classify import MODELS, PAPER, SLOW
 from polysight.host.materials.knn import fit_weights
 from polysight.host.materials.library import Entry, Library
+from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.samples import Real, Samples, majority
 from polysight.shared.errors import DataError
 

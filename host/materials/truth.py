@@ -99,7 +99,7 @@ def _plate(raw: Mapping[str, Any]) -> TruthPlate:
     return TruthPlate(str(raw["name"]), box, eps, None if thickness is None else float(thickness), metal)
 
 
-def match(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[int, TruthPlate]:
+def match_truth(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[int, TruthPlate]:
     """Plate of each patch label: the patch's middle lies in the plate, each plate goes to the nearest such patch."""
     pairs = []
     for plate in plates:

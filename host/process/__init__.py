@@ -4,6 +4,7 @@
 while rows are processed; `save_images` and `save_materials` write the products.
 """
 
+from polysight.host.process.judge import error_budget, judge, recording_verdict
 from polysight.host.process.quality import Quality
 from polysight.host.process.request import DrawnBoxes, Options, ProcessRequest
 from polysight.host.process.save import (
@@ -23,7 +24,10 @@ __all__ = [
     "Products",
     "Quality",
     "coverage_lines",
+    "error_budget",
+    "judge",
     "materials_content",
+    "recording_verdict",
     "save_images",
     "save_materials",
 ]

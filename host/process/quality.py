@@ -44,7 +44,38 @@ class BoardQuality:
             "masked_columns": masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
             "direct_hz": synced.direct_hz[synced.valid],
             "stages": synced.stages,
+            "direct_snr": _direct_snr(synced),
         }
+
+    @property
+    def positions(self) -> int:
+        """Positions of the rows that were recorded."""
+        return sum(r["positions"] for r in self.rows.values())
+
+    @property
+    def positions_masked(self) -> int:
+        """Those of them without usable data."""
+        return sum(r["positions_masked"] for r in self.rows.values())
+
+    @property
+    def frames_share(self) -> float:
+        """Share of the recorded rows' frames that were received whole."""
+        expected = sum(r["frames_expected"] for r in self.rows.values())
+        return sum(r["frames_received"] for r in self.rows.values()) / expected if expected else 0.0
+
+    @property
+    def direct_snr_db(self) -> float | None:
+        """Power of the direct path over that of noise, one sample of a position's average over chirps and RX, dB.
+
+        None where it is not known (cubes that were synchronised elsewhere).
+        """
+        values = np.concatenate([r["direct_snr"] for r in self.rows.values()]) if self.rows else np.zeros(0)
+        return float(10 * np.log10(np.median(values))) if values.size else None
+
+    def residual(self, stage: str) -> float | None:
+        """Standard deviation of the phase after a stage of synchronisation, radians; None where it is not known."""
+        found = [r["stages"][stage][1] for r in self.rows.values() if stage in r["stages"]]
+        return float(np.median(found)) if found else None
 
     def summary(self) -> dict[str, Any]:
         """Plain numbers for quality.json. Residuals are root mean squares over rows, weighted by valid positions."""
@@ -67,6 +98,8 @@ class BoardQuality:
                 "min": float(direct.min()),
                 "max": float(direct.max()),
             }
+        snr = self.direct_snr_db
+        total["direct_path_snr_db"] = None if snr is None else round(snr, 2)
         total["stage_backlash_mm"] = self._backlash()
         total["masked_columns"] = {row: r["masked_columns"] for row, r in self.rows.items() if r["masked_columns"]}
         total["rows_recorded"] = sorted(self.rows)
@@ -77,6 +110,15 @@ class BoardQuality:
         """How far odd rows lie towards +x of where the plan puts them, from the echoes; None where they do not tell."""
         found = estimate_backlash(self.echoes, self.rig)
         return None if found is None else {"shift": round(found.shift_mm, 4), "std": round(found.std_mm, 4)}
+
+
+def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
+    """Power of the direct path over that of noise in the average over chirps and RX, of the valid positions."""
+    if row.noise is None:
+        return np.zeros(0)
+    good = row.valid & np.isfinite(row.noise) & (row.noise > 0)
+    looks = row.chirps[good] * row.samples.shape[0]
+    return np.asarray(row.direct_amplitude[good] ** 2 / row.noise[good] * looks, np.float64)
 
 
 def masked_runs(masked: NDArray[np.bool_]) -> list[list[int]]:

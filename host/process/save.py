@@ -9,7 +9,7 @@ from typing import Any
 
 import tomli_w
 
-from polysight.host.imaging import ChannelImages
+from polysight.host.imaging import ChannelImages, PlaneEstimate
 from polysight.host.materials import (
     PATCHES,
     Classifier,
@@ -21,6 +21,7 @@ from polysight.host.materials import (
     write_labels,
 )
 from polysight.host.polarimetry import ratio
+from polysight.host.process.judge import error_budget, recording_verdict
 from polysight.host.process.quality import Quality
 from polysight.host.products import (
     IMAGE,
@@ -42,6 +43,7 @@ from polysight.host.report import (
     write_report,
 )
 from polysight.host.store import Scan, versions
+from polysight.host.verdict import NoResult, Verdict, verdict_of
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.shared.raster import RasterPlan
@@ -56,6 +58,12 @@ class Products:
 
     folder: Path
     lines: tuple[str, ...]
+    verdict: Verdict
+
+    @property
+    def exit_status(self) -> int:
+        """0; without a result that of `NoResult`."""
+        return 0 if self.verdict.usable else NoResult.exit_status
 
     def summary(self) -> str:
         """Text for the terminal."""
@@ -74,7 +82,11 @@ class Findings:
     images
         Both channels, valid where they were analysed.
     found
-        Patches, and what they are.
+        Patches, and what they are; nothing is said of them without a result.
+    verdict
+        How far all of it may be trusted.
+    plane
+        Where the plates lie.
     classifier
         What named them, if anything did.
     plates
@@ -83,6 +95,8 @@ class Findings:
 
     images: ChannelImages
     found: MaterialsResult
+    verdict: Verdict
+    plane: PlaneEstimate
     classifier: Classifier | None = None
     plates: tuple[TruthPlate, ...] = ()
 
@@ -95,7 +109,7 @@ def save_images(out: Path, scan: Scan, rig: Instrument, images: ChannelImages, q
     p = ratio(images.h, images.v)
     write_image(out / IMAGE, images.h, images.v, p, images.x_m, images.y_m, images.valid)
     write_scan_facts(out, scan, rig, images)
-    write_json(out / QUALITY, quality.to_dict())
+    write_json(out / QUALITY, quality.to_dict(verdict=verdict_of(recording_verdict(quality)).to_dict()))
 
 
 def save_materials(
@@ -107,16 +121,21 @@ def save_materials(
     """
     found, images, c = findings.found, findings.images, findings.found.calibrated
     accuracy = pixel_accuracy(found)
-    numbers = quality.to_dict(pixel_accuracy=accuracy)
-    write_image(out / IMAGE, c.h, c.v, c.p, images.x_m, images.y_m, images.valid)
+    numbers = quality.to_dict(verdict=findings.verdict.to_dict(), pixel_accuracy=accuracy)
+    sigma = found.p_sigma(images.valid)
+    write_image(out / IMAGE, c.h, c.v, c.p, images.x_m, images.y_m, images.valid, sigma)
     write_json(out / QUALITY, numbers)
     write_labels(out / LABELS, labels_of(found), f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, scan.simulated))
-    content = materials_content(scan, found, findings.classifier, unnamed)
+    content = materials_content(scan, findings, unnamed)
     write_json(out / MATERIALS, content)
     write_report(out, _report_context(scan, rig, findings, numbers, (content["library"], unnamed)))
-    lines = (*_lines(scan, found, content["segments"]), *coverage_lines(numbers["coverage"]))
-    return Products(out, (*lines, unnamed) if unnamed else lines)
+    lines = (
+        *findings.verdict.lines(3),
+        *_lines(scan, found, content["segments"]),
+        *coverage_lines(numbers["coverage"]),
+    )
+    return Products(out, (*lines, unnamed) if unnamed else lines, findings.verdict)
 
 
 def coverage_lines(coverage: dict[str, Any]) -> tuple[str, ...]:
@@ -125,13 +144,14 @@ def coverage_lines(coverage: dict[str, Any]) -> tuple[str, ...]:
     return (recorded_sentence(coverage), damaged) if damaged else (recorded_sentence(coverage),)
 
 
-def materials_content(
-    scan: Scan, found: MaterialsResult, classifier: Classifier | None, unnamed: str = ""
-) -> dict[str, Any]:
+def materials_content(scan: Scan, findings: Findings, unnamed: str = "") -> dict[str, Any]:
     """Content of materials.json; `unnamed` says why there is no classifier."""
+    found, classifier = findings.found, findings.classifier
     return {
         "scan_id": scan.scan_id,
         "simulated": scan.simulated,
+        "verdict": findings.verdict.to_dict(),
+        "error_budget": error_budget(found, findings.plane),
         "metal_reference": {"how": found.metal.how, "certain": found.metal.certain},
         "library": classifier_sentence(classifier) if classifier else unnamed or "Nothing was named.",
         "model": classifier.model if classifier else None,
@@ -179,13 +199,15 @@ def _config_summary(rig: Instrument) -> dict[str, Any]:
         "chirp": f"{c.first_sample_hz / 1e9:.3f} GHz + {c.swept_hz / 1e9:.3f} GHz in {c.samples} samples",
         "grid": f"{rig.grid.columns} x {rig.grid.rows} positions, {rig.grid.step_x_mm:g} x {rig.grid.step_y_mm:g} mm",
         "burst": f"{rig.burst.pulses} pulses, {rig.burst.period_us:g} us apart, stage at {rig.stage.speed_mm_s:g} mm/s",
-        "leakage removed": f"H {complex(*leak.leakage_h):.3g}, V {complex(*leak.leakage_v):.3g} (rig file)",
+        "leakage": "not measured"
+        if leak.leakage_std is None
+        else f"H {complex(*leak.leakage_h):.3g}, V {complex(*leak.leakage_v):.3g}, +- {leak.leakage_std:g} (rig file)",
     }
 
 
 def _lines(scan: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
     head = f"{'simulated ' if scan.simulated else ''}scan {scan.scan_id}: {len(rows)} patches; metal {found.metal.how}"
-    known = [r for r in rows if r["truth"] is not None and r["name"] is not None]
+    known = [r for r in rows if r["truth"] is not None and r["name"] is not None and not r["metal_reference"]]
     if not known:
         return (head,)
     right = sum(r["name"] == r["truth"]["name"] for r in known)

@@ -52,8 +52,11 @@ def write_image(
     x_m: npt.NDArray[np.float64],
     y_m: npt.NDArray[np.float64],
     valid: npt.NDArray[np.bool_],
+    p_sigma: npt.NDArray[np.floating] | None = None,
 ) -> None:
     """Write image.npz: h, v, p complex64 [ny, nx], x_m, y_m float64, valid bool; row 0 is the smallest y.
+
+    `p_sigma` float32 [ny, nx] is the standard deviation of p; None: not known, NaN everywhere.
 
     Raises
     ------
@@ -61,7 +64,8 @@ def write_image(
         when shapes do not fit each other.
     """
     shape = (np.size(y_m), np.size(x_m))
-    for name, array in (("h", h), ("v", v), ("p", p), ("valid", valid)):
+    sigma = np.full(shape, np.nan, np.float32) if p_sigma is None else p_sigma
+    for name, array in (("h", h), ("v", v), ("p", p), ("valid", valid), ("p_sigma", sigma)):
         if array.shape != shape:
             raise DataError(f"image {name} has shape {array.shape}, axes say {shape}")
     buffer = io.BytesIO()
@@ -73,6 +77,7 @@ def write_image(
         x_m=np.asarray(x_m, np.float64),
         y_m=np.asarray(y_m, np.float64),
         valid=valid.astype(np.bool_),
+        p_sigma=sigma.astype(np.float32),
     )
     write_atomically(path, buffer.getvalue())
 

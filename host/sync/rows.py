@@ -44,6 +44,11 @@ class RowSynchroniser:
         words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, rig.chirp.samples)
         return synchronise_row(words, valid, self.setups[board]), int(valid.sum())
 
+    @property
+    def direct_path_known(self) -> bool:
+        """Whether the rows' amplitudes are relative to the direct path; not of cubes that lack it."""
+        return not any(form.constant.any() for form in self._forms.values())
+
     def recording_facts(self) -> dict[str, Any]:
         """What quality.json says of how the scan was recorded, and of the form of its cubes."""
         facts = self._source.recording_facts()

@@ -16,10 +16,10 @@ FEW_POSITIONS = 0.5
 """Share of absent or masked positions from which nothing can be said of the scene."""
 SOME_POSITIONS = 0.02
 """Share of absent or masked positions that is worth a word."""
-DIRECT_SNR_NONE_DB = 6.0
-"""Direct path over noise, all chirps and receivers of a position together, below which there is none."""
-DIRECT_SNR_CARE_DB = 27.0
-"""The published rig has 35 dB; 27 dB leave a phase error of 0.03 rad."""
+DIRECT_SNR_NONE_DB = 3.0
+"""Direct path over noise, all chirps and receivers of a position together, below which there is none; one sample."""
+DIRECT_SNR_CARE_DB = 17.0
+"""The simulated rig has 23.5 dB; 12 dB less are a path that is nearly blocked."""
 DIRECT_LEVELS = (0.4, 3.0)
 """Metal's brightness beside the direct path: the published rig's echo and direct path lie within a factor of 1.5."""
 DIRECT_PHASE_CARE_RAD = 0.05
@@ -46,10 +46,10 @@ class Coverage:
     def of(cls, coverage: Mapping[str, object]) -> Coverage:
         """From `coverage` of quality.json."""
         manifest = coverage.get("manifest", ())
-        return cls(
-            *(int(str(coverage[k])) for k in ("rows_planned", "rows_recorded", "frames_planned", "frames_received")),
-            tuple(map(str, manifest)) if isinstance(manifest, list | tuple) else (),
-        )
+        faults = tuple(map(str, manifest)) if isinstance(manifest, list | tuple) else ()
+        keys = ("rows_planned", "rows_recorded", "frames_planned", "frames_received")
+        rows, recorded, frames, received = (int(str(coverage[k])) for k in keys)
+        return cls(rows, recorded, frames, received, faults)
 
 
 def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Reason]:
@@ -65,7 +65,9 @@ def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Rea
             "`polysight resume SCAN` takes the missing rows", 5 + absent,
         ))  # fmt: skip
     out += [
-        Reason("care", fault, "a row that was recorded is not in the images", "`polysight validate SCAN` says more", 6.0)
+        Reason(
+            "care", fault, "a row that was recorded is not in the images", "`polysight validate SCAN` says more", 6.0
+        )
         for fault in coverage.manifest
     ]
     frames = 1 - coverage.frames_received / coverage.frames_planned if coverage.frames_planned else 1.0
@@ -90,7 +92,7 @@ def direct_path_reasons(board: str, snr_db: float | None, phase_rad: float | Non
     out = []
     if snr_db is not None and snr_db < DIRECT_SNR_CARE_DB:
         out.append(Reason(
-            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise (35 dB are usual)",
+            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise (23 dB are usual)",
             "it is partly blocked, or the antennas look elsewhere; it is the reference of every phase",
             "clear the line of sight; check the antennas' aim", 3.0,
         ))  # fmt: skip

@@ -14,7 +14,7 @@ LEVELS: dict[Level, str] = {"good": "good", "care": "usable with care", "none": 
 _ORDER: tuple[Level, ...] = ("none", "care", "good")
 
 
-class NoResult(PolysightError):
+class NoResult(PolysightError):  # noqa: N818 (it is a result, told as an error ends a command)
     """The data do not support any material or permittivity; images are kept. Commands exit with this status."""
 
     exit_status = 7

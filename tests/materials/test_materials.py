@@ -95,11 +95,11 @@ def test_at_least_eight_of_nine_named_right(synthetic, library):
     classifier = Classifier(library)
     for seed in range(5):
         result = synthetic(seed).analyse(classifier=classifier)
-        right = sum(r.verdict.name == r.truth.name for r in result.patches)
-        assert len(result.patches) == 9
-        assert right >= 8
+        named = [r for r in result.patches if r.verdict is not None]
+        assert len(named) == 8  # the metal reference is not named by itself
+        assert sum(r.verdict.name == r.truth.name for r in named) >= 7
         assert pixel_accuracy(result) > 0.75
-        for r in result.patches:
+        for r in named:
             assert 0 < r.verdict.confidence <= 1
             assert sum(r.verdict.votes.values()) == pytest.approx(1)
 
@@ -114,10 +114,10 @@ def test_polarimetry_beats_one_channel(library):
 def test_far_material_is_unknown(synthetic, library):
     strange = {"copper": None, "water": 9.37 - 18.0j, "foam": 1.3 - 0.0j, "rubber": 5.06 - 1.11j}
     result = synthetic(11, strange, noise=0.002).analyse(classifier=Classifier(library))
-    names = {r.truth.name: r.verdict.name for r in result.patches if r.truth}
+    names = {r.truth.name: r.verdict.name for r in result.patches if r.truth and r.verdict}
     assert names["water"] == UNKNOWN
     assert names["rubber"] == "rubber"
-    assert names["copper"] == "copper"
+    assert "copper" not in names  # the reference
 
 
 def test_one_scan_is_not_enough_and_splits_are_by_scan(library):

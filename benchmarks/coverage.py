@@ -1,0 +1,259 @@
+"""Do the error bars hold? Simulated scenes with drawn nuisances, judged by the program; coverage of its regions.
+
+Every scene is drawn anew: materials with their specimens' spread, leakage of any phase, the plane's distance and tilt,
+each plate's tilt, height and roughness, a weak or strong direct path, metal in the scene or scanned on its own. Most
+scenes start from samples as perfect synchronisation leaves them (`synced_cube`), some from raw data. All is simulated,
+by simulators that share nothing with the host's optics; what it says of a real rig is an expectation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polysight.data import packaged
+from polysight.host.imaging import PlaneEstimate
+from polysight.host.materials import MetalChoice, match_truth, truth_plates
+from polysight.host.pipeline import Pipeline
+from polysight.host.polarimetry import PlaneReference, plane_reference
+from polysight.host.process import Findings, Options
+from polysight.host.store import CubeRow, open_source
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.raster import RasterPlan, plan_raster
+from polysight.simulators.scene import decode_scene, synced_cube
+from polysight.simulators.scene.scene_file import Scene, apply_scene
+from polysight.simulators.scene.simulated_scan import simulate, truth
+
+MATERIALS: dict[str, tuple[float, float]] = {
+    "wood": (2.61, 0.01), "PTFE": (2.05, 0.005), "PET": (3.78, 0.7), "acrylic": (4.0, 0.4), "cardboard": (4.54, 0.56),
+    "glass fibre": (4.69, 0.7), "rubber": (5.06, 1.11), "silicone": (3.52, 0.82), "ceramic": (4.75, 2.43),
+    "liquid behind glass": (3.66, 0.43), "glass": (6.3, 0.2), "marble": (7.5, 0.25),
+}  # fmt: skip
+CLASSES = {"low loss": 0.05, "medium": 0.18, "lossy": np.inf}
+"""Material classes by their loss tangent's upper end."""
+GRID = {"columns": 45, "rows": 43, "step_x_mm": 10.0, "step_y_mm": 6.0}
+PLACES = [(x, y) for y in (-34.0, 34.0) for x in (-66.0, 0.0, 66.0)]
+KINDS = ("full", "no metal", "no direct path", "noise", "empty")
+CHI2_68, CHI2_95 = 2.279, 5.991
+
+
+@dataclass(frozen=True)
+class PatchFigures:
+    """One judged patch: squared distance of the truth in its region, errors, and what it was named."""
+
+    scene: int
+    material: str
+    kind: str
+    distance2: float
+    relative_error: float
+    relative_std: float
+    smallest_std: float
+    leakage_measured: bool
+    metal_in_scene: bool
+    level: str
+    name: str | None = None
+    probability: float | None = None
+
+
+class Cubes:
+    """A scene as a source of rows that were synchronised already, in memory."""
+
+    mirrored, synchronised, manifest_faults, simulated = False, True, (), True
+
+    def __init__(self, rig: Instrument, scene: Scene, drop_rows: int = 0) -> None:
+        self.instrument: Instrument = apply_scene(rig, scene)
+        self.plan: RasterPlan = plan_raster(self.instrument.grid)
+        self.scan_id, self._drop = scene.name, drop_rows
+        self._cubes = {b.name: synced_cube(rig, scene, b.name) for b in self.instrument.receivers}
+
+    def rows(self) -> Iterator[int]:
+        """All rows of the plan, but the last ones that were dropped."""
+        yield from range(self.plan.rows - self._drop)
+
+    def read_row(self, board_name: str, row: int) -> CubeRow:
+        """One row, positions as they were met."""
+        cube = self._cubes[board_name][:, row]
+        return CubeRow(np.ascontiguousarray(cube[:, :: self.plan.row(row).direction]))
+
+    def recording_facts(self) -> dict[str, Any]:
+        """Nothing is known of the recording."""
+        return {"recording": {}}
+
+
+def draw_scene(seed: int, kind: str = "full") -> Scene:
+    """A scene of six plates, or of what `kind` says, with every nuisance drawn."""
+    rng = np.random.default_rng([20261122, seed, KINDS.index(kind)])
+    leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
+    names = rng.choice(list(MATERIALS), len(PLACES), replace=False).tolist()
+    metal = None if kind == "no metal" or (kind == "full" and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
+    tilted, plates = rng.random() < 0.5, []
+    for i, (x, y) in enumerate(PLACES):
+        place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
+        relief = {"height_mm": rng.uniform(-0.5, 0.5), "tilt_deg": (rng.uniform(-1, 1, 2) * tilted).tolist()}
+        what = {"name": "metal", "metal": True} if i == metal else {
+            "name": names[i], "permittivity": list(MATERIALS[names[i]]), "rough_mm": rng.uniform(0, 0.2)}  # fmt: skip
+        plates.append({**place, **relief, **what})
+    if kind == "no metal":
+        plates = plates[: int(rng.integers(1, len(PLACES) + 1))]
+    measured = 0.003 if rng.random() < 0.5 else None
+    return decode_scene(
+        {
+            "name": f"drawn {kind} {seed}", "seed": 1000 + seed, "grid": GRID, "object_distance_mm": 499.0,
+            "image": {"columns": 116, "rows": 90},
+            "specimen_spread": [0.03, 0.3], "plane_shift_mm": rng.uniform(-10, 10),
+            "plane_tilt_deg": (rng.uniform(-1, 1, 2) * (not tilted)).tolist(),
+            "plates": [] if kind in ("empty", "noise") else plates,
+            "disturbances": {
+                "leakage_h": [leak[0].real, leak[0].imag], "leakage_v": [leak[1].real, leak[1].imag],
+                "direct_loss_db": "absent" if kind in ("no direct path", "noise") else rng.uniform(-6, 12),
+            } | ({} if measured is None else {"leakage_measured": measured}),
+        },
+        "drawn",
+    )  # fmt: skip
+
+
+def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
+    """A metal plate over the plane, on the rig file's plane, with the scene's rig: the same leakage and gains."""
+    plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
+    whole = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
+    import msgspec
+
+    alone = msgspec.structs.replace(scene, plates=whole, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
+    pipeline = _imaged(Cubes(rig, alone))
+    images = pipeline.form_images()
+    found = plane_reference(images.h, images.v, images.x_m, images.y_m, images.valid)
+    return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
+
+
+def _imaged(source: Any) -> Pipeline:
+    pipeline = Pipeline(source)
+    for row in source.rows():
+        pipeline.add_row(row)
+    return pipeline
+
+
+def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
+    """One scene, drawn, simulated and judged."""
+    rig, scene = load_instrument(packaged(Path("instrument.toml"))), draw_scene(seed, kind)
+    options = Options(model="none")
+    if kind == "full" and not any(p.metal for p in scene.plates):
+        options = replace(options, reference=metal_scan(rig, scene))
+    if raw or kind in ("no direct path", "noise"):
+        with tempfile.TemporaryDirectory(prefix="polysight-coverage-") as folder:
+            simulate(rig, scene, Path(folder) / "scan")
+            pipeline = _imaged(open_source(Path(folder) / "scan", None))
+            findings = pipeline.examine(pipeline.form_images(), options)
+    else:
+        pipeline = _imaged(Cubes(rig, scene))
+        findings = pipeline.examine(pipeline.form_images(), options)
+    return scene, apply_scene(rig, scene), findings, pipeline.plane
+
+
+def figures(seed: int, raw: bool = False) -> list[PatchFigures]:
+    """What coverage is counted from: the patches of one full scene."""
+    scene, rig, findings, _ = judged(seed, "full", raw)
+    plates, found = truth_plates(truth(rig, scene, scene.seed)), findings.found
+    true, out = match_truth([r.patch for r in found.patches], plates), []
+    for r in found.patches:
+        e, plate = r.permittivity, true.get(r.patch.label)
+        if plate is None or plate.permittivity is None or e.value is None or e.covariance is None or r.refused:
+            continue
+        away = np.array([(e.value - plate.permittivity).real, (e.value - plate.permittivity).imag])
+        size, tangent = abs(plate.permittivity), -plate.permittivity.imag / plate.permittivity.real
+        values = np.linalg.eigvalsh(e.covariance)
+        out.append(
+            PatchFigures(
+                seed, plate.name, next(k for k, top in CLASSES.items() if tangent <= top),
+                float(away @ np.linalg.solve(e.covariance, away)), float(np.hypot(*away)) / size,
+                float(np.sqrt(values.mean())) / size, float(np.sqrt(values[0])) / size,
+                found.prior.leakage_measured, any(p.metal for p in scene.plates), findings.verdict.level,
+            )
+        )  # fmt: skip
+    return out
+
+
+def _table(rows: list[PatchFigures], what: str) -> dict[str, float]:
+    d = np.array([r.distance2 for r in rows])
+    if d.size == 0:
+        return {}
+    entry = {
+        "patches": float(d.size), "in_68": float(np.mean(d < CHI2_68)), "in_95": float(np.mean(d < CHI2_95)),
+        "rms_z": float(np.sqrt(np.mean(d) / 2)), "median_error": float(np.median([r.relative_error for r in rows])),
+        "median_std": float(np.median([r.relative_std for r in rows])),
+    }  # fmt: skip
+    print(
+        f"{what:36s} {d.size:5d} patches   68 %: {100 * entry['in_68']:5.1f}   95 %: {100 * entry['in_95']:5.1f}"
+        f"   rms z {entry['rms_z']:.2f}   median error {100 * entry['median_error']:.1f} %,"
+        f" stated {100 * entry['median_std']:.1f} %",
+        flush=True,
+    )
+    return entry
+
+
+def _one(job: tuple[int, bool]) -> list[PatchFigures]:
+    return figures(*job)
+
+
+def _without(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
+    seed, kind = job
+    _, _, findings, _ = judged(seed, kind)
+    rows = findings.found.rows()
+    said = sum(r["name"] is not None or r["permittivity"] is not None for r in rows)
+    reason = findings.verdict.reasons[0].what if findings.verdict.reasons else ""
+    return kind, seed, findings.verdict.level, said, reason
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument("--scenes", type=int, default=40, help="full scenes, from samples (default: 40)")
+    parser.add_argument("--raw", type=int, default=4, help="full scenes from raw data (default: 4)")
+    parser.add_argument("--without", type=int, default=20, help="scenes that hold nothing to name (default: 20)")
+    parser.add_argument("--first", type=int, default=0, help="number of the first scene (default: 0)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
+    parser.add_argument("--json", type=Path, default=None, help="write every patch here")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the tables; 1 when a scene without anything to name got a name or a permittivity."""
+    jobs = [(args.first + i, False) for i in range(args.scenes)] + [(args.first + i, True) for i in range(args.raw)]
+    print("simulated scenes; regions of the permittivity (real and imaginary part together)")
+    with ProcessPoolExecutor(args.jobs) as pool:
+        found = list(pool.map(_one, jobs))
+        kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
+        without = list(pool.map(_without, kinds))
+    rows = [r for one in found[: args.scenes] for r in one]
+    raw = [r for one in found[args.scenes :] for r in one]
+    out: dict[str, Any] = {"all": _table(rows, "all, from samples")}
+    out["raw"] = _table(raw, "all, from raw data")
+    for name in CLASSES:
+        out[name] = _table([r for r in rows if r.kind == name], f"  {name}")
+    for measured in (True, False):
+        what = f"  leakage {'measured' if measured else 'not measured'}"
+        out[what.strip()] = _table([r for r in rows if r.leakage_measured == measured], what)
+    for inside in (True, False):
+        what = f"  metal {'in the scene' if inside else 'scanned on its own'}"
+        out[what.strip()] = _table([r for r in rows if r.metal_in_scene == inside], what)
+    same = {(r.scene, r.material): r for r in rows}
+    apart = [abs(r.relative_error - same[r.scene, r.material].relative_error) for r in raw if (r.scene, r.material) in same]
+    if apart:
+        print(f"raw beside samples: errors of the same patches differ by {100 * float(np.median(apart)):.2f} % (median)")
+    said = [w for w in without if w[3] or w[2] != "none"]
+    print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")
+    for w in said:
+        print("   ", w)
+    if args.json is not None:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        content = {"summary": out, "patches": [asdict(r) for r in rows + raw], "without": without}
+        args.json.write_text(json.dumps(content, indent=1) + "\n")
+    return int(any(w[3] for w in said))
+
+
+__all__ = ["MetalChoice", "add_arguments", "draw_scene", "figures", "judged", "run"]

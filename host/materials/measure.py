@@ -1,0 +1,133 @@
+"""What is measured of each patch, with its standard deviation; and which patches are no plates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from polysight.host.materials.inversion import Seen
+from polysight.host.materials.permittivity import inverse_spread, median_ratio
+from polysight.host.materials.segment import Mask, Patch, Segmentation
+
+Image = npt.NDArray[np.complexfloating]
+
+SPREAD_SHARE = 0.6
+"""Error of a patch's V / H beside the spread of its pixels: speckle averages out, edges and neighbours' sidelobes do not.
+
+Simulated (benchmarks/coverage): 0.5 on smooth plates, 0.6 with roughness and tilt.
+"""
+LEAST_STD = 2e-3
+"""Error of V / H that is there however even the pixels are: H and V are lit from points some 15 mm apart."""
+LEAST_PIXELS = 12
+FLAT_CONTRAST = 0.4
+"""Standard deviation of |H| over its mean in a patch: 0.52 is noise or speckle, a plate stays below 0.25."""
+LEAST_LEVEL = 2.0
+"""|H| beside the background's root mean square."""
+ODD_SHARE, ODD_RATIO = 0.15, 0.15
+"""Several kinds together: so many pixels whose V / H is so far from the median's."""
+_AROUND_PX = 6  # of patches, that is not background
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why nothing is said of a patch."""
+
+    what: str
+    why: str
+    do: str
+
+    def to_dict(self) -> dict[str, str]:
+        """Plain values, for JSON."""
+        return {"what": self.what, "why": self.why, "do": self.do}
+
+
+def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[float, float]:
+    """Root mean square of |H| and |V| away from all patches: noise and sidelobes. NaN where there is no such place."""
+    away = usable & np.isfinite(h) & np.isfinite(v)
+    for patch in found.patches:
+        away &= ~np.asarray(ndimage.binary_dilation(patch.mask, iterations=_AROUND_PX), bool)
+    if not away.any():
+        return float("nan"), float("nan")
+    levels = [float(np.sqrt(np.mean(np.abs(c[away].astype(np.complex128)) ** 2))) for c in (h, v)]
+    return levels[0], levels[1]
+
+
+def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refused | None:
+    """Why a patch is no plate; None when it may be one.
+
+    Parameters
+    ----------
+    patch
+        The patch.
+    h, v
+        complex [ny, nx], relative to metal (or to anything), smoothed inside patches.
+    dark
+        Of :func:`background`, in the same units.
+    """
+    at = patch.interior & np.isfinite(h) & np.isfinite(v)
+    move = "check the image, the direct path and the range profile"
+    if int(at.sum()) < LEAST_PIXELS:
+        return Refused(
+            "too few pixels", f"{int(at.sum())} lie inside its edges", "scan a larger plate, or finer pixels"
+        )
+    level = np.abs(h[at]).astype(np.float64)
+    if not level.mean() > 0:
+        return Refused("no signal", "H is zero there", move)
+    if float(level.std() / level.mean()) > FLAT_CONTRAST:
+        return Refused("noise or speckle, not a flat plate", "its brightness varies as noise does", move)
+    if np.isfinite(dark[0]) and float(np.median(level)) < LEAST_LEVEL * dark[0]:
+        return Refused("as dark as the background", "it does not stand out from noise and sidelobes", move)
+    cross = abs(np.vdot(h[at].astype(np.complex128), v[at]))
+    power_h, power_v = (float(np.sum(np.abs(c[at].astype(np.complex128)) ** 2)) for c in (h, v))
+    dim = float(np.median(np.abs(v[at]))) < 0.12 * float(np.median(level))
+    if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
+        return Refused("H and V do not agree", "their phases differ from pixel to pixel, as in noise", move)
+    odd = np.abs(v[at] / h[at] - 1 / median_ratio(h[at], v[at])) > ODD_RATIO
+    if float(odd.mean()) > ODD_SHARE:
+        what = "several kinds together"
+        return Refused(
+            what, f"{100 * odd.mean():.0f} % of its pixels have another ratio", "move the plates apart, or draw boxes"
+        )
+    return None
+
+
+def seen(patch: Patch, h: Image, v: Image, theta_rad: float) -> Seen:
+    """A patch's ratio, its standard deviation, and its brightness."""
+    at = patch.interior
+    ratio = median_ratio(h[at], v[at])
+    inverse = 1 / ratio if ratio else complex(np.inf, 0.0)
+    spread = inverse_spread(h[at], v[at])
+    level = np.abs(h[at])
+    level = level[np.isfinite(level)]
+    std = float(np.hypot(SPREAD_SHARE * spread, LEAST_STD)) if np.isfinite(spread) else float("inf")
+    return Seen(inverse, std, theta_rad, float(np.median(level)) if level.size else None)
+
+
+def reference_std(spread: float) -> float:
+    """Relative standard deviation of metal's V / H from the spread of its own pixels."""
+    return float(np.hypot(SPREAD_SHARE * spread, LEAST_STD)) if np.isfinite(spread) else LEAST_STD
+
+
+def all_refused(patches: Sequence[Patch], h: Image, v: Image, dark: tuple[float, float]) -> dict[int, Refused]:
+    """Patch number to why it is no plate, for those that are none."""
+    found = ((p.label, refused(p, h, v, dark)) for p in patches)
+    return {label: why for label, why in found if why is not None}
+
+
+def ratio_sigma(
+    h: Image, v: Image, dark: tuple[float, float], systematic: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float32]:
+    """Standard deviation of each pixel's P = H / V, root of the mean of both parts' variance, float32 [ny, nx].
+
+    The error of 1 / P = V / H is that of the background (noise and sidelobes) beside |H|, and what leakage and metal
+    reference leave, `systematic` [ny, nx]; by dP = -P^2 d(1/P). Not a number where P is none.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = v.astype(np.complex128) / h
+        noise = np.hypot(dark[1], np.abs(inverse) * dark[0]) / np.abs(h) / np.sqrt(2)
+        sigma = np.hypot(np.nan_to_num(noise), systematic) / np.abs(inverse) ** 2
+    return np.where(np.isfinite(sigma) & np.isfinite(h) & np.isfinite(v), sigma, np.nan).astype(np.float32)

@@ -1,0 +1,196 @@
+"""What `analyse` returns: everything found about each patch, and its rows for materials.json."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.host.materials.classify import NamedPatch, Verdict
+from polysight.host.materials.inversion import Inversion, Uncertain, ratio_error
+from polysight.host.materials.measure import Refused, background, ratio_sigma
+from polysight.host.materials.metal import MetalReference
+from polysight.host.materials.permittivity import NOTHING, Permittivity
+from polysight.host.materials.segment import Patch, Segmentation
+from polysight.host.materials.truth import TruthPlate
+from polysight.host.polarimetry import Calibrated
+
+Image = npt.NDArray[np.complexfloating]
+SHRINKS = {
+    "noise": "a larger plate, a finer grid or more pulses a position",
+    "metal reference": "a larger metal plate, or `polysight calibrate metal`",
+    "leakage": "measure leakage with metal strips: `polysight leakage`",
+    "incidence": "measure where the antennas are: `polysight calibrate direct-path`",
+    "brightness": "measure leakage with metal strips: `polysight leakage`",
+}
+"""Source of error to the measurement that would shrink it."""
+
+
+@dataclass(frozen=True)
+class PatchResult:
+    """One patch with everything found about it.
+
+    Attributes
+    ----------
+    patch, permittivity
+        Where it is, and what it is made of.
+    named
+        What it and its pixels were called; None when it was not named (no classifier, the metal reference).
+    truth
+        What it really is, where that is known.
+    refused
+        Why nothing is said of it; None when something is.
+    """
+
+    patch: Patch
+    permittivity: Permittivity
+    named: NamedPatch | None = None
+    truth: TruthPlate | None = None
+    refused: Refused | None = None
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """Its name, how sure, and the pixels' votes; None when it was not named, or nothing is said of it."""
+        return None if self.named is None or self.refused is not None else self.named.verdict
+
+    @property
+    def names(self) -> npt.NDArray[np.str_] | None:
+        """Names of the interior's pixels, in image order."""
+        return None if self.named is None or self.refused is not None else self.named.names
+
+
+@dataclass(frozen=True)
+class MaterialsResult:
+    """Everything found in one image pair.
+
+    Attributes
+    ----------
+    calibrated
+        Metal-referenced, leakage-corrected channels [ny, nx], not smoothed.
+    h, v, p
+        The same after the Gaussian filter inside each patch: the features of classification and permittivity. Not a
+        number outside the patches' interiors, so that no edge and no neighbour gets into a material's pixels.
+    metal
+        The reference and how it was chosen.
+    segmentation
+        Patches and label image.
+    patches
+        What each patch is.
+    theta_rad
+        Incidence angle, a number or [ny, nx].
+    inversion, prior
+        The joint inversion of all patches, and what was known of the rig before.
+    bands
+        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.sub_bands`); empty when not
+        asked for.
+    boxes
+        Patch number to the name of the box drawn by hand; empty when the patches were found.
+    withheld
+        Whether the verdict is `no result`: rows hold no name, no ratio and no permittivity then.
+    """
+
+    calibrated: Calibrated
+    h: Image
+    v: Image
+    p: Image
+    metal: MetalReference
+    segmentation: Segmentation
+    patches: tuple[PatchResult, ...]
+    theta_rad: npt.NDArray[np.float64]
+    inversion: Inversion
+    prior: Uncertain
+    bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
+    boxes: dict[int, str] = field(default_factory=dict)
+    withheld: bool = False
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""
+        return [self._row(r) for r in self.patches]
+
+    def without_result(self) -> MaterialsResult:
+        """The same patches with nothing said of them: no name, no ratio, no permittivity, no metal reference."""
+        patches = tuple(replace(r, permittivity=NOTHING, named=None) for r in self.patches)
+        metal = replace(self.metal, label=None, given=False, how=f"none ({self.metal.how})")
+        return replace(self, patches=patches, metal=metal, bands={}, withheld=True)
+
+    def p_sigma(self, usable: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
+        """Standard deviation of each pixel's P, float32 [ny, nx]: not a number without a result, or outside `usable`."""
+        h, v = self.calibrated.h, self.calibrated.v
+        if self.withheld:
+            return np.full(h.shape, np.nan, np.float32)
+        dark = background(h, v, self.segmentation, usable)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = np.where(usable, v / h, np.nan)
+        return ratio_sigma(h, v, dark, ratio_error(self.inversion, self.prior, inverse))
+
+    def incidence_deg(self, patch: Patch) -> float:
+        """Mean incidence angle over a patch's interior, degrees."""
+        inside = self.theta_rad[patch.interior] if self.theta_rad.ndim and patch.interior.any() else self.theta_rad
+        return float(np.degrees(np.mean(inside)))
+
+    def _row(self, r: PatchResult) -> dict[str, Any]:
+        row = _row(r, self.metal, self.incidence_deg(r.patch))
+        if self.withheld:
+            return row | {"amplitude_h": None}
+        level = np.abs(self.h[r.patch.interior])
+        level = level[np.isfinite(level)]
+        row["amplitude_h"] = round(float(np.median(level)), 6) if level.size else None
+        if r.patch.label in self.bands:
+            row["bands"] = self.bands[r.patch.label]
+        if r.patch.label in self.boxes:
+            row["box"] = self.boxes[r.patch.label]
+        return row
+
+
+def _complex(z: complex | None) -> dict[str, float] | None:
+    if z is None or not (math.isfinite(z.real) and math.isfinite(z.imag)):
+        return None
+    return {"real": z.real, "imag": z.imag}
+
+
+def _row(r: PatchResult, metal: MetalReference, incidence_deg: float) -> dict[str, Any]:
+    e, v = r.permittivity, r.verdict
+    permittivity = None
+    if e.value is not None and e.real_range is not None and e.imag_range is not None and r.refused is None:
+        permittivity = {
+            "real": e.value.real,
+            "imag": e.value.imag,
+            "real_p30_p70": list(e.real_range),
+            "imag_p30_p70": list(e.imag_range),
+            "real_std": e.real_std,
+            "imag_std": e.loss_std,
+            "covariance": None if e.covariance is None else e.covariance.tolist(),
+            "shares": dict(e.shares),
+            "dominated_by": e.dominated_by,
+            "do": SHRINKS.get(e.dominated_by or "", ""),
+        }
+    truth = None
+    if r.truth is not None:
+        truth = {
+            "name": r.truth.name,
+            "metal": r.truth.metal,
+            "permittivity": _complex(r.truth.permittivity),
+            "thickness_mm": r.truth.thickness_mm,
+        }
+    return {
+        "label": r.patch.label,
+        "name": v.name if v else None,
+        "confidence": v.confidence if v else None,
+        "votes": v.votes if v else {},
+        "distance": v.distance if v and math.isfinite(v.distance) else None,
+        "metal_reference": r.patch.label == metal.label,
+        "box_mm": [round(b, 3) for b in r.patch.box_mm],
+        "outline_mm": [[round(float(x), 2), round(float(y), 2)] for x, y in r.patch.outline_mm],
+        "pixels": r.patch.pixels,
+        "interior_pixels": e.pixels,
+        "incidence_deg": incidence_deg,
+        "ratio": _complex(e.ratio),
+        "inverse_ratio_std": e.inverse_std if math.isfinite(e.inverse_std) else None,
+        "permittivity": permittivity,
+        "metal_like": e.metal_like and r.refused is None,
+        "refused": None if r.refused is None else r.refused.to_dict(),
+        "truth": truth,
+    }

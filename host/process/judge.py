@@ -1,0 +1,127 @@
+"""The verdict on a processed scan: which evidence of the scan, the rig and the scene speaks for and against it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from polysight.host.imaging import PlaneEstimate
+from polysight.host.materials import Classifier, MaterialsResult
+from polysight.host.process.quality import Quality
+from polysight.host.verdict import (
+    Coverage,
+    Reason,
+    Verdict,
+    direct_path_reasons,
+    incidence_reasons,
+    leakage_reasons,
+    level_reasons,
+    metal_reasons,
+    passivity_reasons,
+    plane_reasons,
+    recording_reasons,
+    signal_reasons,
+    verdict_of,
+)
+
+GAIN = ("it would amplify beyond its error bar", "its permittivity would be below that of air")
+
+
+def recording_verdict(quality: Quality) -> list[Reason]:
+    """Reasons from how the scan was recorded and synchronised: rows, frames, manifest, direct path of each board."""
+    coverage = Coverage.of(quality.coverage())
+    positions = sum(b.positions for b in quality.boards.values())
+    masked = sum(b.positions_masked for b in quality.boards.values())
+    missing: list[Reason] = []
+    for name, board in quality.boards.items():
+        share = 1 - board.positions_masked / board.positions if board.positions else 0.0
+        # Positions without a whole frame have no direct path either: that is the recording's fault, not the path's.
+        received = board.frames_share
+        missing += direct_path_reasons(
+            name, board.direct_snr_db, board.residual("averaged"), share / received if received else 1.0
+        )
+    recorded = recording_reasons(coverage, masked / positions if positions else 1.0)
+    return recorded + missing
+
+
+def judge(
+    quality: Quality, found: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None
+) -> Verdict:
+    """The verdict, from everything that is known of a scan.
+
+    Parameters
+    ----------
+    quality
+        Of all rows.
+    found
+        Patches, metal reference, joint inversion.
+    plane
+        Where the plates lie; None where it was not looked for.
+    classifier
+        What named them, if anything did.
+    """
+    reasons = recording_verdict(quality)
+    refused = {r.patch.label: r.refused.what for r in found.patches if r.refused is not None}
+    gaining = {
+        r.patch.label: r.permittivity.text
+        for r in found.patches
+        if r.refused is not None and r.refused.what in GAIN and r.permittivity.value is not None
+    }
+    reasons += signal_reasons({k: v for k, v in refused.items() if k not in gaining}, len(found.patches))
+    reasons += passivity_reasons(gaining)
+    metal = found.metal
+    if found.patches and metal.evidence is not None:
+        e = metal.evidence
+        label = "" if metal.label is None else f"{metal.label}"
+        reasons += metal_reasons(label, e.enough, metal.given, e.score, e.others)
+    if metal.label in refused and not metal.given:
+        reasons += metal_reasons(f"{metal.label}", False, False, 0.0, 0)
+    if found.prior.channels_known:
+        levels = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
+        reasons += level_reasons({k: float(np.median(np.abs(v))) for k, v in levels.items()})
+    reasons += leakage_reasons(found.prior.leakage_measured, found.inversion.leakage_determined, _by_leakage(found))
+    if plane is not None:
+        std = float(np.degrees(found.prior.theta_std_rad))
+        tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
+        reasons += plane_reasons(plane.known, 1e3 * plane.offset_m, tilt, std)
+    if classifier is not None and len(classifier.angles_deg) == 1:
+        angle = float(np.degrees(np.mean(found.theta_rad)))
+        reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))
+    return verdict_of(reasons)
+
+
+def _by_leakage(found: MaterialsResult) -> float:
+    """Median relative error that leakage leaves in the permittivities; 0 without any."""
+    parts = []
+    for r in found.patches:
+        e = r.permittivity
+        if e.value is not None and e.covariance is not None and e.shares:
+            share = e.shares.get("leakage", 0.0) + e.shares.get("brightness", 0.0)
+            parts.append(float(np.sqrt(share * np.trace(e.covariance) / 2)) / abs(e.value))
+    return float(np.median(parts)) if parts else 0.0
+
+
+def error_budget(found: MaterialsResult, plane: PlaneEstimate | None) -> dict[str, Any]:
+    """What the joint inversion found, for materials.json: leakage, angle, plane, evidence for metal."""
+    i, prior = found.inversion, found.prior
+    source = "measured" if prior.leakage_measured else "scene" if i.leakage_determined else "prior"
+    evidence = found.metal.evidence
+    angle = float(np.degrees(np.mean(found.theta_rad) + i.theta_error_rad))
+    return {
+        "leakage": {
+            "h": [round(i.leakage[0].real, 5), round(i.leakage[0].imag, 5)],
+            "v": [round(i.leakage[1].real, 5), round(i.leakage[1].imag, 5)],
+            "std": [round(s, 5) for s in i.leakage_std],
+            "source": source,
+        },
+        "incidence": {"deg": round(angle, 4), "std_deg": round(float(np.degrees(i.theta_std_rad)), 4)},
+        "plane": {"known": False} if plane is None else plane.to_dict(),
+        "metal": None
+        if evidence is None
+        else {
+            "score": round(evidence.score, 2),
+            "others": evidence.others,
+            "channel_ratio_db": None if evidence.channel_ratio_db is None else round(evidence.channel_ratio_db, 2),
+        },
+    }

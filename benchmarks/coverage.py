@@ -242,9 +242,13 @@ def run(args: argparse.Namespace) -> int:
         what = f"  metal {'in the scene' if inside else 'scanned on its own'}"
         out[what.strip()] = _table([r for r in rows if r.metal_in_scene == inside], what)
     same = {(r.scene, r.material): r for r in rows}
-    apart = [abs(r.relative_error - same[r.scene, r.material].relative_error) for r in raw if (r.scene, r.material) in same]
+    apart = [
+        abs(r.relative_error - same[r.scene, r.material].relative_error) for r in raw if (r.scene, r.material) in same
+    ]
     if apart:
-        print(f"raw beside samples: errors of the same patches differ by {100 * float(np.median(apart)):.2f} % (median)")
+        print(
+            f"raw beside samples: errors of the same patches differ by {100 * float(np.median(apart)):.2f} % (median)"
+        )
     said = [w for w in without if w[3] or w[2] != "none"]
     print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")
     for w in said:

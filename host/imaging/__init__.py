@@ -8,7 +8,7 @@ footprint of a mirror; `SubBandImages` does so for parts of the sweep. Three ima
 
 from polysight.host.imaging.aperture import Aperture
 from polysight.host.imaging.direct import backproject, project
-from polysight.host.imaging.focus import focus_sweep
+from polysight.host.imaging.focus import Focus, focus_sweep
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
 from polysight.host.imaging.images import TAPERS, ChannelImages, ImageBuilder, SubBand, SubBandImages, sub_bands
@@ -23,6 +23,7 @@ __all__ = [
     "Antennas",
     "Aperture",
     "ChannelImages",
+    "Focus",
     "ImageBuilder",
     "ImageGrid",
     "ImagedWith",

@@ -18,7 +18,9 @@ import numpy as np
 from polysight.host.calibration import CalibrationFile, FilterFile, StartFile, facts_of, head, open_raw, write
 from polysight.host.jobs.process import imaged, load_reference, plane_of
 from polysight.host.polarimetry import (
+    Image,
     Leakage,
+    Mask,
     leakage_from_images,
     specular_incidence_rad,
 )
@@ -27,6 +29,7 @@ from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import to_builtins
 
 LEAST_PIXELS = 100  # of a plate that serves as reference
+LEAST_LEAKAGE_STD = 1e-3
 
 
 def _tell(path: Path, file: CalibrationFile, lines: Sequence[str], what_to_set: Sequence[str], as_json: bool) -> int:
@@ -213,8 +216,32 @@ def leakage_of_scans(
             "scan them in the same place, larger than the grid on every side",
         )
     found = leakage_from_images((whole.h, whole.v), turned, mask, theta)
-    facts = {"scans": names, "simulated": simulated, "pixels": int(mask.sum())}
+    std = _leakage_std((whole.h, whole.v), turned, mask, theta)
+    facts = {"scans": names, "simulated": simulated, "pixels": int(mask.sum()), "leakage_std": std}
     return found, {**facts, "incidence_deg": float(np.degrees(theta))}
+
+
+def _leakage_std(
+    plate: tuple[Image, Image], strips: Sequence[tuple[float, Image, Image]], mask: Mask, theta_rad: float
+) -> float:
+    """Standard error of each part of the leakage: how far the quarters of the plane disagree, not less than 0.001.
+
+    What makes it wrong (edges, wires that are not straight, uneven light) differs from place to place as speckle does,
+    and is no smaller over the whole than half of what it is in a quarter.
+    """
+    rows, columns = np.indices(mask.shape)
+    middle = [float(np.median(at[mask])) for at in (rows, columns)]
+    parts = []
+    for up in (rows > middle[0], rows <= middle[0]):
+        for right in (columns > middle[1], columns <= middle[1]):
+            try:
+                found = leakage_from_images(plate, strips, mask & up & right, theta_rad)
+            except DataError:
+                continue
+            parts.append([found.h.real, found.h.imag, found.v.real, found.v.imag])
+    if len(parts) < 2:
+        return LEAST_LEAKAGE_STD
+    return max(LEAST_LEAKAGE_STD, float(np.sqrt(np.mean(np.var(parts, axis=0, ddof=1)))) / 2)
 
 
 def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | None, as_json: bool) -> int:
@@ -234,6 +261,7 @@ def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | No
     sys.stdout.write(
         f"{source}{alike}[polarimetry]\n"
         f"leakage_h = {rows['leakage_h']}\nleakage_v = {rows['leakage_v']}\n"
+        f"leakage_std = {facts['leakage_std']:.4f}\n"
         f"# H over V in the images: {imbalance['db']:+.2f} dB, {imbalance['deg']:+.1f} degrees;"
         f" from {facts['pixels']} pixels{rest}\n"
     )

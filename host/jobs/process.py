@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from polysight.host.calibration import of_scan
-from polysight.host.imaging import ChannelImages, focus_sweep
+from polysight.host.imaging import ChannelImages, Focus, PlaneEstimate, focus_sweep
 from polysight.host.jobs.demo import check_scenes, run_simulator
 from polysight.host.materials import (
     TRUTH,
@@ -208,29 +208,51 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     out.mkdir(parents=True, exist_ok=True)
     pipeline = _all_rows(source, data, depth_mm / 1e3)
     builder = pipeline.images
-    found = focus_sweep(builder, depth_mm / 1e3)
+    images = pipeline.form_images()
+    pipeline.place_plane(images, move=False)
+    plates = pipeline.plane
+    found = focus_sweep(builder, depth_m=depth_mm / 1e3)
+    depth_m = plates.offset_m if plates.known else found.depth_mm / 1e3
     grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
-    moved = replace(grid, z_m=grid.z_m + found.depth_mm / 1e3)
-    pictures = (board.image()[0], board.image(moved)[0])
+    pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
     if source.mirrored:  # the builder's image is that of the mirrored rig
-        found, pictures = found.transposed(), (pictures[0].T, pictures[1].T)
-    sweep = found.to_dict()
+        found, plates, pictures = found.transposed(), plates.transposed(), (pictures[0].T, pictures[1].T)
+    sweep = found.to_dict() | {"plates": plates.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
     (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pipeline.axes_m, source.simulated))
+    head = f"{'simulated ' if source.simulated else ''}scan {source.scan_id}"
     at = pipeline.rig.geometry.object_distance_mm
-    sys.stdout.write(
-        f"{'simulated ' if source.simulated else ''}scan {source.scan_id}: the plane is sharpest"
-        f" {found.depth_mm:+.2f} mm from the rig file's: object_distance_mm = {at + found.depth_mm:.2f}\n"
-        f"tilt: {found.tilt_deg[0]:+.2f} degrees along x, {found.tilt_deg[1]:+.2f} along y;"
-        f" sharpness {found.gain:.3f} times the rig file's plane\n"
-        f"figure: {out / 'focus.png'}\n"
-    )
-    if not found.certain:
-        sys.stdout.write(
-            "do not rely on it: the sharpness hardly changes over the sweep (a narrow scan, or no points and edges in"
-            " it), or the plane lies at the end of the sweep (give a larger --depth)\n"
-        )
+    sys.stdout.write("".join(f"{line}\n" for line in _focus_lines(head, at, found, plates)))
+    sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
+
+
+def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstimate) -> list[str]:
+    """What `focus` says: the plane by the plates where there are any, and by sharpness."""
+    lines = []
+    if plates.known:
+        mm, std = 1e3 * plates.offset_m, 1e3 * plates.offset_std_m
+        tilt, tilt_std = np.degrees(plates.tilt_rad), np.degrees(plates.tilt_std_rad)
+        how = "the phase of their echoes" if plates.by_phase else "the range of their echoes"
+        lines += [
+            f"{head}: {plates.plates} flat plates lie {mm:+.2f} +- {std:.2f} mm from the rig file's plane, by {how}:"
+            f" object_distance_mm = {distance_mm + mm:.2f}",
+            f"tilt: {tilt[0]:+.2f} +- {tilt_std[0]:.2f} degrees along x, {tilt[1]:+.2f} +- {tilt_std[1]:.2f} along y",
+        ]
+    if plates.known and not found.certain:
+        return [*lines, "sharpness does not tell (a narrow scan, or no points and edges in it); the plates do"]
+    lines += [
+        f"{head}: the plane is sharpest {found.depth_mm:+.2f} mm from the rig file's:"
+        f" object_distance_mm = {distance_mm + found.depth_mm:.2f}",
+        f"tilt: {found.tilt_deg[0]:+.2f} degrees along x, {found.tilt_deg[1]:+.2f} along y;"
+        f" sharpness {found.gain:.3f} times the rig file's plane",
+    ]
+    if not plates.known and not found.certain:
+        lines.append(
+            "do not rely on it: there is no flat plate, and the sharpness hardly changes over the sweep (a narrow scan,"
+            " or no points and edges in it), or the plane lies at the end of the sweep (give a larger --depth)"
+        )
+    return lines
 
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:

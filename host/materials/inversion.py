@@ -43,6 +43,7 @@ SOURCES = ("noise", "metal reference", "leakage", "incidence", "brightness")
 _NUISANCES = 8  # a, b (2 each), rho (2), angle, brightness of the metal
 _BENT = 0.1  # standard deviation over radius of curvature of Eq. 3 beyond which its error is drawn, not propagated
 _DRAWS = 4000
+_LEAST_STD = 1e-6  # of a ratio: below it the information matrix has no inverse in double precision
 
 
 @dataclass(frozen=True)
@@ -196,7 +197,7 @@ class _Model:
     def __init__(self, seen: Sequence[Seen], prior: Uncertain, brightness_std: float) -> None:
         self.prior, self.n, self.brightness_std = prior, len(seen), brightness_std
         self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
-        self.std = np.array([s.std for s in seen])
+        self.std = np.maximum(np.array([s.std for s in seen], np.float64), _LEAST_STD)
         level = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)
         # Metal-like patches have |H| = 1 whatever the leakage: they tell nothing of it.
         self.bright = np.isfinite(level) & (level > 0) & (np.abs(self.q - 1) > METAL_LIKE)

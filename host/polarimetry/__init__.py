@@ -7,6 +7,8 @@ of a material, `permittivity_from_ratio` the material of a reflection (Eq. 2 and
 
 from polysight.host.polarimetry.calibrate import (
     Calibrated,
+    Image,
+    Mask,
     axial_ratio_from_known,
     calibrate,
     calibrate_by_reference,
@@ -43,9 +45,11 @@ from polysight.host.polarimetry.reference import PlaneReference, plane_reference
 
 __all__ = [
     "Calibrated",
+    "Image",
     "Incidence",
     "IncidenceChoice",
     "Leakage",
+    "Mask",
     "PlaneReference",
     "Standard",
     "axial_ratio_from_known",

@@ -1,0 +1,61 @@
+"""Metal is shown by the rest of the scene: random scenes of known and unknown materials, with and without metal."""
+
+import numpy as np
+import pytest
+
+from polysight.host.materials.inversion import Seen, Uncertain
+from polysight.host.materials.metal_evidence import metal_evidence
+
+THETA = np.radians(55.0)
+EPS = [
+    2.6 - 0.01j, 2.05 - 0.01j, 3.78 - 0.7j, 4.0 - 0.4j, 4.54 - 0.56j, 4.69 - 0.7j, 5.06 - 1.11j, 3.52 - 0.82j,
+    4.75 - 2.43j, 3.66 - 0.43j, 6.3 - 0.2j, 7.5 - 0.3j, 9.4 - 0.1j, 9.37 - 18.0j, 1.3 - 0.01j,
+]  # fmt: skip
+
+
+def scene(rng, plates, metal, patterns_db=1.0):
+    """Patches relative to the one that is brightest in both channels, whether it is metal, and its V / H."""
+    eps = rng.choice(EPS, plates, replace=False)
+    eps = eps.real * np.exp(0.03 * rng.standard_normal(plates)) + 1j * eps.imag * np.exp(
+        0.3 * rng.standard_normal(plates)
+    )
+    q = np.sqrt(eps - np.sin(THETA) ** 2)
+    r_s, r_p = (np.cos(THETA) - q) / (np.cos(THETA) + q), (q - eps * np.cos(THETA)) / (q + eps * np.cos(THETA))
+    if metal:
+        r_s, r_p = np.append(r_s, -1.0), np.append(r_p, -1.0)
+    a, b = (0.1 * rng.random() * np.exp(2j * np.pi * rng.random()) for _ in range(2))
+    dull = np.exp(0.04 * rng.standard_normal(r_s.size))
+    h, v = (r_s + a * r_p) / (1 + a) * dull, (r_p + b * r_s) / (1 + b) * dull
+    v = v * 10 ** (patterns_db * rng.standard_normal() / 20) + 0.004 * h * rng.standard_normal(r_s.size)
+    best = int(np.argmax(np.abs(h * v)))
+    rest = [i for i in range(h.size) if i != best]
+    seen = [Seen(complex(v[i] / h[i] / (v[best] / h[best])), 0.005, THETA, float(abs(h[i] / h[best]))) for i in rest]
+    return seen, metal and best == plates, complex(v[best] / h[best])
+
+
+@pytest.mark.parametrize("plates", [1, 2, 3, 4, 6, 9])
+def test_no_dielectric_is_taken_for_metal(plates):
+    for seed in range(25):
+        seen, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
+        assert not metal_evidence(seen, Uncertain(3e-3), channel).enough
+
+
+@pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.9)])
+def test_metal_among_dielectrics_is_mostly_recognised(plates, least):
+    found = []
+    for seed in range(20):
+        seen, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
+        assert metal
+        found.append(metal_evidence(seen, Uncertain(3e-3), channel).enough)
+    assert np.mean(found) >= least
+
+
+def test_alone_nothing_is_shown():
+    evidence = metal_evidence([], Uncertain(3e-3), 1.0 + 0j)
+    assert not evidence.enough and evidence.others == 0
+
+
+def test_a_second_piece_of_metal_agrees():
+    seen, _, channel = scene(np.random.default_rng(0), 4, True, 0.0)
+    second = Seen(1.01 - 0.02j, 0.005, THETA, 1.02)
+    assert metal_evidence([*seen, second], Uncertain(3e-3), channel).agreeing == (4,)

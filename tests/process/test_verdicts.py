@@ -1,0 +1,183 @@
+"""Worlds that the rig file does not know: each gets the right verdict with its reason, and error bars that hold."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from benchmarks.coverage import Cubes
+from polysight.host.materials import match_truth, truth_plates
+from polysight.host.pipeline import Pipeline
+from polysight.host.process import Options
+from polysight.host.store import open_source
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene.simulated_scan import simulate, truth
+
+PLATES = {
+    "ceramic": ([-62.0, 32.0], [4.75, 2.43]), "acrylic": ([0.0, 34.0], [4.0, 0.4]), "PET": ([62.0, 32.0], [3.78, 0.7]),
+    "wood": ([-62.0, -32.0], [2.61, 0.01]), "metal": ([0.0, -34.0], None), "rubber": ([62.0, -32.0], [5.06, 1.11]),
+}  # fmt: skip
+
+
+def world(names=tuple(PLATES), disturbances=None, **scene):
+    plates = [
+        {"name": n, "centre_mm": PLATES[n][0], "size_mm": [46.0, 46.0]}
+        | ({"metal": True} if PLATES[n][1] is None else {"permittivity": PLATES[n][1]})
+        for n in names
+    ]
+    raw = {
+        "name": "world", "object_distance_mm": 499.0, "plates": plates, "image": {"columns": 110, "rows": 86},
+        "grid": {"columns": 43, "rows": 41, "step_x_mm": 10.0, "step_y_mm": 6.0},
+        "disturbances": disturbances or {},
+    }  # fmt: skip
+    return decode_scene(raw | scene, "world")
+
+
+def imaged(source):
+    pipeline = Pipeline(source)
+    for row in source.rows():
+        pipeline.add_row(row)
+    return pipeline, pipeline.form_images()
+
+
+@pytest.fixture(scope="module")
+def examine(rig):
+    """A scene as perfect synchronisation leaves it, judged with the shipped rig file."""
+
+    def make(scene, drop_rows=0):
+        source = Cubes(rig, scene, drop_rows)
+        pipeline, images = imaged(source)
+        findings = pipeline.examine(images, Options())
+        plates = truth_plates(truth(source.instrument, scene, scene.seed))
+        true = match_truth([r.patch for r in findings.found.patches], plates)
+        return findings, true
+
+    return make
+
+
+def distances(findings, true):
+    """Squared distance of each patch's true permittivity in its region."""
+    out = []
+    for r in findings.found.patches:
+        plate, e = true.get(r.patch.label), r.permittivity
+        if plate is not None and plate.permittivity is not None and e.value is not None:
+            away = e.value - plate.permittivity
+            pair = np.array([away.real, away.imag])
+            out.append(float(pair @ np.linalg.solve(e.covariance, pair)))
+    return np.array(out)
+
+
+def reasons(findings):
+    return "; ".join(r.what for r in findings.verdict.reasons)
+
+
+def silent(findings):
+    return all(r["name"] is None and r["permittivity"] is None and r["ratio"] is None for r in findings.found.rows())
+
+
+def test_a_measured_rig_and_a_plain_scene_are_good(examine):
+    findings, true = examine(world(disturbances={"leakage_measured": 0.003}))
+    assert findings.verdict.level == "good", reasons(findings)
+    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+    assert sum(r.verdict is not None and r.verdict.name.startswith(true[r.patch.label].name)
+               for r in findings.found.patches) >= 4  # fmt: skip
+    (reference,) = [r for r in findings.found.rows() if r["metal_reference"]]
+    assert reference["name"] is None  # never judged by itself
+
+
+@pytest.mark.parametrize("names", [("ceramic", "acrylic", "PET", "wood", "rubber"), ("ceramic",), ("ceramic", "wood")])
+def test_without_metal_nothing_is_said(examine, names):
+    findings, _ = examine(world(names))
+    assert findings.verdict.level == "none"
+    assert "metal" in reasons(findings)
+    assert silent(findings)
+
+
+@pytest.mark.parametrize("leak", [(0.0, 0.0), (0.0, 0.05), (-0.05, 0.05)])
+def test_leakage_that_nobody_measured_is_in_the_error_bars(examine, leak):
+    findings, true = examine(world(disturbances={"leakage_h": list(leak), "leakage_v": list(leak), "crystal_ppm": {}}))
+    if leak == (0.0, 0.0):  # a rig without leakage would be known to have none
+        assert findings.verdict.level == "good"
+        return
+    assert findings.verdict.level == "care"
+    assert "leakage" in reasons(findings)
+    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+
+
+@pytest.mark.parametrize("shift_mm", [10.0, -8.0])
+def test_a_plane_elsewhere_is_found_and_said(examine, shift_mm):
+    findings, true = examine(world(plane_shift_mm=shift_mm, disturbances={"leakage_measured": 0.003}))
+    assert 1e3 * findings.plane.offset_m == pytest.approx(shift_mm, abs=0.5)
+    assert "off the rig file's plane" in reasons(findings)
+    assert distances(findings, true).max() < 14.0
+    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+
+
+def test_a_tilted_plane_is_found(examine):
+    findings, true = examine(world(plane_tilt_deg=[0.8, -0.6], disturbances={"leakage_measured": 0.003}))
+    np.testing.assert_allclose(np.degrees(findings.plane.tilt_rad), [0.8, -0.6], atol=0.2)
+    assert "tilted" in reasons(findings)
+    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+
+
+def test_a_weak_direct_path_is_noticed(examine):
+    findings, _ = examine(world(disturbances={"direct_loss_db": 12.0}))
+    assert findings.verdict.level == "care"
+    assert "direct path" in reasons(findings)
+
+
+def test_absent_rows_are_counted_against_the_plan(examine):
+    findings, _ = examine(world(), drop_rows=8)
+    assert findings.verdict.level != "good"
+    assert "8 of 41 rows are absent (19.5 % of the positions)" in reasons(findings)
+
+
+def test_an_empty_table_is_no_result(examine):
+    findings, _ = examine(world(()))
+    assert findings.verdict.level == "none"
+    assert silent(findings)
+
+
+@pytest.mark.parametrize("plates", [tuple(PLATES), ()], ids=["plates", "noise"])
+def test_without_a_direct_path_nothing_is_said(rig, tmp_path, plates):
+    small = {"columns": 31, "rows": 25, "step_x_mm": 14.0, "step_y_mm": 10.0}
+    folder = simulate(rig, world(plates, {"direct_loss_db": "absent"}, grid=small), tmp_path / "scan")
+    pipeline, images = imaged(open_source(folder, None))
+    findings = pipeline.examine(images, Options())
+    assert findings.verdict.level == "none"
+    assert "direct path is missing" in findings.verdict.reasons[0].what
+    assert silent(findings)
+
+
+def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
+    pipeline, _ = imaged(Cubes(rig, world(("ceramic", "wood"))))
+    products = pipeline.finish(tmp_path / "out", Options())
+    assert products.exit_status == 7
+    content = json.loads((tmp_path / "out/materials.json").read_text())
+    quality = json.loads((tmp_path / "out/quality.json").read_text())
+    assert content["verdict"]["level"] == quality["verdict"]["level"] == "none"
+    assert all(s["name"] is None and s["permittivity"] is None and not s["votes"] for s in content["segments"])
+    with np.load(tmp_path / "out/image.npz") as image:
+        assert np.isfinite(image["h"]).any()
+        assert np.isnan(image["p_sigma"]).all()
+    assert "no result" in products.summary()
+    assert msgspec.json.decode((tmp_path / "out/labels.json").read_bytes())["labels"].keys() <= {"patch", "patch (2)"}
+
+
+def test_p_sigma_covers_the_error_of_p(examine, rig):
+    scene = world(disturbances={"leakage_measured": 0.003})
+    findings, true = examine(scene)
+    found, sigma = findings.found, findings.found.p_sigma(findings.images.valid)
+    inside = []
+    for r in found.patches:
+        plate = true.get(r.patch.label)
+        if plate is None or plate.permittivity is None or abs(1 / r.permittivity.ratio) < 0.03:
+            continue
+        q = np.sqrt(plate.permittivity - np.sin(found.theta_rad[0, 0]) ** 2)
+        cos = np.cos(found.theta_rad[0, 0])
+        p = (cos - q) / (cos + q) * (q + plate.permittivity * cos) / (q - plate.permittivity * cos)
+        at = r.patch.interior
+        inside.append(np.mean(np.abs(found.calibrated.p[at] - p) < 2 * np.sqrt(2) * sigma[at]))
+    assert len(inside) >= 3
+    assert np.mean(inside) > 0.8

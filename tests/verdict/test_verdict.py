@@ -1,0 +1,160 @@
+"""The verdict: the worst reason decides, reasons come in order of weight, and JSON gives back what was written."""
+
+import itertools
+
+import pytest
+
+from polysight.host.verdict import (
+    LEVELS,
+    Coverage,
+    NoResult,
+    Reason,
+    Verdict,
+    direct_path_reasons,
+    incidence_reasons,
+    leakage_reasons,
+    level_reasons,
+    metal_reasons,
+    plane_reasons,
+    read_verdict,
+    recording_reasons,
+    signal_reasons,
+    verdict_of,
+)
+
+ALL = [
+    Reason("care", "a", "because", "do a", 1.0),
+    Reason("care", "b", "because", "do b", 3.0),
+    Reason("none", "c", "because", "do c", 0.1),
+]
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(ALL)))
+def test_the_worst_reason_decides_and_weight_orders(order):
+    verdict = verdict_of(order)
+    assert verdict.level == "none"
+    assert [r.what for r in verdict.reasons] == ["c", "b", "a"]
+    assert verdict_of(r for r in order if r.level == "care").level == "care"
+
+
+def test_without_reasons_all_is_good():
+    assert verdict_of([]) == Verdict("good")
+    assert verdict_of([]).lines() == ["verdict:  good"]
+
+
+def test_json_gives_back_what_was_written():
+    verdict = verdict_of(ALL)
+    content = {"verdict": verdict.to_dict(), "other": 1}
+    again = read_verdict(content)
+    assert again is not None
+    assert again.to_dict() == verdict.to_dict()
+    assert all(set(r) == {"what", "why", "do"} for r in content["verdict"]["reasons"])
+    assert read_verdict({}) is None
+    assert read_verdict({"verdict": {"level": "perfect"}}) is None
+
+
+def test_no_result_has_an_exit_status_of_its_own():
+    error = verdict_of(ALL).error("the images are kept")
+    assert isinstance(error, NoResult)
+    assert error.exit_status == 7
+    assert "c" in error.what and "the images are kept" in error.remedy
+
+
+def test_every_level_has_words():
+    assert LEVELS == {"good": "good", "care": "usable with care", "none": "no result"}
+
+
+def level(reasons):
+    return verdict_of(reasons).level
+
+
+@pytest.mark.parametrize(
+    ("recorded", "received", "faults", "masked", "want"),
+    [
+        (27, 27 * 100, (), 0.0, "good"),
+        (22, 22 * 100, (), 0.0, "care"),
+        (10, 10 * 100, (), 0.0, "none"),
+        (27, 27 * 100, ("line 6: damaged",), 0.0, "care"),
+        (27, 27 * 80, (), 0.2, "care"),
+        (27, 27 * 30, (), 0.7, "none"),
+    ],
+)
+def test_rows_and_frames_count_against_the_plan(recorded, received, faults, masked, want):
+    reasons = recording_reasons(Coverage(27, recorded, 27 * 100, received, faults), masked)
+    assert level(reasons) == want
+    if recorded == 22:
+        assert "5 of 27" in reasons[0].what and "18.5 %" in reasons[0].what
+
+
+@pytest.mark.parametrize(
+    ("snr_db", "phase", "share", "want"),
+    [
+        (23.0, 0.004, 1.0, "good"),
+        (None, None, 1.0, "good"),
+        (12.0, 0.004, 1.0, "care"),
+        (23.0, 0.2, 1.0, "care"),
+        (23.0, 0.004, 0.1, "none"),
+        (1.0, 0.004, 1.0, "none"),
+    ],
+)
+def test_direct_path(snr_db, phase, share, want):
+    reasons = direct_path_reasons("RH", snr_db, phase, share)
+    assert level(reasons) == want
+    if want == "none":
+        assert "direct path is missing" in reasons[0].what
+
+
+def test_a_weak_direct_path_shows_in_the_metals_level():
+    assert level(level_reasons({"H": 1.3, "V": 1.3})) == "good"
+    assert level(level_reasons({"H": 5.3, "V": 5.3})) == "care"
+    assert level(level_reasons({"H": None})) == "good"
+
+
+@pytest.mark.parametrize(
+    ("enough", "given", "score", "others", "want"),
+    [
+        (True, False, 4.0, 8, "good"),
+        (False, False, -30.0, 8, "none"),
+        (False, False, 0.0, 0, "none"),
+        (False, True, 0.0, 0, "good"),
+        (False, True, -10.0, 4, "care"),
+        (False, True, -60.0, 4, "none"),
+    ],
+)
+def test_metal_is_never_judged_by_itself(enough, given, score, others, want):
+    assert level(metal_reasons("3", enough, given, score, others)) == want
+
+
+def test_other_rules():
+    assert level(signal_reasons({}, 0)) == "none"
+    assert level(signal_reasons({1: "noise"}, 1)) == "none"
+    assert level(signal_reasons({1: "noise"}, 2)) == "care"
+    assert level(leakage_reasons(True, False, 0.5)) == "good"
+    assert level(leakage_reasons(False, False, 0.1)) == "care"
+    assert level(plane_reasons(False, 0.0, (0.0, 0.0), 0.3)) == "care"
+    assert level(plane_reasons(True, 10.0, (0.0, 0.0), 0.1)) == "care"
+    assert level(plane_reasons(True, 0.2, (0.1, 0.0), 0.1)) == "good"
+    assert level(incidence_reasons(55.0, 54.9)) == "good"
+    assert level(incidence_reasons(55.5, 54.9)) == "care"
+
+
+def test_every_reason_says_what_why_and_what_to_do():
+    reasons = [
+        *recording_reasons(Coverage(9, 5, 900, 400, ("x",)), 0.3),
+        *direct_path_reasons("RH", 1.0, None, 1.0),
+        *direct_path_reasons("RH", 10.0, 0.3, 1.0),
+        *signal_reasons({1: "noise"}, 2),
+        *signal_reasons({}, 0),
+        *metal_reasons("1", False, False, -9.0, 3),
+        *metal_reasons("1", False, True, -9.0, 3),
+        *leakage_reasons(False, True, 0.1),
+        *plane_reasons(False, 0.0, (0.0, 0.0), 0.3),
+        *plane_reasons(True, 14.0, (0.0, 0.0), 0.3),
+        *plane_reasons(True, 9.0, (0.9, 0.0), 0.3),
+        *level_reasons({"H": 9.0, "V": 0.1}),
+        *incidence_reasons(57.0, 54.9),
+    ]
+    assert len(reasons) >= 16
+    for r in reasons:
+        assert r.what and r.why and r.do
+        assert not r.what.endswith(".") and not r.do.endswith(".")

@@ -1,4 +1,4 @@
-"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> metal reference -> materials."""
+"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> plane -> metal -> materials -> verdict."""
 
 from __future__ import annotations
 
@@ -15,21 +15,18 @@ class Pipeline:
     """Processes one scan, row by row as they are committed, then to the end.
 
     With `live`, the images so far can be looked at after every row at next to no cost (`images.current()`).
-    `depth_m` keeps what lies that much nearer or farther than the rig file says, for autofocus. With `bands` above 1
-    that many sub-bands of the sweep are imaged too.
+    `depth_m` keeps what lies that much nearer or farther than the rig file says: plates are looked for there. With
+    `bands` above 1 that many sub-bands of the sweep are imaged too.
     """
 
-    def __init__(
-        self, source: store.Source, live: bool = False, depth_m: float = imaging.PLANE_REACH_M, bands: int = 1
-    ) -> None:
+    def __init__(self, source: store.Source, live: bool = False, depth_m: float = 0.0, bands: int = 1) -> None:
         self.source, self.calibration = source, calibration.of_scan(source)
         rig = self.calibration.rig(source.instrument)
         self.rig = store.mirrored(rig) if source.mirrored else rig  # of the images: x from TX to RX
         self.synchroniser = sync.RowSynchroniser(source, rig, self.calibration.high_passes(rig))
-        self.images = imaging.ImageBuilder(rig, live=live, depth_m=depth_m)
-        self.sub_bands = imaging.SubBandImages(rig, bands)
+        self.images = imaging.ImageBuilder(rig, live=live, depth_m=max(depth_m, imaging.PLANE_REACH_M))
+        self.sub_bands, self.plane = imaging.SubBandImages(rig, bands), imaging.UNKNOWN_PLANE
         self.quality = process.Quality(rig, source)
-        self.plane = imaging.UNKNOWN_PLANE
 
     def add_row(self, row: int) -> dict[str, sync.SyncedRow]:
         """Read, synchronise and reduce one row of every board for the images; returns the synchronised rows."""
@@ -46,7 +43,7 @@ class Pipeline:
         return synced
 
     def form_images(self) -> imaging.ChannelImages:
-        """Both channels, flattened by their footprint, not yet referenced to metal."""
+        """Both channels, flattened by their footprint, on the rig file's plane, not yet referenced to metal."""
         with self.quality.timed("image"):
             images = self.images.finish()
         with self.quality.timed("point response"):
@@ -54,35 +51,23 @@ class Pipeline:
         self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 
-    def place_plane(self, images: imaging.ChannelImages, move: bool = True) -> imaging.ChannelImages:
-        """Find the plane that the plates lie on (`self.plane`); the images on it, where it is not the rig file's.
-
-        With `move` False the images stay as they are: they are to be divided by metal on the rig file's plane.
-        """
-        with self.quality.timed("plane"):
-            patches = materials.segment(images.h, images.v, images.x_m, images.y_m, images.valid).patches
-            masks = [p.interior.T if self.source.mirrored else p.interior for p in patches]
-            self.plane = imaging.find_plane(self.images, masks)
-            if move and self.plane.worth_moving:
-                images = self.images.finish(self.plane.offset_m)
-                images = images.transposed() if self.source.mirrored else images
-        return images
-
-    def band_images(self) -> tuple[imaging.ChannelImages, ...]:
-        """Both channels in every sub-band, flattened; none when they were not asked for."""
-        made = self.sub_bands.finish()
-        return tuple(images.transposed() for images in made) if self.source.mirrored else made
+    @property
+    def axes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pixel centres of the images, x and y, ascending."""
+        grid = self.images.grid
+        return (grid.y_m, grid.x_m) if self.source.mirrored else (grid.x_m, grid.y_m)
 
     def metal_plane(self, options: process.Options, in_scene: bool = False) -> polarimetry.PlaneReference | None:
         """Metal scanned on its own: as asked for, or as calibrated unless metal `in_scene` is named."""
         in_scene = in_scene or options.metal_box_mm is not None
         return self.calibration.metal_plane(self.rig, options.reference, in_scene, options.bands)
 
-    @property
-    def axes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixel centres of the images, x and y, ascending."""
-        grid = self.images.grid
-        return (grid.y_m, grid.x_m) if self.source.mirrored else (grid.x_m, grid.y_m)
+    def place_plane(self, images: imaging.ChannelImages, move: bool = True) -> imaging.ChannelImages:
+        """Find the plane that the plates lie on; the images on it. They stay as they are when `move` is False."""
+        with self.quality.timed("plane"):
+            masks, swapped = materials.insides(images), self.source.mirrored
+            self.plane, images = imaging.on_their_plane(self.images, images, masks, swapped, move)
+        return images
 
     def find_materials(
         self,
@@ -92,7 +77,7 @@ class Pipeline:
         classifier: materials.Classifier | None = None,
         incidence: polarimetry.Incidence = "one",
     ) -> materials.MaterialsResult:
-        """Patches (found, unless known), metal reference, leakage, permittivity, names; sub-bands where imaged."""
+        """Patches (found, unless known), metal reference, joint inversion, names; sub-bands where imaged."""
         with self.quality.timed("materials"):
             rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
             angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, incidence)
@@ -100,12 +85,14 @@ class Pipeline:
             found = materials.analyse(materials.ImagePair.of(images), optics, metal, known, classifier)
             self.quality.note_materials(found, angles, images.valid, metal.plane)
         with self.quality.timed("sub-bands"):
-            return materials.with_bands(found, self.sub_bands.bands, self.band_images(), optics, metal.plane)
+            return materials.with_bands(
+                found, self.sub_bands.bands, self.sub_bands.finish(self.source.mirrored), optics, metal.plane
+            )
 
     def examine(
         self, images: imaging.ChannelImages, options: process.Options, plates: materials.Plates = ()
     ) -> process.Findings:
-        """From the images to the verdict: plane, metal, patches, names. Without a result nothing is named."""
+        """From the images to the verdict; without a result nothing is said of any patch."""
         classifier, boxes = options.classifier(self.rig), options.drawn(images.x_m, images.y_m)
         plane = self.metal_plane(options, boxes.metal is not None)
         images = self.place_plane(images, move=plane is None)

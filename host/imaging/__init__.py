@@ -12,7 +12,7 @@ from polysight.host.imaging.focus import Focus, focus_sweep
 from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
 from polysight.host.imaging.images import TAPERS, ChannelImages, ImageBuilder, SubBand, SubBandImages, sub_bands
-from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane
+from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane, on_their_plane
 from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
 
@@ -37,6 +37,7 @@ __all__ = [
     "focus_sweep",
     "image_grid",
     "imaging_facts",
+    "on_their_plane",
     "point_response",
     "project",
     "reduction",

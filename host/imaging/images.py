@@ -222,9 +222,10 @@ class SubBandImages:
         for builder in self.builders:
             builder.add_row(board_name, row_index, row)
 
-    def finish(self) -> tuple[ChannelImages, ...]:
-        """The images of every sub-band from the rows added so far, lowest frequency first."""
-        return tuple(builder.finish() for builder in self.builders)
+    def finish(self, transposed: bool = False) -> tuple[ChannelImages, ...]:
+        """The images of every sub-band from the rows added so far, lowest frequency first; x and y swapped on demand."""
+        made = (builder.finish() for builder in self.builders)
+        return tuple(images.transposed() if transposed else images for images in made)
 
 
 def _part(rig: Instrument, band: SubBand) -> Instrument:

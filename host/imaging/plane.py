@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.imaging.images import ImageBuilder
+from polysight.host.imaging.images import ChannelImages, ImageBuilder
 from polysight.host.imaging.samples import BoardSamples
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
@@ -161,6 +161,29 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         by_phase,
         int(tells.sum()),
     )
+
+
+def on_their_plane(
+    builder: ImageBuilder, images: ChannelImages, masks: Sequence[NDArray[np.bool_]], transposed: bool, move: bool
+) -> tuple[PlaneEstimate, ChannelImages]:
+    """The plane that patches lie on, and the images on it, where it is not the rig file's.
+
+    Parameters
+    ----------
+    builder, images
+        With the rows added, and what it made of them.
+    masks
+        bool [ny, nx] insides of the patches, on the images' grid.
+    transposed
+        Whether the images are the builder's with x and y swapped.
+    move
+        False: the images stay as they are.
+    """
+    plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
+    if move and plane.worth_moving:
+        images = builder.finish(plane.offset_m)
+        images = images.transposed() if transposed else images
+    return plane, images
 
 
 def _ranges(board: BoardSamples, masks: Sequence[NDArray[np.bool_]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -229,7 +229,7 @@ def _leakage_std(
     What makes it wrong (edges, wires that are not straight, uneven light) differs from place to place as speckle does,
     and is no smaller over the whole than half of what it is in a quarter.
     """
-    rows, columns = np.indices(mask.shape)
+    rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
     middle = [float(np.median(at[mask])) for at in (rows, columns)]
     parts = []
     for up in (rows > middle[0], rows <= middle[0]):

@@ -154,7 +154,7 @@ def load_reference(
         when the scan cannot be read, or shows no metal plate.
     """
     pipeline, images = imaged(folder, config, bands)
-    parts = tuple(plane_of(pipeline, band) for band in pipeline.band_images())
+    parts = tuple(plane_of(pipeline, band) for band in pipeline.sub_bands.finish(pipeline.source.mirrored))
     found = replace(plane_of(pipeline, images), bands=parts)
     return found if by_position else found.mean()
 

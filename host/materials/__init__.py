@@ -59,7 +59,16 @@ from polysight.host.materials.published import (
 )
 from polysight.host.materials.result import MaterialsResult, PatchResult
 from polysight.host.materials.samples import CHANNELS, Samples, feature_matrix
-from polysight.host.materials.segment import Box, Patch, Segmentation, SegmentSettings, axis_mm, box_mask, segment
+from polysight.host.materials.segment import (
+    Box,
+    Patch,
+    Segmentation,
+    SegmentSettings,
+    axis_mm,
+    box_mask,
+    insides,
+    segment,
+)
 from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row, with_bands
 from polysight.host.materials.train import (
     Score,
@@ -151,6 +160,7 @@ __all__ = [
     "format_permittivity",
     "image_centre_mm",
     "invert",
+    "insides",
     "is_metal",
     "label_folders",
     "labels_of",

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from skimage import filters, measure, morphology, restoration
 
+from polysight.host.imaging import ChannelImages
 from polysight.shared.errors import DataError
 
 Mask = npt.NDArray[np.bool_]
@@ -212,6 +213,13 @@ def segment(
         labels[mask] = len(patches) + 1
         patches.append(make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable))
     return Segmentation(labels, tuple(patches), threshold)
+
+
+def insides(images: ChannelImages) -> list[Mask]:
+    """Insides of the patches of an image pair, bool [ny, nx] each; none when nothing is valid."""
+    if not (images.valid & np.isfinite(images.h) & np.isfinite(images.v)).any():
+        return []
+    return [p.interior for p in segment(images.h, images.v, images.x_m, images.y_m, images.valid).patches]
 
 
 def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float) -> Segmentation:

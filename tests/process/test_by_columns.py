@@ -30,7 +30,7 @@ def test_sub_bands_lie_as_the_whole_band_s_image_does(scan, tmp_path):
     pipeline = Pipeline(source, bands=BANDS)
     for row in source.rows():
         pipeline.add_row(row)
-    whole, parts = pipeline.form_images(), pipeline.band_images()
+    whole, parts = pipeline.form_images(), pipeline.sub_bands.finish(pipeline.source.mirrored)
     assert whole.h.shape == (IMAGE["rows"], IMAGE["columns"])
     assert len(parts) == BANDS
     for part in parts:

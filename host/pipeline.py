@@ -95,7 +95,7 @@ class Pipeline:
         """From the images to the verdict; without a result nothing is said of any patch."""
         classifier, boxes = options.classifier(self.rig), options.drawn(images.x_m, images.y_m)
         plane = self.metal_plane(options, boxes.metal is not None)
-        images = self.place_plane(images, move=plane is None)
+        images = self.place_plane(images)
         if plane is not None:
             images = replace(images, valid=images.valid & plane.valid_on(images.x_m, images.y_m))
         metal = materials.MetalChoice(options.metal_box_mm, boxes.metal, plane)

@@ -65,7 +65,7 @@ class BoardQuality:
 
     @property
     def direct_snr_db(self) -> float | None:
-        """Power of the direct path over that of noise, one sample of a position's average over chirps and RX, dB.
+        """Power of the direct path over that of noise in one sample of one chirp and channel, dB.
 
         None where it is not known (cubes that were synchronised elsewhere).
         """
@@ -113,12 +113,11 @@ class BoardQuality:
 
 
 def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
-    """Power of the direct path over that of noise in the average over chirps and RX, of the valid positions."""
+    """Power of the direct path over that of noise in one sample of one chirp and channel, of the valid positions."""
     if row.noise is None:
         return np.zeros(0)
     good = row.valid & np.isfinite(row.noise) & (row.noise > 0)
-    looks = row.chirps[good] * row.samples.shape[0]
-    return np.asarray(row.direct_amplitude[good] ** 2 / row.noise[good] * looks, np.float64)
+    return np.asarray(row.direct_amplitude[good] ** 2 / row.noise[good], np.float64)
 
 
 def masked_runs(masked: NDArray[np.bool_]) -> list[list[int]]:

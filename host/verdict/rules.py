@@ -16,10 +16,10 @@ FEW_POSITIONS = 0.5
 """Share of absent or masked positions from which nothing can be said of the scene."""
 SOME_POSITIONS = 0.02
 """Share of absent or masked positions that is worth a word."""
-DIRECT_SNR_NONE_DB = 3.0
-"""Direct path over noise, all chirps and receivers of a position together, below which there is none; one sample."""
-DIRECT_SNR_CARE_DB = 17.0
-"""The simulated rig has 23.5 dB; 12 dB less are a path that is nearly blocked."""
+DIRECT_SNR_NONE_DB = -14.0
+"""Direct path over noise in one sample of one chirp and channel, below which there is none."""
+DIRECT_SNR_CARE_DB = 0.0
+"""The simulated rig has 5.5 dB, as the paper's phase errors suggest; 12 dB less are a path that is nearly blocked."""
 DIRECT_LEVELS = (0.4, 3.0)
 """Metal's brightness beside the direct path: the published rig's echo and direct path lie within a factor of 1.5."""
 DIRECT_PHASE_CARE_RAD = 0.05
@@ -92,7 +92,7 @@ def direct_path_reasons(board: str, snr_db: float | None, phase_rad: float | Non
     out = []
     if snr_db is not None and snr_db < DIRECT_SNR_CARE_DB:
         out.append(Reason(
-            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise (23 dB are usual)",
+            "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
             "it is partly blocked, or the antennas look elsewhere; it is the reference of every phase",
             "clear the line of sight; check the antennas' aim", 3.0,
         ))  # fmt: skip
@@ -135,10 +135,19 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
             "there is no flat object on the plane, or the data are noise",
             "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
         )]  # fmt: skip
+    by_reason: dict[str, list[int]] = {}
+    for label, what in refused.items():
+        by_reason.setdefault(what, []).append(label)
     return [
-        Reason("care", f"patch {label} is not judged: {why}", "what is said of a patch holds for one flat plate", "move the plates apart, or draw its box (--labels)", 2.0)
-        for label, why in refused.items()
-    ]  # fmt: skip
+        Reason(
+            "care",
+            f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {what}",
+            "what is said of a patch holds for one flat plate",
+            "move the plates apart, or draw their boxes (--labels)",
+            2.0,
+        )
+        for what, labels in by_reason.items()
+    ]
 
 
 def metal_reasons(how: str, enough: bool, given: bool, score: float, others: int) -> list[Reason]:

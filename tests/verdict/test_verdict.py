@@ -89,12 +89,12 @@ def test_rows_and_frames_count_against_the_plan(recorded, received, faults, mask
 @pytest.mark.parametrize(
     ("snr_db", "phase", "share", "want"),
     [
-        (23.0, 0.004, 1.0, "good"),
+        (5.5, 0.004, 1.0, "good"),
         (None, None, 1.0, "good"),
-        (12.0, 0.004, 1.0, "care"),
-        (23.0, 0.2, 1.0, "care"),
-        (23.0, 0.004, 0.1, "none"),
-        (1.0, 0.004, 1.0, "none"),
+        (-6.0, 0.004, 1.0, "care"),
+        (5.5, 0.2, 1.0, "care"),
+        (5.5, 0.004, 0.1, "none"),
+        (-20.0, 0.004, 1.0, "none"),
     ],
 )
 def test_direct_path(snr_db, phase, share, want):
@@ -141,8 +141,8 @@ def test_other_rules():
 def test_every_reason_says_what_why_and_what_to_do():
     reasons = [
         *recording_reasons(Coverage(9, 5, 900, 400, ("x",)), 0.3),
-        *direct_path_reasons("RH", 1.0, None, 1.0),
-        *direct_path_reasons("RH", 10.0, 0.3, 1.0),
+        *direct_path_reasons("RH", -20.0, None, 1.0),
+        *direct_path_reasons("RH", -6.0, 0.3, 1.0),
         *signal_reasons({1: "noise"}, 2),
         *signal_reasons({}, 0),
         *metal_reasons("1", False, False, -9.0, 3),

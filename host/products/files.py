@@ -68,7 +68,7 @@ def write_image(
         when shapes do not fit each other.
     """
     shape = (np.size(y_m), np.size(x_m))
-    more = {} if p_sigma is None else {"p_sigma": p_sigma.astype(np.float32)}
+    more: dict[str, Any] = {} if p_sigma is None else {"p_sigma": p_sigma.astype(np.float32)}
     for name, array in (("h", h), ("v", v), ("p", p), ("valid", valid), *more.items()):
         if array.shape != shape:
             raise DataError(f"image {name} has shape {array.shape}, axes say {shape}")

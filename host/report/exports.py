@@ -205,6 +205,7 @@ def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
         valid=products.valid,
         metal_referenced=bool(products.materials),
         materials=products.segments,
+        verdict=products.verdict,
     )
     paths = []
     for name, data in figures(context).items():

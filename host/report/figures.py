@@ -71,6 +71,12 @@ def phase_limits_deg(ctx: ReportContext) -> Limits | None:
     return (low, high) if high - low < _MOST_DEG else None
 
 
+def _decibels(ctx: ReportContext) -> str:
+    if not ctx.metal_referenced:
+        return "dB"
+    return "dB (metal = 0)" if ctx.judged else "dB (reference = 0)"
+
+
 def draw_channel(ax: Axes, ctx: ReportContext, key: str, phase_deg: Limits | None = None):
     """Draw one of FIGURES on an axes; returns the image for a colour bar, and the bar's label.
 
@@ -97,13 +103,13 @@ def draw_channel(ax: Axes, ctx: ReportContext, key: str, phase_deg: Limits | Non
             _shown(ctx, level), extent=extent, origin="lower", cmap="cividis", vmin=bottom, vmax=top,
             alpha=_fade(ctx), interpolation="nearest",
         )  # fmt: skip
-        return shown, "dB (metal = 0)" if ctx.metal_referenced else "dB"
+        return shown, _decibels(ctx)
     top = 0.0 if ctx.metal_referenced else float(np.percentile(finite, 99.8)) if finite.size else 0.0
     shown = ax.imshow(
         _shown(ctx, level), extent=extent, origin="lower", cmap="cividis", vmin=top - 35, vmax=top,
         interpolation="nearest",
     )  # fmt: skip
-    return shown, "dB (metal = 0)" if ctx.metal_referenced else "dB"
+    return shown, _decibels(ctx)
 
 
 def _ratio_range_db(ctx: ReportContext, level: npt.NDArray) -> tuple[float, float]:

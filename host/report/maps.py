@@ -181,8 +181,8 @@ def _fill_patches(
         text = texts.get(row["label"], "metal" if is_metal else "not\njudged" if row.get("refused") else "–")
         write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, text, 8)
         ax.annotate(
-            str(row["label"]), (x0, y1), textcoords="offset points", xytext=(2.5, -2), ha="left", va="top", fontsize=6.5,
-            color=INK, path_effects=[withStroke(linewidth=2, foreground="white")],
+            str(row["label"]), (x0, y1), textcoords="offset points", xytext=(2.5, -2), ha="left", va="top",
+            fontsize=6.5, color=INK, path_effects=[withStroke(linewidth=2, foreground="white")],
         )  # fmt: skip
     _crop(ax, ctx)
     ax.set_aspect("equal")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup, escape
 
 from polysight.host.products import permittivity_spread, refused_text, write_atomically
 from polysight.host.report.context import ReportContext
@@ -52,6 +53,7 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         undefined=StrictUndefined,
         trim_blocks=True,
     )
+    environment.filters["code"] = _code
     rows = [_row(r, colours_of(ctx)) for r in ctx.materials]
     seen = {r["truth"] for r in rows}
     alt = {
@@ -71,6 +73,7 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         keys=key_numbers(ctx, rows),
         centre=centre,
         verdict=ctx.verdict,
+        remedies=_remedies(rows),
         rows=rows,
         with_errors=any(permittivity_spread(r.get("permittivity")) for r in ctx.materials),
         budget=budget_table(ctx.error_budget),
@@ -81,6 +84,21 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         config=[(k, text(v)) for k, v in ctx.config.items()],
         provenance=[(k, text(v)) for k, v in ctx.provenance.items()],
     )
+
+
+def _code(words: str) -> Markup:
+    """Text with `commands` in it, for the page."""
+    parts = [escape(part) for part in words.split("`")]
+    return Markup("").join(Markup("<code>{}</code>").format(part) if i % 2 else part for i, part in enumerate(parts))
+
+
+def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """What would shrink the errors: each measurement once, with the patches that it would help."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        if row["do"]:
+            found.setdefault((row["dominated_by"], row["do"]), []).append(str(row["label"]))
+    return [{"what": what, "do": do, "patches": ", ".join(labels)} for (what, do), labels in found.items()]
 
 
 def _replaced_names(ctx: ReportContext) -> list[str]:
@@ -108,17 +126,18 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
     ratio = r.get("ratio")
     p = complex(ratio["real"], ratio["imag"]) if ratio else None
     x0, y0, x1, y1 = r["box_mm"]
+    is_metal = bool(r.get("metal_reference"))
     out: dict[str, Any] = {
         "label": r["label"],
-        "name": str(r.get("name") or f"patch {r['label']}"),
+        "name": str(r.get("name") or ("metal reference" if is_metal else f"patch {r['label']}")),
         "where": f"{(x0 + x1) / 2:.0f}, {(y0 + y1) / 2:.0f}".replace("-", "−"),
         "size": f"{x1 - x0:.0f} × {y1 - y0:.0f}",
         "colour": patch_colour(r, colours),
-        "metal_reference": bool(r.get("metal_reference")),
+        "metal_reference": is_metal and bool(r.get("name")),
         "refused": r.get("refused") or {},
         "why_refused": refused_text(r),
         "truth": str(truth["name"]) if truth else "",
-        "right": bool(truth) and truth is not None and truth["name"] == r.get("name"),
+        "right": truth is not None and (truth["name"] == r.get("name") or (is_metal and bool(truth.get("metal")))),
         "votes": DASH if r.get("confidence") is None else f"{100 * r['confidence']:.0f} %",
         "real": "metal-like" if r.get("metal_like") else DASH,
         "loss": DASH,

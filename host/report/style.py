@@ -89,7 +89,7 @@ def write_label(
     """Write a name or number with a halo; `above` puts it on top of the point."""
     ink, halo = ("white", "#10141b") if on_dark else (INK, "white")
     return ax.text(
-        x, y, text, ha="center", va="bottom" if above else "center", fontsize=size, color=ink, linespacing=1.1,
+        x, y, text, ha="center", va="bottom" if above else "center", fontsize=size, color=ink, linespacing=1.2,
         path_effects=[withStroke(linewidth=2.4, foreground=halo)], family=list(font_families()), parse_math=False,
     )  # fmt: skip
 
@@ -152,7 +152,7 @@ class MapLabel:
 
 
 def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
-    """Replace all labels by their numbers if any two touch or one leaves the frame; returns those that were replaced."""
+    """Replace all labels by their numbers if two touch or one leaves the frame; returns those that were replaced."""
     if not labels:
         return []
     fig.draw_without_rendering()

@@ -263,7 +263,9 @@ def report(folder: Path) -> int:
         from polysight.host.jobs.process import process
         from polysight.host.process import ProcessRequest
 
-        return process(ProcessRequest(data=str(folder), out=str(folder / "products")))
+        status = process(ProcessRequest(data=str(folder), out=str(folder / "products")))
+        made = find_products(folder, REPORT)
+        return status if status or made is None else print_verdict(made, to_terminal=False)
     status = print_verdict(found)
     sys.stdout.write(f"report:   {found.folder / REPORT}\n")
     return status

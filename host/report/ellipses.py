@@ -136,14 +136,22 @@ def _set_limits(ax: Axes, rows: Sequence[dict[str, Any]]) -> None:
     """Around estimates, truths and ellipses; one very uncertain patch must not shrink all others to a dot."""
     centres = np.array([(r["permittivity"]["real"], -r["permittivity"]["imag"]) for r in rows])
     certain = np.concatenate([centres, np.array([t for r in rows if (t := _truth(r))], float).reshape(-1, 2)])
-    spreads = [permittivity_spread(r["permittivity"]) for r in rows]
-    half = np.array([(s.real_std, s.loss_std) if s else (0.0, 0.0) for s in spreads]) * math.sqrt(SHARES[0.95])
+    half = np.array([_half_size(r["permittivity"]) for r in rows])
     low, high = certain.min(axis=0), certain.max(axis=0)
     span = np.maximum(high - low, (0.5, 0.3))
     low = np.minimum(low, np.maximum((centres - half).min(axis=0), low - 0.75 * span)) - 0.08 * span
     high = np.maximum(high, np.minimum((centres + half).max(axis=0), high + 0.75 * span)) + 0.08 * span
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(min(low[1], -0.1), high[1])
+
+
+def _half_size(e: dict[str, Any]) -> tuple[float, float]:
+    """How far what is drawn of an estimate reaches: the 95 % ellipse, or the bars."""
+    if spread := permittivity_spread(e):
+        radius = math.sqrt(SHARES[0.95])
+        return radius * spread.real_std, radius * spread.loss_std
+    bars = [e.get(f"{part}_p30_p70") or [e[part]] for part in ("real", "imag")]
+    return tuple(max(abs(v - e[part]) for v in bar) for part, bar in zip(("real", "imag"), bars, strict=True))
 
 
 def _legend(fig: Figure, rows: Sequence[dict[str, Any]], colours: dict[str, str], with_truth: bool) -> None:

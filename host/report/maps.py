@@ -14,6 +14,7 @@ from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
 
 from polysight.host.products import permittivity_spread
 from polysight.host.report.context import ReportContext
@@ -38,6 +39,8 @@ from polysight.host.report.style import (
 )
 from polysight.host.report.tables import INK, MUTED
 
+_ROOM = 0.09  # of a map's height: what a label of two lines needs
+
 
 def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapLabel]:
     """Material map: the majority's colour over each patch, each interior pixel in the colour of its own name.
@@ -54,6 +57,7 @@ def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapL
         if label not in refused:
             rgb[interior] = [to_rgb(colours.get(str(n), UNKNOWN_COLOUR)) for n in names]
     ax.imshow(rgb, extent=extent_mm(ctx), origin="lower", interpolation="nearest")
+    _crop(ax, ctx)
     labels = []
     for row in ctx.materials:
         x0, _, x1, y1 = row["box_mm"]
@@ -65,9 +69,16 @@ def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapL
         below = "" if row.get("confidence") is None else f"{100 * row['confidence']:.0f} %"
         below = "not judged" if row.get("refused") else below
         text = write_label(ax, (x0 + x1) / 2, y1 + 0.5, f"{name}\n{below}" if below else name, size, above=True)
+        _keep_inside(ax, text, y1)
         labels.append(MapLabel(text, str(row["label"]), name, patch_colour(row, colours), below))
-    _crop(ax, ctx)
     return labels
+
+
+def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
+    """Put a label below the upper edge of its patch where there is no room above: it would reach into the title."""
+    bottom, top = ax.get_ylim()
+    if top_mm > top - _ROOM * (top - bottom):
+        text.set(y=min(top_mm, top) - 1.0, verticalalignment="top")
 
 
 def _crop(ax: Axes, ctx: ReportContext) -> None:
@@ -102,6 +113,7 @@ def draw_truth(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapLabel
         ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, facecolor=colour, edgecolor=INK, linewidth=0.9))
         if y1 < top:
             text = write_label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
+            _keep_inside(ax, text, y1)
         else:  # larger than the image: a name above it would be far outside the picture
             text = write_label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
         labels.append(MapLabel(text, str(number), name, colour))

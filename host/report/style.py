@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
+from matplotlib.transforms import Bbox, BboxBase
 
 from polysight.host.report.context import ReportContext
 from polysight.host.report.fonts import figure_label, font_families
@@ -32,6 +33,7 @@ PALETTE = (
 UNKNOWN_COLOUR = "#BBBBBB"
 METAL_COLOUR, REFUSED_COLOUR = "#C9D3DE", "#8d949e"  # the metal reference; patches that were not judged
 HATCH = "////"
+_GAP_PT = 8.0  # between names side by side
 _LONGEST = 26  # characters of a name in a legend
 
 
@@ -156,14 +158,19 @@ def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
     if not labels:
         return []
     fig.draw_without_rendering()
+    gap = _GAP_PT * fig.dpi / 72
     boxes = [one.text.get_window_extent() for one in labels]
     frames = [one.text.axes.bbox if one.text.axes else fig.bbox for one in labels]
     outside = any(b.x0 < f.x0 - 1 or b.x1 > f.x1 + 1 for b, f in zip(boxes, frames, strict=True))
-    if not outside and not any(a.overlaps(b) for a, b in combinations(boxes, 2)):
+    if not outside and not any(a.overlaps(b) for a, b in combinations([_widened(b, gap) for b in boxes], 2)):
         return []
     for one in labels:
-        one.text.set_text(f"{one.number}\n{one.below}" if one.below else one.number)
+        one.text.set_text(f"{one.number}: {one.below}" if one.below else one.number)
     return list(labels)
+
+
+def _widened(box: BboxBase, gap: float) -> Bbox:
+    return Bbox.from_extents(box.x0 - gap / 2, box.y0, box.x1 + gap / 2, box.y1)
 
 
 def name_legend(fig: Figure, labels: Sequence[MapLabel]) -> None:

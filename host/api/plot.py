@@ -42,6 +42,7 @@ def plot_scan(done: ProcessedScan) -> Figure:
         metal_referenced=named,
         materials=done.segments,
         segments=done.labels,
+        verdict=done.verdict,
     )
     draw_overview(fig, list(fig.subplots(rows, columns).flat), context, bar_labels=True)
     stamp = {True: " (simulated)", False: "", None: " (not known whether simulated)"}[done.simulated]

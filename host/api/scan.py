@@ -27,6 +27,7 @@ from polysight.host.products import (
     write_zarr,
 )
 from polysight.host.store import MANIFEST, ScanFolder, Source, open_source
+from polysight.host.verdict import Verdict
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
 
 RIG = Path("instrument.toml")
 Box = tuple[float, float, float, float]
+_PERMITTIVITY = (
+    "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error",
+    "permittivity_real_loss_covariance", "dominated_by", "refused",
+)  # fmt: skip
 
 
 def open_scan(
@@ -158,7 +163,7 @@ class Scan:
     Results are computed once and kept. Each call returns new arrays, so that changing them changes no later result.
     Every dataset has named dimensions (`y`, `x` in metres in the rig frame, `patch`), `units` and `long_name` on each
     variable, and its provenance as attributes: `scan_id`, `simulated`, `rig`, `versions`, `processed_utc`,
-    `rows_missing`, `positions_masked`.
+    `rows_missing`, `positions_masked`, `verdict`.
 
     Attributes
     ----------
@@ -179,6 +184,14 @@ class Scan:
     def simulated(self) -> bool | None:
         """True if the data is simulated; None when the products do not say."""
         return self._source.simulated if self._source is not None else self._saved.simulated
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """How far the result may be trusted, with reasons; None where it was not judged (products of earlier releases).
+
+        Processes recorded rows where there are no products. Raises as :meth:`image`.
+        """
+        return self._saved.verdict if self._saved_products is not None else self._processed(True).verdict
 
     @property
     def rig(self) -> Instrument:
@@ -218,7 +231,8 @@ class Scan:
         Returns
         -------
         xarray.Dataset
-            `h` (s-polarised), `v` (p-polarised), `p` (H / V) complex64 [y, x], `valid` bool [y, x], `incidence_deg`.
+            `h` (s-polarised), `v` (p-polarised), `p` (H / V) complex64 [y, x], `valid` bool [y, x], `incidence_deg`;
+            `p_sigma` (standard deviation of `p`) where it is known.
 
         Raises
         ------
@@ -250,8 +264,10 @@ class Scan:
         -------
         xarray.Dataset
             On dimension `patch`: `permittivity` complex128, `permittivity_real_standard_error`,
-            `permittivity_loss_standard_error`, `ratio` (P) complex128, `inverse_ratio_standard_error` (of 1 / P),
-            `patch_incidence_deg`, `name`, `pixels`; `true_permittivity` for a simulated scene.
+            `permittivity_loss_standard_error`, `permittivity_real_loss_covariance`, `dominated_by` (what most of the
+            error comes from), `refused` (why a patch was not judged), `ratio` (P) complex128,
+            `inverse_ratio_standard_error` (of 1 / P), `patch_incidence_deg`, `name`, `pixels`; `true_permittivity` for
+            a simulated scene.
 
         Raises
         ------
@@ -259,27 +275,28 @@ class Scan:
             as :meth:`image`.
         """
         return self._columns(
-            "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error", "ratio",
-            "inverse_ratio_standard_error", "patch_incidence_deg", "name", "pixels", "true_permittivity",
+            *_PERMITTIVITY, "ratio", "inverse_ratio_standard_error", "patch_incidence_deg", "name", "pixels",
+            "true_permittivity",
         )  # fmt: skip
 
     def materials(self) -> xarray.Dataset:
-        """Name of each patch.
+        """Name of each patch, and its permittivity with errors.
 
         Returns
         -------
         xarray.Dataset
             On dimension `patch`: `name` ("" when not named, "unknown" when it is none of the library), `confidence`,
             `runner_up` and `runner_up_share` (the next name by number of pixels), `metal_reference`, `pixels`;
-            `true_name` for a simulated scene. Attributes `library`, `model`.
+            `permittivity`, its errors, `dominated_by` and `refused` as of :meth:`permittivity`; `true_name` for a
+            simulated scene. Attributes `library`, `model`, `verdict`.
 
         Raises
         ------
         DataError
             as :meth:`image`.
         """
-        names = ("name", "confidence", "runner_up", "runner_up_share", "metal_reference", "pixels", "true_name")
-        return self._columns(*names)
+        names = ("name", "confidence", "runner_up", "runner_up_share", "metal_reference", "pixels")
+        return self._columns(*names, *_PERMITTIVITY, "true_name")
 
     def plot(self, *, metal_referenced: bool = True) -> Figure:
         """Figure of |H|, |V|, |P| (dB), and of the materials' names if metal-referenced; axes in mm.

@@ -50,7 +50,7 @@ def _concentration(args: argparse.Namespace) -> int:
 
 
 def _classify(args: argparse.Namespace) -> int:
-    from polysight.host.jobs.materials import classify
+    from polysight.host.jobs.classify import classify
 
     return classify(args.data, args.library, args.model, args.json)
 

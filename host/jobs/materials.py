@@ -1,7 +1,7 @@
-"""Commands on materials in saved products: the table, names, permittivity through layers, and concentration.
+"""Commands on materials in saved products: the table, permittivity through layers, and concentration.
 
-`classify` names the patches of several scans together, or judges the models on a library; `report` finds the report of
-a scan, or makes it again from the raw rows.
+Each prints the verdict first, and nothing of the patches where it is `none`. `report` finds the report of a scan, or
+makes it again from the raw rows.
 """
 
 from __future__ import annotations
@@ -15,28 +15,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from polysight.host.imaging import sub_bands
+from polysight.host.jobs.print_verdict import print_verdict
 from polysight.host.materials import (
     AMPLITUDE_ERROR,
-    PATCHES,
-    SIMULATED_LIBRARY,
-    Classifier,
     Layer,
     LayerFit,
     Library,
-    MatchedPatch,
-    Verdict,
     bands_of_row,
     fit_concentration,
     fit_layer,
     format_permittivity,
-    match_patches,
     read_materials,
 )
-from polysight.host.products import MATERIALS, SCAN, SavedProducts, find_products, read_products
-from polysight.host.report import classifier_sentence
+from polysight.host.products import (
+    MATERIALS,
+    SCAN,
+    SavedProducts,
+    find_products,
+    permittivity_spread,
+    read_products,
+    refused_text,
+)
 from polysight.shared.config import Chirp, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 
@@ -98,6 +99,8 @@ def permittivity(
 ) -> int:
     """Permittivity of patches, as one interface or as the unknown layer of a stack; returns the exit status.
 
+    Without a result (verdict `none`) no permittivity is printed, and the exit status is that of NoResult.
+
     `folder` holds the products, or is the scan folder that holds them. The chirp is the one they were made with, as
     their scan.json says; `config` replaces it. With `bands` above 1 the stack is fitted to so many sub-bands of the
     sweep, which the products must hold. `amplitude_error` is how far |H| may be trusted, relative; 0 leaves it out.
@@ -109,8 +112,12 @@ def permittivity(
         chirp it was made, or its sub-bands are of another one.
     ConfigError
         when `config` cannot be read.
+    NoResult
+        when a stack is to be fitted to data whose verdict is `none`.
     """
     products = read_products(folder, MATERIALS)
+    if stack and products.verdict is not None and not products.verdict.usable:
+        raise products.verdict.error("the images are kept")
     rows = [r for r in products.segments if segment is None or r["label"] == segment]
     if not rows:
         raise DataError(f"{products.folder}: no segment {segment}", f"its number is not in {MATERIALS}")
@@ -123,13 +130,17 @@ def permittivity(
             data = bands_of_row(row, chirp, bands, amplitude_error)
             found = fit_layer(data, stack, float(np.radians(row["incidence_deg"]))) if data else None
         out.append({"label": row["label"], "name": row["name"], "single_interface": row["permittivity"]})
+        if row.get("refused"):
+            out[-1]["refused"] = row["refused"]
         if found is not None:
             out[-1]["layer"] = _layer_row(found)
     if as_json:
         sys.stdout.write(json.dumps(out, indent=1) + "\n")
-    else:
+        return print_verdict(products, to_terminal=False)
+    status = print_verdict(products)
+    if status == 0:
         sys.stdout.write("".join(_line(row) for row in out))
-    return 0
+    return status
 
 
 def _layer_row(fit: LayerFit) -> dict[str, Any]:
@@ -142,18 +153,27 @@ def _layer_row(fit: LayerFit) -> dict[str, Any]:
 def _line(row: Mapping[str, Any]) -> str:
     head = f"{row['label']:>3}  {row['name'] or '':24s}"
     single = row["single_interface"]
+    if row.get("refused"):
+        return f"{head} not judged: {refused_text(row)}\n"
     if single is None:
         return f"{head} metal-like: no permittivity\n"
-    text = f"{head} one interface {format_permittivity(complex(single['real'], single['imag']), width=6):15s}"
-    if single.get("real_std") is not None:
-        text += f"  +- {single['real_std']:.2f}"
+    text = f"{head} one interface {_estimate(single)}"
     layer = row.get("layer")
     if layer is not None:
         real, loss = layer["permittivity"]
         text += f"   in the stack {format_permittivity(complex(real, -loss), width=6):15s}"
         text += f"  +- {layer['std_real']:.2f}, {layer['std_loss']:.2f}"
         text += "".join(f"\n     note: {w}" for w in layer["warnings"])
-    return text + "\n"
+    return text.rstrip() + "\n"
+
+
+def _estimate(permittivity: Mapping[str, Any]) -> str:
+    """A permittivity with the errors of both parts, and what most of them comes from."""
+    text = f"{format_permittivity(complex(permittivity['real'], permittivity['imag']), width=6):15s}"
+    if spread := permittivity_spread(permittivity):
+        text += f"  +- {spread.real_std:.2f}, {spread.loss_std:.2f}"
+    main = permittivity.get("dominated_by")
+    return f"{text}  mostly {main}" if main else text
 
 
 def concentration(data: Path, given: Mapping[str, float], confidence: float, as_json: bool) -> int:
@@ -196,6 +216,8 @@ def concentration(data: Path, given: Mapping[str, float], confidence: float, as_
 def materials(data: Sequence[Path], as_json: bool) -> int:
     """What the patches of processed scans were named, and their permittivity; returns the exit status.
 
+    That of NoResult when one of the scans has none (verdict `none`): nothing is said of its patches.
+
     Raises
     ------
     DataError
@@ -204,27 +226,32 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
     scans = [read_products(folder, MATERIALS) for folder in data]
     if as_json:
         sys.stdout.write(json.dumps([{"products": str(s.folder), **s.materials} for s in scans], indent=1) + "\n")
-        return 0
+        return max((print_verdict(s, to_terminal=False) for s in scans), default=0)
+    worst = 0
     for scan in scans:
         kind = "simulated " if scan.simulated else ""
-        sys.stdout.write(f"{scan.folder}: {kind}scan {scan.scan_id}\n" + "".join(map(_patch_line, scan.segments)))
-    return 0
+        sys.stdout.write(f"{scan.folder}: {kind}scan {scan.scan_id}\n")
+        status = print_verdict(scan)
+        if status == 0:
+            sys.stdout.write("".join(map(_patch_line, scan.segments)))
+        worst = max(worst, status)
+    return worst
 
 
 def _patch_line(row: dict[str, Any]) -> str:
-    name = row["name"] or "not named"
+    name = row["name"] or ("metal reference" if row.get("metal_reference") else "not named")
+    if row.get("refused"):
+        return f"{row['label']:>3}  {'not judged':24s} {refused_text(row)}\n"
     sure = f"{100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
     e = row.get("permittivity")
-    told = "metal-like" if row.get("metal_like") else "-"
-    if e is not None:
-        told = f"{format_permittivity(complex(e['real'], e['imag']), width=6):15s}"
-    if e is not None and e.get("real_std") is not None:
-        told += f"  +- {e['real_std']:.2f}"
+    told = _estimate(e) if e is not None else "metal-like" if row.get("metal_like") else "-"
     return f"{row['label']:>3}  {name:24s} {sure:>5s}  {told}".rstrip() + "\n"
 
 
 def report(folder: Path) -> int:
     """Say where the report of a scan is, and make it from the raw rows where it is not there; the exit status.
+
+    That of NoResult when the scan has none; the report says why.
 
     Raises
     ------
@@ -236,131 +263,9 @@ def report(folder: Path) -> int:
         from polysight.host.jobs.process import process
         from polysight.host.process import ProcessRequest
 
-        return process(ProcessRequest(data=str(folder), out=str(folder / "products")))
+        status = process(ProcessRequest(data=str(folder), out=str(folder / "products")))
+        made = find_products(folder, REPORT)
+        return status if status or made is None else print_verdict(made, to_terminal=False)
+    status = print_verdict(found)
     sys.stdout.write(f"report:   {found.folder / REPORT}\n")
-    return 0
-
-
-def classify(data: Sequence[Path], library: Path | None, model: str | None, as_json: bool) -> int:
-    """Name the patches of processed scans together, or judge the models on one library; returns the exit status.
-
-    Parameters
-    ----------
-    data
-        Folders that `polysight process` wrote, or scan folders, one for each incidence angle; or a library (.npz), or a
-        folder of the published material files.
-    library, model
-        Of the naming; without: the simulated library, and the model that was chosen for it.
-    as_json
-        Print JSON.
-
-    Raises
-    ------
-    ConfigError
-        when the data are of both kinds.
-    DataError
-        when something in them cannot be used.
-    """
-    scans = [find_products(folder, PATCHES) for folder in data]
-    found = [s for s in scans if s is not None]
-    if len(found) == len(scans):
-        return _name(found, library or SIMULATED_LIBRARY, model, as_json)
-    if len(data) > 1:
-        other = data[scans.index(None)]
-        raise ConfigError(
-            f"{other}: not a folder of products", "several scans are named together from what polysight process wrote",
-            f"polysight process SCAN --out {other}",
-        )  # fmt: skip
-    if library is not None or model is not None:
-        raise ConfigError(
-            f"{data[0]}: no patches of a scan, so --library and --model would do nothing",
-            "they choose what names patches; on a library every model is judged",
-            "leave them out, or give a folder that polysight process wrote",
-        )
-    return _judge(data[0], as_json)
-
-
-def _judge(data: Path, as_json: bool) -> int:
-    from polysight.host.materials import MODELS, Samples, score
-
-    library = read_materials(data) if data.is_dir() else Library.load(data)
-    if len(library.angles_deg) > 1:
-        sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
-        library = library.at(library.angles_deg[-1])
-    samples = Samples.of(library)
-    scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
-    source = "simulated" if library.simulated else "measured"
-    if as_json:
-        rows = [{k: v for k, v in asdict(s).items() if "confusion" not in k and k != "names"} for s in scores]
-        best = max(scores[::2], key=lambda s: s.pixels + s.patches)
-        content = {"source": source, "names": best.names, "scores": rows}
-        content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
-        return 0
-    sys.stdout.write(
-        f"{source}: {len(library.names)} materials, {len(library.scans)} scans, {samples.names.size} pixels\n"
-        f"{'':44s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
-        f"{'model':44s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
-    )
-    for held, mixed in zip(scores[::2], scores[1::2], strict=True):
-        sys.stdout.write(
-            f"{held.model:44s}{held.pixels:11.1%}{held.patches:11.1%}{mixed.pixels:12.1%}{mixed.patches:12.1%}\n"
-        )
-    if missing := scores[0].not_judged:
-        sys.stdout.write(f"not judged with scans left out, because one scan alone holds them: {', '.join(missing)}\n")
-    return 0
-
-
-def _name(products: Sequence[SavedProducts], library_path: Path, model: str | None, as_json: bool) -> int:
-    library = Library.load(library_path)
-    scans = [p.patches for p in products]
-    classifier = Classifier(library, model=model, angles_deg=[s.angle_deg for s in scans])
-    matched = match_patches(scans)
-    if not matched:
-        raise DataError(
-            f"{products[-1].folder}: none of its patches lies where one of {products[0].folder} does",
-            "the object was moved between the scans, or these are scans of other objects",
-            "scan the same patches in the same places",
-        )
-    named = classifier.scan([m.features for m in matched])
-    rows = [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)]
-    simulated = any(s.simulated for s in scans)
-    once = sum(len(s.patches) for s in scans) - len(scans) * len(matched)
-    if as_json:
-        content = {
-            "source": "simulated" if simulated else "measured",
-            "incidence_deg": [s.angle_deg for s in scans],
-            "model": classifier.model,
-            "library": classifier_sentence(classifier),
-            "patches": rows,
-            "patches_not_in_every_scan": once,
-        }
-        sys.stdout.write(json.dumps(content, indent=1) + "\n")
-        return 0
-    angles = " and ".join(f"{s.angle_deg:.1f}" for s in scans)
-    sys.stdout.write(f"{'simulated: ' if simulated else ''}{len(rows)} patches at {angles} degrees\n")
-    for row in rows:
-        votes = ", ".join(f"{name} {share:.0%}" for name, share in list(row["votes"].items())[:2])
-        truth = f"   truly {row['truth']}" if row["truth"] else ""
-        sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {row['confidence']:6.1%}   pixels: {votes}{truth}\n")
-    known = [r for r in rows if r["truth"]]
-    if known:
-        right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
-        sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
-    if once:
-        sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
-    sys.stdout.write(classifier_sentence(classifier) + "\n")
-    return 0
-
-
-def _row(matched: MatchedPatch, verdict: Verdict, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
-    return {
-        "label": matched.label,
-        "name": verdict.name,
-        "confidence": verdict.confidence,
-        "votes": verdict.votes,
-        "distance": verdict.distance if np.isfinite(verdict.distance) else None,
-        "pixels": verdict.pixels,
-        "truth": matched.truth,
-        "pixels_right": float((pixels == matched.truth).mean()) if matched.truth else None,
-    }
+    return status

@@ -12,6 +12,7 @@ from polysight.host.page.images import Shown
 from polysight.host.page.listener import Heard
 from polysight.host.page.story import Notice, Story
 from polysight.host.page.verdict import Signs, judge, no_scan, sync_notices, unreadable
+from polysight.host.verdict import Verdict
 from polysight.shared.raster import WIDTH_US
 
 PAPER_PHASE_RAD = 0.022
@@ -33,6 +34,7 @@ class Content:
     asked: Wish | None
     control: bool
     problem: str
+    verdict: Verdict | None = None
 
 
 def make_snapshot(c: Content) -> dict[str, Any]:
@@ -55,6 +57,7 @@ def make_snapshot(c: Content) -> dict[str, Any]:
         "profile": _profile(c.shown),
         "sync": _sync(c.shown),
         "notices": _notices(c),
+        "verdict": _verdict(c),
     }
 
 
@@ -75,6 +78,13 @@ def make_motion(c: Content) -> dict[str, Any]:
         "point": h.point,
         "state": h.state,
     }
+
+
+def _verdict(c: Content) -> dict[str, Any] | None:
+    """How far the results may be trusted, when the scan has ended and was processed."""
+    if c.verdict is None or c.story is None or c.story.ended is None:
+        return None
+    return {**c.verdict.to_dict(), "text": c.verdict.text}
 
 
 def remaining(story: Story, now_s: float) -> tuple[int | None, str]:

@@ -20,6 +20,7 @@ import msgpack
 from polysight.host.acquisition import Wish, ask, last_sign_of_life
 from polysight.host.page.images import RowViewer, Shown
 from polysight.host.page.listener import Heard, PiListener
+from polysight.host.page.result import ResultTail
 from polysight.host.page.snapshot import Content, make_motion, make_snapshot
 from polysight.host.page.story import Story
 from polysight.host.page.verdict import Signs
@@ -153,6 +154,7 @@ class Watch:
     def _begin(self) -> None:
         """Forget everything: another scan may be in the folder now."""
         self._manifest, self._events = ManifestTail(self.folder / MANIFEST), EventTail(self.folder / EVENTS)
+        self._result = ResultTail(self.folder)
         self._content = Manifest()
         self._story: Story | None = None
         self._viewer: RowViewer | None = None
@@ -177,8 +179,9 @@ class Watch:
         self.shown = self._viewer.shown if self._viewer is not None else Shown()
         heard = self._listener.heard if self._listener is not None else Heard()
         content = Content(
-            self.folder, self._story, self._signs(heard), heard, self.shown, self._wish(), self.control, self._problem
-        )
+            self.folder, self._story, self._signs(heard), heard, self.shown, self._wish(), self.control, self._problem,
+            self._result.look(),
+        )  # fmt: skip
         self.state = _publish(self.state, make_snapshot(content))
         self.motion = _publish(self.motion, make_motion(content))
 

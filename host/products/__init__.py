@@ -7,13 +7,11 @@ found by `read_products`, is the one place that knows how the files are laid out
 from polysight.host.products.dataset_files import read_netcdf, write_netcdf, write_zarr
 from polysight.host.products.datasets import (
     CONVENTION,
-    ProcessedScan,
-    Rows,
     full_dataset,
     image_dataset,
     patch_dataset,
-    read_processed,
     runs,
+    verdict_attributes,
 )
 from polysight.host.products.files import (
     FINISHED,
@@ -35,7 +33,14 @@ from polysight.host.products.files import (
     write_scan_facts,
 )
 from polysight.host.products.folder import RAW_DROPPED, check_products_folder, making_products
-from polysight.host.products.material_table import material_columns
+from polysight.host.products.material_table import (
+    PermittivitySpread,
+    material_columns,
+    permittivity_spread,
+    refused_text,
+)
+from polysight.host.products.processed import ProcessedScan, Rows, read_processed
+from polysight.host.products.withhold import withhold
 
 __all__ = [
     "CONVENTION",
@@ -46,6 +51,7 @@ __all__ = [
     "QUALITY",
     "RAW_DROPPED",
     "SCAN",
+    "PermittivitySpread",
     "ProcessedScan",
     "Rows",
     "SavedProducts",
@@ -56,14 +62,18 @@ __all__ = [
     "making_products",
     "material_columns",
     "patch_dataset",
+    "permittivity_spread",
     "plain",
     "read_image",
     "read_netcdf",
     "read_processed",
     "read_products",
+    "refused_text",
     "runs",
     "rx_gains",
     "scan_facts",
+    "verdict_attributes",
+    "withhold",
     "write_atomically",
     "write_image",
     "write_json",

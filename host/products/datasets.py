@@ -9,153 +9,26 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from skimage import measure
 
-from polysight.host.materials import PATCHES, axis_mm, box_mask, image_centre_mm
+from polysight.host.materials import image_centre_mm
 from polysight.host.polarimetry import incidence_choice, specular_incidence_rad
-from polysight.host.products.files import SavedProducts
 from polysight.host.products.material_table import material_columns
-from polysight.shared.config import Instrument
+from polysight.host.products.processed import ProcessedScan
+from polysight.host.verdict import Verdict
 from polysight.shared.errors import DataError
-from polysight.shared.tables import decode
 
 if TYPE_CHECKING:
     import xarray
 
-Labels = npt.NDArray[np.int32]
-Mask = npt.NDArray[np.bool_]
 CONVENTION = (
     "H: s-polarised, V: p-polarised, P = H / V, relative to metal where a reference was found; row 0 is the smallest y,"
     " column 0 the smallest x; rig frame; permittivity is real - j loss"
 )
 UNREFERENCED = "none: h, v and p are in arbitrary units"
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Rows of a scan, counted from 0.
-
-    Attributes
-    ----------
-    planned
-        Number of rows in the plan.
-    committed
-        Indices of the rows that hold data, ascending.
-    """
-
-    planned: int
-    committed: tuple[int, ...]
-
-    @property
-    def indices(self) -> range:
-        """Indices of all planned rows."""
-        return range(self.planned)
-
-    @property
-    def missing(self) -> tuple[int, ...]:
-        """Indices of the planned rows that hold no data."""
-        return tuple(sorted(set(self.indices) - set(self.committed)))
-
-
-@dataclass(frozen=True)
-class ProcessedScan:
-    """Result of processing a scan, in memory: the content of its product files.
-
-    Attributes
-    ----------
-    image
-        `h`, `v`, `p` complex64 [ny, nx], `valid` bool [ny, nx], `x_m`, `y_m` float64: image.npz.
-    scan, quality, materials
-        Content of scan.json, quality.json and materials.json. Without materials the image is not metal-referenced.
-    labels
-        int32 [ny, nx]: number of the patch that holds each pixel, 0 for none.
-    interior
-        bool [ny, nx]: pixels that the patches' statistics are made from; None when not known.
-    """
-
-    image: dict[str, npt.NDArray[Any]]
-    scan: dict[str, Any]
-    quality: dict[str, Any]
-    materials: dict[str, Any]
-    labels: Labels
-    interior: Mask | None
-
-    @property
-    def segments(self) -> list[dict[str, Any]]:
-        """Patches as materials.json lists them."""
-        return list(self.materials.get("segments", []))
-
-    @property
-    def metal_referenced(self) -> bool:
-        """True if h, v and p are relative to metal."""
-        return bool(self.materials)
-
-    @property
-    def scan_id(self) -> str:
-        """Name of the scan; "" when it is not known."""
-        return str(self.scan.get("scan_id", self.materials.get("scan_id", "")))
-
-    @property
-    def simulated(self) -> bool | None:
-        """True if the data was simulated; None when it is not known."""
-        return self.scan.get("simulated", self.materials.get("simulated"))
-
-    @cached_property
-    def rig(self) -> Instrument | None:
-        """Rig file the images were made with; None when it is not known. Raises ConfigError."""
-        raw = self.scan.get("instrument")
-        return None if raw is None else decode(raw, Instrument, f"scan.json of {self.scan_id}: instrument")
-
-    @property
-    def rows(self) -> Rows | None:
-        """Rows of the scan and those in the images; None when they are not known."""
-        boards = self.quality.get("boards", {}).values()
-        if self.rig is None or not boards or any("rows_recorded" not in b for b in boards):
-            return None
-        committed = set.intersection(*(set(b["rows_recorded"]) for b in boards))
-        by_columns = self.quality.get("recording", {}).get("direction") == "col"
-        planned = self.rig.grid.columns if by_columns else self.rig.grid.rows
-        return Rows(planned, tuple(sorted(committed)))
-
-
-def read_processed(products: SavedProducts) -> ProcessedScan:
-    """Read a folder of products. Raises DataError when a file is damaged."""
-    image = products.image
-    labels, interior = _saved_patches(products)
-    return ProcessedScan(image, products.scan, products.quality, products.materials, labels, interior)
-
-
-def _saved_patches(products: SavedProducts) -> tuple[Labels, Mask | None]:
-    """Labels from the patches' outlines, accurate to half a pixel, and the interiors from patches.npz."""
-    x, y = axis_mm(products.x_m), axis_mm(products.y_m)
-    labels = np.zeros((y.size, x.size), np.int32)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    for s in products.segments:
-        outline = np.asarray(s.get("outline_mm") or [], np.float64)
-        if len(outline):
-            inside = measure.points_in_poly(points, outline).reshape(labels.shape)
-        else:
-            inside = box_mask(tuple(s["box_mm"]), products.x_m, products.y_m)
-        labels[inside] = s["label"]
-    if not (products.folder / PATCHES).exists():
-        return labels, None
-    interior = np.zeros(labels.shape, bool)
-    for patch in products.patches.patches:
-        columns, rows = (_nearest(axis, patch.places_mm[:, i]) for i, axis in enumerate((x, y)))
-        labels[rows, columns] = patch.label
-        interior[rows, columns] = True
-    return labels, interior
-
-
-def _nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
-    """Indices of the axis values nearest to `places`; the axis is evenly spaced."""
-    return np.rint((places - axis[0]) / (axis[1] - axis[0])).astype(np.intp)
 
 
 def runs(numbers: Sequence[int]) -> str:
@@ -169,10 +42,19 @@ def runs(numbers: Sequence[int]) -> str:
     return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in found) or "none"
 
 
+def verdict_attributes(verdict: Verdict | None) -> dict[str, str]:
+    """`verdict`, its level, and `verdict_reasons` as JSON (what, why, do); nothing where there is no verdict."""
+    if verdict is None:
+        return {}
+    content = verdict.to_dict()
+    return {"verdict": content["level"], "verdict_reasons": json.dumps(content["reasons"], ensure_ascii=False)}
+
+
 def provenance(done: ProcessedScan) -> dict[str, Any]:
     """Attributes of every dataset: what the data is and where it comes from. Unknown entries are left out.
 
-    `simulated` is True, False or "unknown"; `versions` is JSON; `rows_missing` and `positions_masked` are text.
+    `simulated` is True, False or "unknown"; `versions` is JSON; `rows_missing` and `positions_masked` are text; see
+    :func:`verdict_attributes` for `verdict` and `verdict_reasons`.
     """
     simulated = "unknown" if done.simulated is None else done.simulated
     attrs: dict[str, Any] = {
@@ -183,6 +65,7 @@ def provenance(done: ProcessedScan) -> dict[str, Any]:
         "metal_reference": done.materials.get("metal_reference", {}).get("how", "given")
         if done.metal_referenced
         else UNREFERENCED,
+        **verdict_attributes(done.verdict),
     }
     if done.rig is not None:
         attrs["rig"] = done.rig.name
@@ -230,6 +113,7 @@ def image_dataset(done: ProcessedScan) -> xarray.Dataset:
     xarray.Dataset
         Dimensions `y`, `x` (metres, rig frame). `h`, `v`, `p` complex64 [y, x]: s-polarised and p-polarised channel
         and their ratio, relative to metal where `metal_reference` does not begin with "none". `valid` bool [y, x].
+        `p_sigma` float32 [y, x], the standard deviation of `p`, where the products have it.
         `incidence_deg`: one angle, or [y, x] where the scan was processed with each pixel's own; left out when the
         rig is not known. Attributes: :func:`provenance`.
     """
@@ -243,6 +127,9 @@ def image_dataset(done: ProcessedScan) -> xarray.Dataset:
         "p": _described(plane, image["p"], "1", f"polarisation ratio H / V, {unit}"),
         "valid": _described(plane, image["valid"], "1", "True where the scan illuminates the pixel"),
     }
+    if "p_sigma" in image:
+        about = "standard deviation of p: root of the mean variance of its real and imaginary part"
+        data["p_sigma"] = _described(plane, image["p_sigma"], "1", about)
     if done.rig is not None:
         if done.quality.get("incidence", {}).get("used") == "by pixel":
             angles = incidence_choice(done.rig, image["x_m"], image["y_m"], "pixel").used_rad
@@ -269,9 +156,10 @@ def patch_dataset(done: ProcessedScan) -> xarray.Dataset:
         `label` int32 [y, x] (0: no patch) and, where known, `interior` bool [y, x], the pixels behind the numbers.
         On dimension `patch`: `name`, `confidence`, `runner_up`, `runner_up_share`, `metal_reference`, `metal_like`,
         `width` and `height` (m), `pixels`, `patch_incidence_deg`, `ratio` and `permittivity` (complex) with their
-        standard errors, where the truth is known `true_name` and `true_permittivity`, and with sub-bands `band_ratio`
-        [patch, band]. Coordinates `centre_x` and `centre_y` (m, rig frame). Attributes: :func:`provenance`,
-        `library`, `model`.
+        standard errors, `permittivity_real_loss_covariance`, `dominated_by` (what most of the error comes from) and
+        `refused` (why a patch was not judged), where the truth is known `true_name` and `true_permittivity`, and with
+        sub-bands `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y` (m, rig frame). Attributes:
+        :func:`provenance`, `library`, `model`.
 
     Raises
     ------
@@ -328,6 +216,10 @@ def _table(done: ProcessedScan) -> dict[str, Any]:
     for part in ("real", "loss"):
         name = f"permittivity_{part}_standard_error"
         rows.append((name, _numbers(c[name]), "1", f"standard error of the permittivity, {part} part"))
+    name = "permittivity_real_loss_covariance"
+    rows.append((name, _numbers(c[name]), "1", "covariance of the permittivity's real part and loss"))
+    rows.append(("dominated_by", _text(c["dominated_by"]), "", "what most of the permittivity's error comes from"))
+    rows.append(("refused", _text(c["refused"]), "", "why the patch was not judged, and what to do"))
     if any(c["true_name"]):
         truth = _complex(c["true_permittivity_real"], c["true_permittivity_loss"], -1)
         rows.append(("true_name", _text(c["true_name"]), "", "material of the simulated scene"))

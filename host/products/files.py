@@ -22,7 +22,9 @@ import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials import PATCHES, SeenPatches, read_patches
+from polysight.host.products.withhold import withhold
 from polysight.host.store import Scan, versions
+from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import decode, to_builtins
@@ -30,6 +32,7 @@ from polysight.shared.tables import decode, to_builtins
 SCAN = "scan.json"
 IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
 FINISHED = ".finished.json"  # says what the products were made with, when several scans are processed
+_OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not write
 _PRODUCTS = "products"  # of a scan folder
 
 
@@ -56,7 +59,8 @@ def write_image(
 ) -> None:
     """Write image.npz: h, v, p complex64 [ny, nx], x_m, y_m float64, valid bool; row 0 is the smallest y.
 
-    `p_sigma` float32 [ny, nx] is the standard deviation of p; None: not known, NaN everywhere.
+    `p_sigma` float32 [ny, nx] is the standard deviation of the complex p, not a number where it is not known; without,
+    the file does not hold it.
 
     Raises
     ------
@@ -64,8 +68,8 @@ def write_image(
         when shapes do not fit each other.
     """
     shape = (np.size(y_m), np.size(x_m))
-    sigma = np.full(shape, np.nan, np.float32) if p_sigma is None else p_sigma
-    for name, array in (("h", h), ("v", v), ("p", p), ("valid", valid), ("p_sigma", sigma)):
+    more: dict[str, Any] = {} if p_sigma is None else {"p_sigma": p_sigma.astype(np.float32)}
+    for name, array in (("h", h), ("v", v), ("p", p), ("valid", valid), *more.items()):
         if array.shape != shape:
             raise DataError(f"image {name} has shape {array.shape}, axes say {shape}")
     buffer = io.BytesIO()
@@ -77,16 +81,17 @@ def write_image(
         x_m=np.asarray(x_m, np.float64),
         y_m=np.asarray(y_m, np.float64),
         valid=valid.astype(np.bool_),
-        p_sigma=sigma.astype(np.float32),
+        **more,
     )
     write_atomically(path, buffer.getvalue())
 
 
 def read_image(path: Path) -> dict[str, npt.NDArray]:
-    """Read image.npz (no pickle). Raises DataError."""
+    """Read image.npz (no pickle); `p_sigma` only where the file holds it. Raises DataError."""
+    names = ("h", "v", "p", "x_m", "y_m", "valid")
     try:
         with path.open("rb") as f, np.load(f, allow_pickle=False) as z:
-            return {k: z[k] for k in ("h", "v", "p", "x_m", "y_m", "valid")}
+            return {k: z[k] for k in (*names, *(k for k in _OPTIONAL if k in z))}
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(f"{path}: not an image product: {e}", "made by polysight process or image") from None
 
@@ -195,8 +200,8 @@ class SavedProducts:
 
     @cached_property
     def materials(self) -> dict[str, Any]:
-        """Content of materials.json; empty when no material was looked for."""
-        return _json(self.folder / MATERIALS)
+        """Content of materials.json as it may be shown (:func:`withhold`); empty when no material was looked for."""
+        return withhold(_json(self.folder / MATERIALS))
 
     @cached_property
     def quality(self) -> dict[str, Any]:
@@ -220,6 +225,16 @@ class SavedProducts:
         if not isinstance(found, list):
             raise _damaged(self.folder / MATERIALS, "its segments are no list")
         return list(found)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """How far the result may be trusted; None in products of earlier releases."""
+        return read_verdict(self.materials) or read_verdict(self.quality)
+
+    @property
+    def p_sigma(self) -> npt.NDArray[np.float32] | None:
+        """Standard deviation of the complex P, float32 [ny, nx]; None in products of earlier releases."""
+        return self.image.get("p_sigma")
 
     @property
     def simulated(self) -> bool | None:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
 
 _COLUMNS = (
     "patch", "name", "confidence", "metal_reference", "metal_like", "centre_x_mm", "centre_y_mm", "width_mm",
     "height_mm", "pixels", "incidence_deg", "permittivity_real", "permittivity_real_standard_error",
-    "permittivity_loss", "permittivity_loss_standard_error", "p_real", "p_imag", "p_abs_db", "p_phase_deg",
-    "inverse_p_standard_error", "true_name", "true_permittivity_real", "true_permittivity_loss",
+    "permittivity_loss", "permittivity_loss_standard_error", "permittivity_real_loss_covariance", "dominated_by",
+    "refused", "p_real", "p_imag", "p_abs_db", "p_phase_deg", "inverse_p_standard_error", "true_name",
+    "true_permittivity_real", "true_permittivity_loss",
 )  # fmt: skip
 
 
@@ -22,11 +28,56 @@ class HasSegments(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class PermittivitySpread:
+    """Error of a permittivity eps' - j eps'': standard deviations of both parts, and how they go together.
+
+    Attributes
+    ----------
+    real_std, loss_std
+        Of eps' and of eps''.
+    covariance
+        Of eps' and eps''; None in products of earlier releases, which have standard errors only.
+    """
+
+    real_std: float
+    loss_std: float
+    covariance: float | None = None
+
+    @property
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """Covariance of (eps', eps''), [2, 2]; both count as independent where their covariance is not known."""
+        c = self.covariance or 0.0
+        return np.array([[self.real_std**2, c], [c, self.loss_std**2]])
+
+
+def permittivity_spread(permittivity: Mapping[str, Any] | None) -> PermittivitySpread | None:
+    """Error of a segment's `permittivity`; None where it is not known.
+
+    `covariance` of materials.json is that of (real, imag), and the loss is -imag: the sign of its mixed term changes.
+    """
+    e = permittivity or {}
+    given = e.get("covariance")
+    if given is not None and None not in (given[0][0], given[0][1], given[1][1]):
+        return PermittivitySpread(math.sqrt(given[0][0]), math.sqrt(given[1][1]), -given[0][1] + 0.0)
+    if e.get("real_std") is None or e.get("imag_std") is None:
+        return None
+    return PermittivitySpread(e["real_std"], e["imag_std"])
+
+
+def refused_text(segment: Mapping[str, Any]) -> str:
+    """Why a patch has no name and no permittivity, and what to do, in one line; "" where it was judged."""
+    refused = segment.get("refused") or {}
+    head = ": ".join(part for part in (refused.get("what"), refused.get("why")) if part)
+    return "; ".join(part for part in (head, refused.get("do")) if part)
+
+
 def material_columns(products: HasSegments) -> dict[str, list[Any]]:
     """Columns by name, an entry for each patch; None where a number is not known.
 
-    Permittivity is `permittivity_real` - j `permittivity_loss`; p_imag and p_phase are those of P = H / V relative to
-    metal; positions count from the image's centre.
+    Permittivity is `permittivity_real` - j `permittivity_loss`; `permittivity_real_loss_covariance` is of these two,
+    `dominated_by` what most of the error comes from, `refused` why a patch was not judged. p_imag and p_phase are those
+    of P = H / V relative to metal; positions count from the image's centre.
     """
     rows = [_row(segment) for segment in products.segments]
     return {name: [row[name] for row in rows] for name in _COLUMNS}
@@ -36,7 +87,7 @@ def _row(s: dict[str, Any]) -> dict[str, Any]:
     x0, y0, x1, y1 = s["box_mm"]
     e, truth = s.get("permittivity") or {}, s.get("truth") or {}
     true = truth.get("permittivity") or {}
-    p = s.get("ratio")
+    p, spread = s.get("ratio"), permittivity_spread(e)
     size = math.hypot(p["real"], p["imag"]) if p else 0.0
     return {
         "patch": s["label"],
@@ -51,9 +102,12 @@ def _row(s: dict[str, Any]) -> dict[str, Any]:
         "pixels": s.get("interior_pixels"),
         "incidence_deg": s.get("incidence_deg"),
         "permittivity_real": e.get("real"),
-        "permittivity_real_standard_error": e.get("real_std"),
+        "permittivity_real_standard_error": spread.real_std if spread else None,
         "permittivity_loss": _minus(e.get("imag")),
-        "permittivity_loss_standard_error": e.get("imag_std"),
+        "permittivity_loss_standard_error": spread.loss_std if spread else None,
+        "permittivity_real_loss_covariance": spread.covariance if spread else None,
+        "dominated_by": e.get("dominated_by"),
+        "refused": refused_text(s) or None,
         "p_real": p["real"] if p else None,
         "p_imag": p["imag"] if p else None,
         "p_abs_db": 20 * math.log10(size) if size else None,

@@ -6,18 +6,11 @@ leaves of errors; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from s
 
 from polysight.host.report.context import ReportContext, classifier_sentence, context_of
 from polysight.host.report.exports import export
-from polysight.host.report.figures import (
-    PALETTE,
-    banner_png,
-    draw_channel,
-    draw_overview,
-    extent_mm,
-    figures,
-    focus_figure,
-    png,
-)
+from polysight.host.report.figures import banner_png, draw_channel, draw_overview, figures
+from polysight.host.report.focus_figure import focus_figure
 from polysight.host.report.fonts import figure_label, font_families
 from polysight.host.report.report import write_report
+from polysight.host.report.style import PALETTE, extent_mm, png
 from polysight.host.report.sync_report import QUANTITIES, SyncReport, write_sync_report
 from polysight.host.report.tables import INK, MUTED, STAMP, manifest_sentence, recorded_sentence
 

@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
+from polysight.host.products import SavedProducts, withhold
+from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.raster import RasterPlan
 
 Image = npt.NDArray[np.complexfloating]
@@ -69,6 +72,11 @@ class ReportContext:
         Board to its RX: gain_db and phase_deg against the first, which were divided out.
     rig_file
         The whole rig file as text.
+    verdict
+        How far the result may be trusted; where not given that of `quality`, None when it does not say. Where it is
+        `none`, the context drops whatever it was given of names, permittivities and truth: nothing can show them.
+    error_budget
+        What materials.json says of leakage, plane, angle and metal.
     """
 
     title: str
@@ -94,6 +102,43 @@ class ReportContext:
     plan: RasterPlan | None = None
     rx_gains: dict[str, list[dict[str, float]]] = field(default_factory=dict)
     rig_file: str = ""
+    verdict: Verdict | None = None
+    error_budget: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        verdict = self.verdict or read_verdict(self.quality)
+        object.__setattr__(self, "verdict", verdict)
+        if verdict is None or verdict.usable:
+            return
+        bare = withhold({"verdict": verdict.to_dict(), "segments": self.materials})["segments"]
+        nothing: dict[str, Any] = {
+            "materials": [{**row, "metal_reference": False} for row in bare],
+            "quality": _without_results(self.quality),
+            **{"pixel_names": {}, "truth": None, "pixel_accuracy": None, "library_note": "", "metal_how": ""},
+        }
+        for name, value in nothing.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def judged(self) -> bool:
+        """False where the verdict is that nothing can be said of the patches."""
+        return self.verdict is None or self.verdict.usable
+
+    def with_products(self, folder: Path) -> ReportContext:
+        """The same with patches, verdict and error budget as the folder's materials.json has them, if it is there."""
+        saved = SavedProducts(folder)
+        if not saved.materials:
+            return self
+        budget = saved.materials.get("error_budget") or self.error_budget
+        return replace(self, materials=saved.segments, verdict=saved.verdict or self.verdict, error_budget=budget)
+
+
+def _without_results(quality: dict[str, Any]) -> dict[str, Any]:
+    """quality.json without what it says of names and permittivities."""
+    out = {k: v for k, v in quality.items() if k != "pixel_accuracy"}
+    if isinstance(out.get("incidence"), dict):
+        out["incidence"] = {k: v for k, v in out["incidence"].items() if "permittivity" not in k}
+    return out
 
 
 def context_of(

@@ -21,6 +21,7 @@ from polysight.host.products import (
     material_columns,
     read_processed,
     read_products,
+    verdict_attributes,
     write_atomically,
     write_netcdf,
     write_zarr,
@@ -31,8 +32,14 @@ from polysight.shared.errors import ConfigError, DataError
 
 
 def write_csv(path: Path, products: SavedProducts) -> None:
-    """Write the table as CSV: comma, UTF-8, a header line; what is not known is empty. Numbers keep all digits."""
+    """Write the table as CSV: comma, UTF-8, a header line; what is not known is empty. Numbers keep all digits.
+
+    The last columns, `verdict` and `verdict_reasons` (JSON), say the same in every line; products of earlier releases
+    are written without them.
+    """
     columns = material_columns(products)
+    count = len(columns["patch"])
+    columns |= {name: [value] * count for name, value in verdict_attributes(products.verdict).items()}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -40,6 +47,14 @@ def write_csv(path: Path, products: SavedProducts) -> None:
     write_atomically(path, text.getvalue().encode("utf-8"))
 
 
+_PLANES = {
+    "h": "s-polarised channel",
+    "v": "p-polarised channel",
+    "p": "polarisation ratio H / V",
+    "p_sigma": "standard deviation of p: root of the mean variance of its real and imaginary part",
+    "valid": "whether the scan illuminates the pixel",
+}
+_TEXT = ("name", "true_name", "dominated_by", "refused")
 _UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
 
 
@@ -57,9 +72,10 @@ def _h5py() -> Any:
 def write_hdf5(path: Path, products: SavedProducts) -> None:
     """Write a file of these products.
 
-    /h, /v, /p complex64 [y, x], /valid bool [y, x]; /x, /y float64 in metres, the dimension scales of all four; group
-    /materials with a column for each of :func:`polysight.host.products.material_table.material_columns`; attributes
-    scan_id, simulated, convention, and as JSON instrument, versions, quality, materials.
+    /h, /v, /p complex64 [y, x], /valid bool [y, x], where known /p_sigma float32 [y, x]; /x, /y float64 in metres, the
+    dimension scales of all of them; group /materials with a column for each of
+    :func:`polysight.host.products.material_columns`; attributes scan_id, simulated, convention, verdict, and as JSON
+    verdict_reasons, config, versions; the JSON files under /documents.
 
     Raises
     ------
@@ -75,10 +91,9 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
             f[name].attrs["units"] = "m"
             f[name].attrs["long_name"] = f"pixel centre, {name} of the rig frame"
             f[name].make_scale(name)
-        about = {"h": "s-polarised channel", "v": "p-polarised channel", "p": "polarisation ratio H / V"}
-        for name, long_name in {**about, "valid": "whether the scan illuminates the pixel"}.items():
-            data = f.create_dataset(name, data=getattr(products, name), compression="gzip", shuffle=True)
-            data.attrs["units"], data.attrs["long_name"] = "1", long_name
+        for name in (n for n in _PLANES if n in products.image):
+            data = f.create_dataset(name, data=products.image[name], compression="gzip", shuffle=True)
+            data.attrs["units"], data.attrs["long_name"] = "1", _PLANES[name]
             for i, axis in enumerate(axes):
                 data.dims[i].attach_scale(f[axis])
                 data.dims[i].label = axis
@@ -89,6 +104,8 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
         for name, content in _documents(products).items():
             # Attributes above 64 kB do not fit the file's header; a dataset of text takes any length.
             f.create_dataset(f"documents/{name}", data=json.dumps(content), dtype=h5py.string_dtype())
+        for name, value in verdict_attributes(products.verdict).items():
+            f.attrs[name] = value
         f.attrs["versions"] = json.dumps(products.scan.get("versions", {}))
         f.attrs["config"] = json.dumps(products.scan.get("instrument", {}))
     part.replace(path)
@@ -101,7 +118,7 @@ def _documents(products: SavedProducts) -> dict[str, dict[str, Any]]:
 def _write_materials(h5py: Any, group: Any, columns: dict[str, list[Any]]) -> None:
     """One dataset a column: text, bool or float64, not a number where a value is not known."""
     for name, values in columns.items():
-        if name in ("name", "true_name"):
+        if name in _TEXT:
             group.create_dataset(name, data=[v or "" for v in values], dtype=h5py.string_dtype())
         elif name in ("metal_reference", "metal_like"):
             group[name] = np.array(values, np.bool_)
@@ -120,7 +137,8 @@ _LONGEST_NAME = 63
 def write_mat(path: Path, products: SavedProducts) -> None:
     """Write `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, struct `materials` of columns, structs `config`, `versions`.
 
-    `quality_json` and `materials_json` are those files as text: jsondecode reads them.
+    Where known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON). `quality_json` and `materials_json` are
+    those files as text: jsondecode reads them.
     """
     content = {
         "h": products.h,
@@ -129,7 +147,7 @@ def write_mat(path: Path, products: SavedProducts) -> None:
         "valid": products.valid,
         "x_m": products.x_m[None, :],
         "y_m": products.y_m[:, None],
-        "materials": {name: _column(values) for name, values in material_columns(products).items()},
+        "materials": {name: _column(values, name in _TEXT) for name, values in material_columns(products).items()},
         "config": _struct(products.scan.get("instrument", {})),
         "versions": _struct(products.scan.get("versions", {})),
         "scan_id": products.scan_id,
@@ -137,15 +155,18 @@ def write_mat(path: Path, products: SavedProducts) -> None:
         "convention": CONVENTION,
         "quality_json": json.dumps(products.quality),
         "materials_json": json.dumps(products.materials),
+        **verdict_attributes(products.verdict),
     }
+    if products.p_sigma is not None:
+        content["p_sigma"] = products.p_sigma
     buffer = io.BytesIO()
     scipy.io.savemat(buffer, content, long_field_names=True, do_compression=True, oned_as="column")
     write_atomically(path, buffer.getvalue())
 
 
-def _column(values: list[Any]) -> Any:
-    """A column of numbers, not a number where one is not known; of words, a cell array."""
-    if any(isinstance(v, str) for v in values):
+def _column(values: list[Any], text: bool) -> Any:
+    """A column of numbers, not a number where one is not known; of text, a cell array."""
+    if text:
         return np.array([v or "" for v in values], dtype=object)[:, None]
     if values and all(isinstance(v, bool) for v in values):
         return np.array(values)[:, None]
@@ -184,6 +205,7 @@ def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
         valid=products.valid,
         metal_referenced=bool(products.materials),
         materials=products.segments,
+        verdict=products.verdict,
     )
     paths = []
     for name, data in figures(context).items():

@@ -8,11 +8,20 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup, escape
 
-from polysight.host.products import write_atomically
+from polysight.host.products import permittivity_spread, refused_text, write_atomically
 from polysight.host.report.context import ReportContext
-from polysight.host.report.figures import FIGURES, UNKNOWN_COLOUR, colours_of, figures, patch_label, plate_label
-from polysight.host.report.tables import coverage_sentence, key_numbers, masked_positions, quality_tables, text
+from polysight.host.report.figures import FIGURES, figures
+from polysight.host.report.style import colours_of, patch_colour, patch_label, plate_label
+from polysight.host.report.tables import (
+    budget_table,
+    coverage_sentence,
+    key_numbers,
+    masked_positions,
+    quality_tables,
+    text,
+)
 
 DASH = "–"
 
@@ -20,11 +29,14 @@ DASH = "–"
 def write_report(out_dir: Path, ctx: ReportContext) -> Path:
     """Write `report.html` and `figures/*.png` into a folder.
 
+    Patches, verdict and error budget are those of the folder's materials.json where it is there already.
+
     Returns
     -------
     Path
         of the page.
     """
+    ctx = ctx.with_products(out_dir)
     pictures = figures(ctx)
     for name, data in pictures.items():
         write_atomically(out_dir / "figures" / f"{name}.png", data)
@@ -41,6 +53,7 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         undefined=StrictUndefined,
         trim_blocks=True,
     )
+    environment.filters["code"] = _code
     rows = [_row(r, colours_of(ctx)) for r in ctx.materials]
     seen = {r["truth"] for r in rows}
     alt = {
@@ -48,6 +61,7 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         "materials": "Material map",
         "truth": "True plates",
         "permittivity": "Permittivity plot",
+        "permittivity_map": "Map of the permittivity and its error",
         "coverage": "Masked positions",
     }
     centre = [f"{(float(a[0]) + float(a[-1])) * 500:.1f}" for a in (ctx.x_m, ctx.y_m)]
@@ -58,7 +72,11 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         lead=_lead(ctx),
         keys=key_numbers(ctx, rows),
         centre=centre,
+        verdict=ctx.verdict,
+        remedies=_remedies(rows),
         rows=rows,
+        with_errors=any(permittivity_spread(r.get("permittivity")) for r in ctx.materials),
+        budget=budget_table(ctx.error_budget),
         replaced=_replaced_names(ctx),
         missed=[str(t["name"]) for t in ctx.truth or [] if str(t["name"]) not in seen] if rows else [],
         quality=quality_tables(ctx.quality),
@@ -66,6 +84,21 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
         config=[(k, text(v)) for k, v in ctx.config.items()],
         provenance=[(k, text(v)) for k, v in ctx.provenance.items()],
     )
+
+
+def _code(words: str) -> Markup:
+    """Text with `commands` in it, for the page."""
+    parts = [escape(part) for part in words.split("`")]
+    return Markup("").join(Markup("<code>{}</code>").format(part) if i % 2 else part for i, part in enumerate(parts))
+
+
+def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """What would shrink the errors: each measurement once, with the patches that it would help."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        if row["do"]:
+            found.setdefault((row["dominated_by"], row["do"]), []).append(str(row["label"]))
+    return [{"what": what, "do": do, "patches": ", ".join(labels)} for (what, do), labels in found.items()]
 
 
 def _replaced_names(ctx: ReportContext) -> list[str]:
@@ -87,26 +120,28 @@ def _lead(ctx: ReportContext) -> str:
 
 def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
     """One line of the materials table, formatted."""
-    name = str(r.get("name") or f"patch {r['label']}")
     truth = r.get("truth") or None
     e = r.get("permittivity")
     true_eps = truth["permittivity"] if truth else None
     ratio = r.get("ratio")
     p = complex(ratio["real"], ratio["imag"]) if ratio else None
+    x0, y0, x1, y1 = r["box_mm"]
+    is_metal = bool(r.get("metal_reference"))
     out: dict[str, Any] = {
         "label": r["label"],
-        "name": name,
-        "colour": colours.get(name, UNKNOWN_COLOUR),
-        "metal_reference": bool(r.get("metal_reference")),
+        "name": str(r.get("name") or ("metal reference" if is_metal else f"patch {r['label']}")),
+        "where": f"{(x0 + x1) / 2:.0f}, {(y0 + y1) / 2:.0f}".replace("-", "−"),
+        "size": f"{x1 - x0:.0f} × {y1 - y0:.0f}",
+        "colour": patch_colour(r, colours),
+        "metal_reference": is_metal and bool(r.get("name")),
+        "refused": r.get("refused") or {},
+        "why_refused": refused_text(r),
         "truth": str(truth["name"]) if truth else "",
-        "right": bool(truth) and truth is not None and truth["name"] == r.get("name"),
+        "right": truth is not None and (truth["name"] == r.get("name") or (is_metal and bool(truth.get("metal")))),
         "votes": DASH if r.get("confidence") is None else f"{100 * r['confidence']:.0f} %",
         "real": "metal-like" if r.get("metal_like") else DASH,
         "loss": DASH,
-        "real_error": "",
-        "loss_error": "",
-        "real_range": "",
-        "loss_range": "",
+        **dict.fromkeys(("real_error", "loss_error", "real_range", "loss_range", "dominated_by", "share", "do"), ""),
         "true_real": ("metal" if truth["metal"] else DASH) if truth else DASH,
         "true_loss": DASH,
         "error": DASH,
@@ -116,15 +151,26 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
         "pixels": r.get("interior_pixels", r.get("pixels", DASH)),
     }
     if e:
-        (r0, r1), (i0, i1) = e["real_p30_p70"], e["imag_p30_p70"]
-        out["real"], out["loss"] = f"{e['real']:.2f}", f"{-e['imag']:.2f}"
-        real_std, loss_std = e.get("real_std"), e.get("imag_std")
-        out["real_error"] = "" if real_std is None else f"± {real_std:.2f}"
-        out["loss_error"] = "" if loss_std is None else f"± {loss_std:.2f}"
-        out["real_range"], out["loss_range"] = f"({r0:.2f} … {r1:.2f})", f"({-i1:.2f} … {-i0:.2f})"
+        out |= _estimate(e)
     if true_eps:
         out["true_real"], out["true_loss"] = f"{true_eps['real']:.2f}", f"{-true_eps['imag']:.2f}"
         if e:
             out["relative_error"] = e["real"] / true_eps["real"] - 1
             out["error"] = f"{100 * out['relative_error']:+.1f} %"
+    return out
+
+
+def _estimate(e: dict[str, Any]) -> dict[str, str]:
+    """A segment's permittivity with its errors and where they come from, formatted."""
+    out = {"real": f"{e['real']:.2f}", "loss": f"{-e['imag']:.2f}"}
+    spread = permittivity_spread(e)
+    if spread is not None:
+        out["real_error"], out["loss_error"] = f"± {spread.real_std:.2f}", f"± {spread.loss_std:.2f}"
+    if "real_p30_p70" in e and "imag_p30_p70" in e:
+        (r0, r1), (i0, i1) = e["real_p30_p70"], e["imag_p30_p70"]
+        out["real_range"], out["loss_range"] = f"({r0:.2f} … {r1:.2f})", f"({-i1:.2f} … {-i0:.2f})"
+    main = e.get("dominated_by")
+    share = (e.get("shares") or {}).get(main)
+    out["dominated_by"], out["do"] = str(main or ""), str(e.get("do") or "")
+    out["share"] = "" if share is None else f"{100 * share:.0f} %"
     return out

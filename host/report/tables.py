@@ -217,7 +217,7 @@ def _received(quality: dict[str, Any]) -> list[tuple[str, str]]:
 
 def quality_tables(quality: dict[str, Any]) -> list[Table]:
     """Tables of the known parts of quality.json, then one of whatever else is in it."""
-    known = {"boards", "residuals", "seconds_per_stage", "seconds", "imaging"}
+    known = {"boards", "residuals", "seconds_per_stage", "seconds", "imaging", "verdict", "error_budget"}
     boards = quality.get("boards")
     residuals = quality.get("residuals") or _residuals_of(boards)
     parts = (
@@ -233,6 +233,69 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
         rows = [_cells(pretty(k), text(v)) for k, v in flat.items()]
         out.append({"caption": "Rows, masked data and other figures.", "head": [], "rows": rows})
     return out
+
+
+_SOURCES = {
+    "measured": "measured (rig file)",
+    "prior": "not measured; its prior is used",
+    "scene": "estimated from the scene",
+}
+
+
+def budget_table(budget: Mapping[str, Any]) -> Table | None:
+    """What the error budget found: leakage, plane and angle with their errors, evidence for metal; None without it."""
+    rows = [*_leakage_rows(budget.get("leakage")), *_plane_rows(budget.get("plane"), budget.get("incidence"))]
+    metal = budget.get("metal") or {}
+    if metal.get("score") is not None:
+        told = f"score {_signed(metal['score'], 1)} from {metal.get('others', 0)} other patches"
+        if metal.get("channel_ratio_db") is not None:
+            told += f"; V over H {_signed(metal['channel_ratio_db'], 1)} dB beside the direct path"
+        rows.append(_cells("Evidence that the reference is metal", told))
+    if not rows:
+        return None
+    caption = "What the errors of the permittivities were computed with. ± is a standard deviation."
+    return {"caption": caption, "head": [], "rows": rows}
+
+
+def _leakage_rows(leakage: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    if not leakage:
+        return []
+    source = str(leakage.get("source", ""))
+    rows = [_cells("Leakage", _SOURCES.get(source, source))]
+    for i, channel in enumerate("hv"):
+        value = leakage.get(channel)
+        if value is not None and None not in value:
+            std = (leakage.get("std") or (None, None))[i]
+            error = "" if std is None else f" ± {std:.3f}"
+            sign = "+" if value[1] >= 0 else "−"
+            told = f"{_signed(value[0], 3)} {sign} {abs(value[1]):.3f}i{error}"
+            rows.append(_cells(f"Leakage of {channel.upper()}, relative to its own channel", told))
+    return rows
+
+
+def _plane_rows(plane: Mapping[str, Any] | None, incidence: Mapping[str, Any] | None) -> list[dict[str, Any]]:
+    rows = []
+    if incidence and incidence.get("deg") is not None:
+        std = incidence.get("std_deg")
+        rows.append(_cells("Incidence angle", f"{incidence['deg']:.2f}°" + ("" if std is None else f" ± {std:.2f}°")))
+    if plane and not plane.get("known"):
+        rows.append(_cells("Plane of the plates", "not found; taken as the rig file says"))
+    elif plane:
+        std = plane.get("offset_std_mm")
+        offset = f"{_signed(plane.get('offset_mm') or 0.0, 1)} mm" + ("" if std is None else f" ± {std:.1f} mm")
+        rows.append(_cells("Plane of the plates, beside the rig file's", offset))
+        tilt = plane.get("tilt_deg")
+        if tilt and None not in tilt:
+            rows.append(_cells("Tilt of the plane", f"{_signed(tilt[0], 2)}° in x, {_signed(tilt[1], 2)}° in y"))
+        by, plates = plane.get("by"), plane.get("plates")
+        if by:
+            rows.append(_cells("Plane found by", f"{by}" + (f" of {plates} plates" if plates else "")))
+    return rows
+
+
+def _signed(value: float, digits: int) -> str:
+    """A number with its sign, a true minus, and no negative zero."""
+    return f"{round(float(value), digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
 def _cells(*cells: str, share: float | None = None) -> dict[str, Any]:

@@ -16,13 +16,15 @@ PATCH = {
     "label": 4, "name": "PET", "confidence": 0.75, "metal_reference": False, "metal_like": True,
     "box_mm": [10.0, -20.0, 50.0, 40.0], "outline_mm": [], "pixels": 99, "interior_pixels": 77, "incidence_deg": 54.5,
     "ratio": {"real": 0.0, "imag": 10.0}, "inverse_ratio_std": 0.004,
-    "permittivity": {"real": 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125},
+    "permittivity": {"real": 3.5, "imag": -0.25, "real_std": 0.0625, "imag_std": 0.125,
+                     "covariance": [[0.0625**2, -0.002], [-0.002, 0.125**2]], "dominated_by": "leakage"},
     "truth": {"name": "vinyl", "permittivity": {"real": 3.75, "imag": -0.5}},
 }  # fmt: skip
 METAL = {
     "label": 5, "name": None, "confidence": None, "metal_reference": True, "metal_like": False,
     "box_mm": [-8.0, 2.0, -4.0, 4.0], "outline_mm": [], "pixels": 9, "interior_pixels": 7, "incidence_deg": 55.0,
     "ratio": None, "inverse_ratio_std": None, "permittivity": None, "truth": None,
+    "refused": {"what": "noise", "why": "nothing reflects", "do": "look at the image"},
 }  # fmt: skip
 EXPECTED = {
     "patch": [4, 5],
@@ -40,6 +42,9 @@ EXPECTED = {
     "permittivity_real_standard_error": [0.0625, None],
     "permittivity_loss": [0.25, None],
     "permittivity_loss_standard_error": [0.125, None],
+    "permittivity_real_loss_covariance": [0.002, None],  # loss is -imag
+    "dominated_by": ["leakage", None],
+    "refused": [None, "noise: nothing reflects; look at the image"],
     "p_real": [0.0, None],
     "p_imag": [10.0, None],
     "p_abs_db": [20.0, None],

@@ -13,8 +13,8 @@ from matplotlib import colormaps
 from polysight.host.process.quality import masked_runs
 from polysight.host.products import plain, read_image, write_atomically, write_image, write_json
 from polysight.host.report import ReportContext, banner_png, write_report
-from polysight.host.report.figures import colours_of, png
 from polysight.host.report.report import render
+from polysight.host.report.style import colours_of, png
 from polysight.host.report.tables import coverage_figure, masked_positions, pretty, text
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan

@@ -77,6 +77,26 @@ function showStatus() {
   document.title = `${SIGNS[status.level]}${short}${left ? ` · ${left}` : ""} · polysight`;
 }
 
+function showResult() {
+  const told = state.verdict;
+  by("result").hidden = !told;
+  if (!told) return;
+  by("result").dataset.level = told.level;
+  by("result-level").textContent = told.text;
+  by("reasons").replaceChildren(...told.reasons.map((r) => {
+    const item = make("li"), what = make("b"), why = make("span", r.why && ": ", "why");
+    what.append(...rich(r.what));
+    if (r.why) why.append(...rich(r.why));
+    item.append(what, why);
+    if (r.do) {
+      const todo = make("span", "→ ", "do");
+      todo.append(...rich(r.do));
+      item.append(todo);
+    }
+    return item;
+  }));
+}
+
 function showButtons() {
   const { enabled, running, paused, asked } = state.control;
   by("buttons").hidden = !enabled || !running;
@@ -227,6 +247,7 @@ function showPlots() {
 
 function showAll() {
   showStatus();
+  showResult();
   showButtons();
   showNotices();
   const there = Boolean(state.scan);

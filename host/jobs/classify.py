@@ -1,0 +1,188 @@
+"""`polysight classify`: names the patches of several scans together, or judges the models on a library."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Container, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.host.jobs.print_verdict import print_verdict
+from polysight.host.materials import (
+    PATCHES,
+    SIMULATED_LIBRARY,
+    Classifier,
+    Library,
+    MatchedPatch,
+    SeenPatches,
+    Verdict,
+    match_patches,
+    read_materials,
+)
+from polysight.host.products import SavedProducts, find_products, refused_text
+from polysight.host.report import classifier_sentence
+from polysight.shared.errors import ConfigError, DataError
+
+
+def classify(data: Sequence[Path], library: Path | None, model: str | None, as_json: bool) -> int:
+    """Name the patches of processed scans together, or judge the models on one library; returns the exit status.
+
+    Parameters
+    ----------
+    data
+        Folders that `polysight process` wrote, or scan folders, one for each incidence angle; or a library (.npz), or a
+        folder of the published material files.
+    library, model
+        Of the naming; without: the simulated library, and the model that was chosen for it.
+    as_json
+        Print JSON.
+
+    Raises
+    ------
+    ConfigError
+        when the data are of both kinds.
+    DataError
+        when something in them cannot be used.
+
+    Notes
+    -----
+    Where one of the scans has no result (verdict `none`) nothing is named; the exit status is that of NoResult.
+    """
+    scans = [find_products(folder, PATCHES) for folder in data]
+    found = [s for s in scans if s is not None]
+    if len(found) == len(scans):
+        return _name(found, library or SIMULATED_LIBRARY, model, as_json)
+    if len(data) > 1:
+        other = data[scans.index(None)]
+        raise ConfigError(
+            f"{other}: not a folder of products", "several scans are named together from what polysight process wrote",
+            f"polysight process SCAN --out {other}",
+        )  # fmt: skip
+    if library is not None or model is not None:
+        raise ConfigError(
+            f"{data[0]}: no patches of a scan, so --library and --model would do nothing",
+            "they choose what names patches; on a library every model is judged",
+            "leave them out, or give a folder that polysight process wrote",
+        )
+    return _judge(data[0], as_json)
+
+
+def _judge(data: Path, as_json: bool) -> int:
+    from polysight.host.materials import MODELS, Samples, score
+
+    library = read_materials(data) if data.is_dir() else Library.load(data)
+    if len(library.angles_deg) > 1:
+        sys.stderr.write(f"{data}: angles {library.angles_deg} degrees; judged at {library.angles_deg[-1]:g}\n")
+        library = library.at(library.angles_deg[-1])
+    samples = Samples.of(library)
+    scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
+    source = "simulated" if library.simulated else "measured"
+    if as_json:
+        rows = [{k: v for k, v in asdict(s).items() if "confusion" not in k and k != "names"} for s in scores]
+        best = max(scores[::2], key=lambda s: s.pixels + s.patches)
+        content = {"source": source, "names": best.names, "scores": rows}
+        content |= {"best_with_scans_left_out": best.model, "confusion_of_best": best.confusion.tolist()}
+        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        return 0
+    sys.stdout.write(
+        f"{source}: {len(library.names)} materials, {len(library.scans)} scans, {samples.names.size} pixels\n"
+        f"{'':44s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
+        f"{'model':44s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
+    )
+    for held, mixed in zip(scores[::2], scores[1::2], strict=True):
+        sys.stdout.write(
+            f"{held.model:44s}{held.pixels:11.1%}{held.patches:11.1%}{mixed.pixels:12.1%}{mixed.patches:12.1%}\n"
+        )
+    if missing := scores[0].not_judged:
+        sys.stdout.write(f"not judged with scans left out, because one scan alone holds them: {', '.join(missing)}\n")
+    return 0
+
+
+def _name(products: Sequence[SavedProducts], library_path: Path, model: str | None, as_json: bool) -> int:
+    status = max(print_verdict(p, to_terminal=not as_json) for p in products)
+    if status:
+        if as_json:
+            sys.stdout.write(json.dumps(_nothing_named(products), indent=1) + "\n")
+        return status
+    library = Library.load(library_path)
+    refused = [{s["label"]: s for s in p.segments if s.get("refused")} for p in products]
+    scans = [_without(p.patches, labels) for p, labels in zip(products, refused, strict=True)]
+    classifier = Classifier(library, model=model, angles_deg=[s.angle_deg for s in scans])
+    matched = match_patches(scans)
+    if not matched:
+        raise DataError(
+            f"{products[-1].folder}: none of its patches lies where one of {products[0].folder} does",
+            "the object was moved between the scans, or these are scans of other objects",
+            "scan the same patches in the same places",
+        )
+    named = classifier.scan([m.features for m in matched])
+    rows = [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)]
+    simulated = any(s.simulated for s in scans)
+    once = sum(len(s.patches) for s in scans) - len(scans) * len(matched)
+    if as_json:
+        content = {
+            "source": "simulated" if simulated else "measured",
+            "incidence_deg": [s.angle_deg for s in scans],
+            "model": classifier.model,
+            "library": classifier_sentence(classifier),
+            "patches": rows,
+            "patches_not_in_every_scan": once,
+            "refused": [
+                {"products": str(p.folder), "label": label, **s["refused"]}
+                for p, found in zip(products, refused, strict=True)
+                for label, s in found.items()
+            ],
+        }
+        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+        return 0
+    angles = " and ".join(f"{s.angle_deg:.1f}" for s in scans)
+    sys.stdout.write(f"{'simulated: ' if simulated else ''}{len(rows)} patches at {angles} degrees\n")
+    for row in rows:
+        votes = ", ".join(f"{name} {share:.0%}" for name, share in list(row["votes"].items())[:2])
+        truth = f"   truly {row['truth']}" if row["truth"] else ""
+        sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {row['confidence']:6.1%}   pixels: {votes}{truth}\n")
+    for p, found in zip(products, refused, strict=True):
+        where = f" in {p.folder}" if len(products) > 1 else ""
+        sys.stdout.write("".join(f"{n:>3}  not judged{where}: {refused_text(s)}\n" for n, s in found.items()))
+    known = [r for r in rows if r["truth"]]
+    if known:
+        right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
+        sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
+    if once:
+        sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
+    sys.stdout.write(classifier_sentence(classifier) + "\n")
+    return 0
+
+
+def _without(scan: SeenPatches, refused: Container[int]) -> SeenPatches:
+    """The patches of a scan that may be judged."""
+    return replace(scan, patches=tuple(p for p in scan.patches if p.label not in refused))
+
+
+def _nothing_named(products: Sequence[SavedProducts]) -> dict[str, Any]:
+    """What `classify` prints as JSON when one of the scans has no result: its patches without names."""
+    scan = next(p for p in products if p.verdict is not None and not p.verdict.usable)
+    nothing = {"name": None, "confidence": None, "votes": {}}
+    return {
+        "products": str(scan.folder),
+        "verdict": None if scan.verdict is None else scan.verdict.to_dict(),
+        "patches": [{"label": s["label"], **nothing} for s in scan.segments],
+    }
+
+
+def _row(matched: MatchedPatch, verdict: Verdict, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
+    return {
+        "label": matched.label,
+        "name": verdict.name,
+        "confidence": verdict.confidence,
+        "votes": verdict.votes,
+        "distance": verdict.distance if np.isfinite(verdict.distance) else None,
+        "pixels": verdict.pixels,
+        "truth": matched.truth,
+        "pixels_right": float((pixels == matched.truth).mean()) if matched.truth else None,
+    }

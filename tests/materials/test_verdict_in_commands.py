@@ -1,0 +1,120 @@
+"""`polysight materials`, `permittivity`, `report` and `classify` of judged products, as typed."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.host.materials import PATCHES
+from polysight.host.materials.patch_files import FORMAT
+from polysight.host.verdict import LEVELS, NoResult
+from tests.support.products import NAMES, PERMITTIVITY, REASON, judged_products
+
+NUMBERS = ("2.9", "0.2", "3.0")
+
+
+def with_pixels(folder: Path) -> Path:
+    """Products that `classify` takes: with patches.npz of three patches of the simulated library's PET."""
+    rows = [{"label": n, "centre_mm": [30.0 * n, 0.0], "truth": None, "pixels": 4} for n in (1, 2, 3)]
+    places = np.concatenate([np.array([[30.0 * n + k, 0.0] for k in range(4)]) for n in (1, 2, 3)])
+    features = np.tile([0.5, 0.15, 0.3, 0.05], (12, 1))
+    meta = {"format": FORMAT, "angle_deg": 55.0, "simulated": True, "patches": rows}
+    out = io.BytesIO()
+    np.savez_compressed(
+        out,
+        meta=np.frombuffer(json.dumps(meta).encode(), np.uint8),
+        places_mm=places.astype(np.float32),
+        features=features.astype(np.float32),
+    )
+    (folder / PATCHES).write_bytes(out.getvalue())
+    return folder
+
+
+@pytest.mark.parametrize("command", ["materials", "permittivity"])
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_verdict_comes_first_and_decides_the_exit_status(tmp_path, capsys, command, level):
+    folder = str(judged_products(tmp_path, level, careless=True))
+    status = main([command, folder])
+    out = capsys.readouterr().out
+    assert status == (NoResult.exit_status if level == "none" else 0)
+    assert f"verdict:  {LEVELS[level]}" in out
+    if level != "good":
+        assert REASON["do"] in out
+    if level == "none":
+        assert [word for word in (*NAMES, *NUMBERS) if word in out] == []
+        return
+    line = next(text for text in out.splitlines() if "PET" in text)
+    assert out.index("verdict:") < out.index(line)
+    assert "2.90 - j0.20" in line
+    assert "+- 0.20, 0.10  mostly leakage" in line
+    assert "not judged" in out
+    assert "noise: its pixels do not agree; look at the image" in out
+
+
+@pytest.mark.parametrize("command", ["materials", "permittivity"])
+def test_json_without_a_result_is_printed_with_nulls(tmp_path, capsys, command):
+    folder = str(judged_products(tmp_path, "none", careless=True))
+    assert main([command, folder, "--json"]) == NoResult.exit_status
+    out = capsys.readouterr().out
+    assert [word for word in NAMES if word in out] == []
+    content = json.loads(out)
+    if command == "materials":
+        assert content[0]["verdict"]["level"] == "none"
+        assert {(s["name"], s["permittivity"], s["ratio"]) for s in content[0]["segments"]} == {(None, None, None)}
+    else:
+        assert {(s["name"], s["single_interface"]) for s in content} == {(None, None)}
+
+
+def test_no_layer_is_fitted_without_a_result(tmp_path, capsys):
+    folder = judged_products(tmp_path, "none", careless=True)
+    status = main(["permittivity", str(folder), "--layer", "sheet,?,0.5"])
+    told = capsys.readouterr()
+    assert status == NoResult.exit_status
+    assert told.out == ""
+    assert REASON["what"] in told.err
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_report_says_the_verdict_and_where_the_page_is(tmp_path, capsys, level):
+    folder = judged_products(tmp_path, level)
+    (folder / "report.html").write_text("<html>", encoding="utf-8")
+    assert main(["report", str(folder)]) == (NoResult.exit_status if level == "none" else 0)
+    out = capsys.readouterr().out
+    assert out.startswith(f"verdict:  {LEVELS[level]}")
+    assert "report.html" in out
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, capsys, as_json):
+    more = ["--json"] if as_json else []
+    none = with_pixels(judged_products(tmp_path / "none", "none"))
+    good = with_pixels(judged_products(tmp_path / "good", "good"))
+    assert main(["classify", str(none), *more]) == NoResult.exit_status
+    out = capsys.readouterr().out
+    if as_json:
+        assert {(p["name"], p["confidence"]) for p in json.loads(out)["patches"]} == {(None, None)}
+    else:
+        assert "pixels:" not in out
+    assert main(["classify", str(good), *more]) == 0
+    out = capsys.readouterr().out
+    if as_json:
+        assert [p["label"] for p in json.loads(out)["patches"]] == [1, 2]
+        assert [p["label"] for p in json.loads(out)["refused"]] == [3]
+    else:
+        assert "3  not judged: noise" in out
+
+
+def test_products_of_earlier_releases_print_no_verdict(tmp_path, capsys):
+    folder = str(judged_products(tmp_path, None))
+    for command in ("materials", "permittivity"):
+        assert main([command, folder]) == 0
+        out = capsys.readouterr().out
+        assert "verdict" not in out
+        assert "2.90 - j0.20" in out
+        assert "+- 0.20, 0.10" in out
+    assert PERMITTIVITY["real"] == 2.9

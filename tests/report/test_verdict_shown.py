@@ -1,0 +1,172 @@
+"""The report with a verdict: what is withheld, ellipses that hold their share, labels that can be read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from html import unescape
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+
+from polysight.host.api.plot import plot_scan
+from polysight.host.products import permittivity_spread, read_processed, read_products
+from polysight.host.report import ReportContext, write_report
+from polysight.host.report.ellipses import SHARES, ellipse_of, place_numbers
+from polysight.host.report.figures import phase_limits_deg
+from polysight.host.report.maps import draw_materials, permittivity_map
+from polysight.host.report.style import shorten_labels
+from polysight.host.report.tables import budget_table
+from polysight.host.verdict import LEVELS
+from tests.support.products import BUDGET, NAMES, PERMITTIVITY, REASON, judged_products, segments
+
+RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
+
+
+def context(folder, **more) -> ReportContext:
+    """What processing hands to the report: names in patches, pixels and truth, and quality.json."""
+    p = read_products(folder)
+    interior = np.zeros(p.h.shape, bool)
+    interior[5:9, 12:16] = True
+    given = ReportContext(
+        title="one", simulated=True, x_m=p.x_m, y_m=p.y_m, h=p.h, v=p.v, p=p.p, valid=p.valid,
+        materials=segments("good"), pixel_names={2: (np.array(["PET"] * 16), interior)}, pixel_accuracy=0.5,
+        truth=[{"name": "acrylic", "box_mm": (-10.0, -20.0, 15.0, 20.0), "permittivity": 3 - 0.3j}],
+        library_note="Of its materials 1 could not be judged: copper.", quality=p.quality,
+    )  # fmt: skip
+    return replace(given, **more)
+
+
+def drawn_text(make) -> str:
+    """All text that a figure is made with."""
+    found: list[str] = []
+    plain, noted = Axes.text, Axes.annotate
+
+    def text(self, x, y, s, *a, **k):
+        found.append(str(s))
+        return plain(self, x, y, s, *a, **k)
+
+    def annotate(self, s, *a, **k):
+        found.append(str(s))
+        return noted(self, s, *a, **k)
+
+    with patch.object(Axes, "text", text), patch.object(Axes, "annotate", annotate):
+        make()
+    return "\n".join(found)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
+    folder = judged_products(tmp_path, level)
+    page = unescape(write_report(folder, context(folder)).read_text(encoding="utf-8"))
+    head = page[page.index("<main>") : page.index("<h2>Images")]
+    assert f'<span class="badge">{LEVELS[level]}</span>' in head
+    for part in REASON.values():
+        assert (part in head) == (level != "good")
+    assert "estimated from the scene" in page
+    assert "+2.4 mm ± 0.3 mm" in page
+    assert "54.60° ± 0.12°" in page
+
+
+@pytest.mark.parametrize("careless", [False, True])
+def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
+    folder = judged_products(tmp_path, "none", careless)
+    text = drawn_text(lambda: write_report(folder, context(folder)))
+    text += drawn_text(lambda: plot_scan(read_processed(read_products(folder))))
+    page = unescape((folder / "report.html").read_text(encoding="utf-8"))
+    for part in (text, page[page.index("<main>") :]):
+        assert [word for word in RESULTS if word in part] == []
+    made = {path.stem for path in (folder / "figures").iterdir()}
+    assert {"amplitude_h", "amplitude_v", "amplitude_p", "phase_p", "materials"} <= made
+    assert not {"permittivity", "permittivity_map", "truth"} & made
+
+
+def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path):
+    folder = judged_products(tmp_path, "care")
+    page = unescape(write_report(folder, context(folder)).read_text(encoding="utf-8"))
+    assert "2.90 ± 0.20" in page
+    assert "0.20 ± 0.10" in page
+    assert "leakage (60 %)" in page
+    assert PERMITTIVITY["do"] in page
+    assert "not judged: noise: its pixels do not agree; look at the image" in page
+    assert (folder / "figures" / "permittivity_map.png").exists()
+
+
+def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
+    folder = judged_products(tmp_path, None)
+    page = unescape(write_report(folder, context(folder, materials=segments(None))).read_text(encoding="utf-8"))
+    assert 'class="verdict' not in page
+    assert "Error budget" not in page
+    assert "2.90 ± 0.20" in page
+    assert budget_table({}) is None
+
+
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("mixed", [0.0, 0.9, -0.7])
+def test_an_ellipse_holds_its_share_of_draws(share, mixed):
+    std = np.array([0.3, 0.05])
+    matrix = np.outer(std, std) * np.array([[1, mixed], [mixed, 1]])
+    width, height, angle = ellipse_of(matrix, share)
+    draws = np.random.default_rng(5).multivariate_normal([0, 0], matrix, 100_000)
+    turn = np.radians(angle)
+    along = draws @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    inside = (along[:, 0] / (width / 2)) ** 2 + (along[:, 1] / (height / 2)) ** 2 <= 1
+    assert inside.mean() == pytest.approx(share, abs=0.005)
+
+
+def test_an_ellipse_leans_as_real_part_and_loss_do():
+    spread = permittivity_spread(PERMITTIVITY)  # real and imag rise together: the loss falls as the real part rises
+    assert spread is not None
+    width, height, angle = ellipse_of(spread.matrix, 0.68)
+    assert np.tan(np.radians(angle if width > height else angle + 90)) < 0
+
+
+@pytest.mark.parametrize("apart_pt", [0.0, 4.0, 30.0])
+def test_numbers_of_close_points_do_not_cover_one_another(apart_pt):
+    grid = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), axis=-1).reshape(-1, 2) * apart_pt
+    places = place_numbers(grid, np.empty((0, 2)))
+    apart = np.abs(places[:, None] - places[None]).max(axis=2) + 100 * np.eye(len(grid))
+    assert apart.min() >= 9
+    if apart_pt:
+        assert np.hypot(*(places - grid).T).max() < 60
+    assert place_numbers(np.empty((0, 2)), np.empty((0, 2))).shape == (0, 2)
+
+
+def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
+    rows = [
+        {**segments("good")[1], "label": 3 * i + k + 1, "name": f"polyethylene, high density, sheet {i} {k}",
+         "box_mm": [16 * k - 24, 16 * i - 24, 16 * k - 10, 16 * i - 10]}
+        for i in range(3) for k in range(3)
+    ]  # fmt: skip
+    ctx = context(judged_products(tmp_path, "good"), materials=rows, pixel_names={}, truth=None)
+    fig = Figure(figsize=(4.6, 4.6), dpi=160, layout="constrained")
+    FigureCanvasAgg(fig)
+    labels = draw_materials(fig.add_subplot(), ctx)
+    assert shorten_labels(fig, labels) == labels
+    fig.draw_without_rendering()
+    boxes = [one.text.get_window_extent() for one in labels]
+    assert not any(Bbox.intersection(a, b) for i, a in enumerate(boxes) for b in boxes[:i])
+    assert permittivity_map(ctx) is not None
+
+
+def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):
+    ctx = context(judged_products(tmp_path, "good"))
+    p = np.exp(1j * np.radians(np.where(np.arange(30) % 2, 170.0, -170.0)))[None, :] * np.ones((20, 1))
+    limits = phase_limits_deg(replace(ctx, p=p))
+    assert limits is not None
+    low, high = limits
+    assert high - low < 40
+    assert any(low <= 170 + turn <= high and low <= 190 + turn <= high for turn in (-360, 0))
+    assert phase_limits_deg(replace(ctx, materials=[])) is None
+    random = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=p.shape))
+    assert phase_limits_deg(replace(ctx, p=random)) is None
+
+
+@pytest.mark.parametrize("key", BUDGET)
+def test_an_error_budget_with_a_part_alone_is_shown(key):
+    assert budget_table({key: BUDGET[key]})
+    assert budget_table({"plane": {"known": False}})

@@ -1,0 +1,69 @@
+"""Made-up products of a judged scan: a metal reference, a named patch, a refused one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polysight.host.products import write_image, write_json
+
+NAMES = ("PET", "acrylic", "copper")
+REASON = {"what": "no metal reference", "why": "it is the only patch", "do": "lay a metal plate into the scene"}
+BUDGET = {
+    "leakage": {"h": [0.01, -0.02], "v": [0.0, 0.03], "std": [0.02, 0.02], "source": "scene"},
+    "incidence": {"deg": 54.6, "std_deg": 0.12},
+    "plane": {"known": True, "offset_mm": 2.4, "offset_std_mm": 0.3, "tilt_deg": [0.2, -0.1],
+              "by": "phase", "plates": 3},
+    "metal": {"score": 12.5, "others": 2, "channel_ratio_db": 0.4},
+}  # fmt: skip
+COMMON: dict[str, Any] = {
+    "outline_mm": [], "pixels": 90, "interior_pixels": 60, "incidence_deg": 54.6, "metal_like": False, "votes": {},
+    "name": None, "confidence": None, "permittivity": None, "ratio": None, "truth": None, "refused": None,
+    "metal_reference": False, "inverse_ratio_std": 0.01,
+}  # fmt: skip
+PERMITTIVITY = {
+    "real": 2.9, "imag": -0.2, "real_std": 0.2, "imag_std": 0.1, "covariance": [[0.04, 0.012], [0.012, 0.01]],
+    "real_p30_p70": [2.8, 3.0], "imag_p30_p70": [-0.25, -0.15], "dominated_by": "leakage",
+    "shares": {"noise": 0.1, "metal reference": 0.1, "leakage": 0.6, "incidence": 0.1, "brightness": 0.1},
+    "do": "measure leakage with metal strips (polysight leakage)",
+}  # fmt: skip
+_OLD = ("covariance", "dominated_by", "shares", "do")
+
+
+def segments(level: str | None) -> list[dict[str, Any]]:
+    """Three patches as materials.json has them with this verdict; None: as earlier releases wrote them."""
+    metal = {**COMMON, "label": 1, "box_mm": [-50.0, -20.0, -20.0, 20.0], "metal_reference": True}
+    pet = {
+        **COMMON, "label": 2, "box_mm": [-10.0, -20.0, 15.0, 20.0], "name": "PET", "confidence": 0.8,
+        "votes": {"PET": 0.8, "acrylic": 0.2}, "ratio": {"real": 3.0, "imag": 0.4}, "permittivity": PERMITTIVITY,
+        "truth": {"name": "acrylic", "metal": False, "permittivity": {"real": 3.0, "imag": -0.3}},
+    }  # fmt: skip
+    noise = {**COMMON, "label": 3, "box_mm": [25.0, -20.0, 50.0, 20.0]}
+    noise["refused"] = {"what": "noise", "why": "its pixels do not agree", "do": "look at the image"}
+    if level is None:
+        pet["permittivity"] = {k: v for k, v in PERMITTIVITY.items() if k not in _OLD}
+        return [{k: v for k, v in s.items() if k != "refused"} for s in (metal, pet, noise)]
+    if level == "none":
+        nothing = {"name": None, "confidence": None, "permittivity": None, "ratio": None, "votes": {}, "truth": None}
+        return [s | nothing for s in (metal, pet, noise)]
+    return [metal, pet, noise]
+
+
+def judged_products(folder: Path, level: str | None, careless: bool = False) -> Path:
+    """Write them; `careless` leaves names and permittivities where the verdict allows none."""
+    rng = np.random.default_rng(2)
+    h, v = (rng.standard_normal((2, 20, 30)) + 1j * rng.standard_normal((2, 20, 30))).astype(np.complex64)
+    axes = (np.linspace(-0.06, 0.06, 30), np.linspace(-0.04, 0.04, 20))
+    sigma = None if level is None else rng.uniform(0.1, 0.2, h.shape)
+    write_image(folder / "image.npz", h, v, h / v, *axes, np.ones(h.shape, bool), sigma)
+    content: dict[str, Any] = {"scan_id": "s", "simulated": True, "segments": segments("good" if careless else level)}
+    quality: dict[str, Any] = {}
+    if level is not None:
+        quality["verdict"] = {"level": level, "reasons": [] if level == "good" else [REASON]}
+        content |= {"verdict": quality["verdict"], "error_budget": BUDGET}
+    write_json(folder / "materials.json", content)
+    write_json(folder / "quality.json", quality)
+    write_json(folder / "scan.json", {"scan_id": "s", "simulated": True})
+    return folder

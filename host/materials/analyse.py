@@ -12,7 +12,7 @@ import numpy.typing as npt
 from polysight.host.materials.classify import Classifier, NamedPatch, features_of
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
 from polysight.host.materials.inversion import Inversion, Uncertain, feature_errors, invert
-from polysight.host.materials.measure import Refused, all_refused, background, reference_std, seen
+from polysight.host.materials.measure import LEAST_STD, Refused, all_refused, background, reference_std, seen
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box, no_metal
 from polysight.host.materials.metal_evidence import metal_evidence
 from polysight.host.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
@@ -64,10 +64,12 @@ def analyse(
     raw = to_metal(images.h, images.v, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
     refused = all_refused(found.patches, rh, rv, background(raw.h, raw.v, found, images.usable))
-    prior = optics.prior(reference_std(reference_spread(rh, rv, reference, plane)))
+    std = reference_std(reference_spread(rh, rv, reference, plane))
+    common, local = (std, 0.0) if plane is None else (LEAST_STD, std)
+    prior = optics.prior(common)
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    measured = [seen(p, rh, rv, _angle(theta, p)) for p in judged]
+    measured = [seen(p, rh, rv, _angle(theta, p), local) for p in judged]
     if plane is None:
         channel = _channel_ratio(images, reference) if optics.channel_ratio_known else None
         reference = replace(reference, evidence=metal_evidence(measured, prior, channel))

@@ -15,13 +15,16 @@ from polysight.host.materials.segment import Mask, Patch, Segmentation
 
 Image = npt.NDArray[np.complexfloating]
 
-SPREAD_SHARE = 0.6
+SPREAD_SHARE = 0.5
 """Error of a patch's V / H beside the spread of its pixels: speckle averages out, edges and neighbours' sidelobes do not.
 
 Simulated (benchmarks/coverage): 0.5 on smooth plates, 0.6 with roughness and tilt.
 """
-LEAST_STD = 2e-3
+LEAST_STD = 1.7e-3
 """Error of V / H that is there however even the pixels are: H and V are lit from points some 15 mm apart."""
+TILT_STD = 0.016
+"""Error of V / H for a phase of H that spreads over the patch by one radian: a tilted plate is lit from elsewhere, and by
+H and V differently. One degree of tilt spreads it by 0.3 rad."""
 LEAST_PIXELS = 12
 FLAT_CONTRAST = 0.4
 """Standard deviation of |H| over its mean in a patch: 0.52 is noise or speckle, a plate stays below 0.25."""
@@ -95,16 +98,27 @@ def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refu
     return None
 
 
-def seen(patch: Patch, h: Image, v: Image, theta_rad: float) -> Seen:
-    """A patch's ratio, its standard deviation, and its brightness."""
+def seen(patch: Patch, h: Image, v: Image, theta_rad: float, local_std: float = 0.0) -> Seen:
+    """A patch's ratio, its standard deviation, and its brightness.
+
+    `local_std` is the relative error of a metal reference that differs from place to place; 0 where it is one number.
+    """
     at = patch.interior
     ratio = median_ratio(h[at], v[at])
     inverse = 1 / ratio if ratio else complex(np.inf, 0.0)
     spread = inverse_spread(h[at], v[at])
     level = np.abs(h[at])
     level = level[np.isfinite(level)]
-    std = float(np.hypot(SPREAD_SHARE * spread, LEAST_STD)) if np.isfinite(spread) else float("inf")
+    parts = (SPREAD_SHARE * spread, LEAST_STD, TILT_STD * _phase_spread(h[at]), local_std * abs(inverse))
+    std = float(np.sqrt(np.sum(np.square(parts)))) if np.isfinite(spread) else float("inf")
     return Seen(inverse, std, theta_rad, float(np.median(level)) if level.size else None)
+
+
+def _phase_spread(h: Image) -> float:
+    """Circular standard deviation of the phase of H over a patch, radians: what a tilt makes of it."""
+    h = h[np.isfinite(h)].astype(np.complex128)
+    coherent = abs(h.sum()) / max(float(np.abs(h).sum()), 1e-300)
+    return float(np.sqrt(-2 * np.log(min(max(coherent, 1e-3), 1.0))))
 
 
 def reference_std(spread: float) -> float:

@@ -1,4 +1,4 @@
-"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> plane -> metal -> materials -> verdict."""
+"""The whole flow on one screen: recorded rows -> synchronised rows -> images -> plane -> materials -> verdict."""
 
 from __future__ import annotations
 

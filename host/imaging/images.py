@@ -223,7 +223,7 @@ class SubBandImages:
             builder.add_row(board_name, row_index, row)
 
     def finish(self, transposed: bool = False) -> tuple[ChannelImages, ...]:
-        """The images of every sub-band from the rows added so far, lowest frequency first; x and y swapped on demand."""
+        """The images of every sub-band from the rows so far, lowest frequency first; x and y swapped on demand."""
         made = (builder.finish() for builder in self.builders)
         return tuple(images.transposed() if transposed else images for images in made)
 

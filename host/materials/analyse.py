@@ -83,7 +83,7 @@ def analyse(
         for p in found.patches
     }
     refused |= {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
-    named = _names(classifier, found, (sh, sv, sp), (inversion, prior), judged, float(np.mean(theta)))
+    named = _names(classifier, (sh, sv, sp), (inversion, prior), judged, float(np.mean(theta)))
     truth = match_truth(found.patches, known.plates)
     results = tuple(
         PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
@@ -94,7 +94,6 @@ def analyse(
 
 def _names(
     classifier: Classifier | None,
-    found: Segmentation,
     channels: tuple[Image, Image, Image],
     errors: tuple[Inversion, Uncertain],
     judged: list[Patch],

@@ -369,7 +369,7 @@ def feature_errors(found: Inversion, prior: Uncertain, i: int) -> Real:
     """
     t = found.patches[i].inverse_ratio
     c = found.nuisance_covariance[:6, :6]
-    # d ln h' = da (1 - t), d ln v' = db (1 - 1 / t): what p leaks into H, s into V, and metal at 1 in both; d ln q = rho.
+    # d ln h' = da (1 - t), d ln v' = db (1 - 1 / t), d ln q = rho: p leaks into H, s into V, metal stays at 1.
     own_t = t if abs(t) > 0.02 else 0.02 * np.exp(1j * np.angle(t))
     by_h, by_v = np.array([1 - t, 0, 0]), np.array([0, 1 - 1 / own_t, 1])
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])

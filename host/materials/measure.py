@@ -16,15 +16,16 @@ from polysight.host.materials.segment import Mask, Patch, Segmentation
 Image = npt.NDArray[np.complexfloating]
 
 SPREAD_SHARE = 0.5
-"""Error of a patch's V / H beside the spread of its pixels: speckle averages out, edges and neighbours' sidelobes do not.
+"""Error of a patch's V / H beside the spread of its pixels: speckle averages out, edges and neighbours do not.
 
 Simulated (benchmarks/coverage): 0.5 on smooth plates, 0.6 with roughness and tilt.
 """
 LEAST_STD = 1.7e-3
 """Error of V / H that is there however even the pixels are: H and V are lit from points some 15 mm apart."""
 TILT_STD = 0.016
-"""Error of V / H for a phase of H that spreads over the patch by one radian: a tilted plate is lit from elsewhere, and by
-H and V differently. One degree of tilt spreads it by 0.3 rad."""
+"""Error of V / H for a phase of H that spreads over the patch by one radian.
+
+A tilted plate is lit from elsewhere, and for H and V differently; one degree of tilt spreads the phase by 0.3 rad."""
 LEAST_PIXELS = 12
 FLAT_CONTRAST = 0.4
 """Standard deviation of |H| over its mean in a patch: 0.52 is noise or speckle, a plate stays below 0.25."""

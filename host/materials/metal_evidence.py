@@ -3,8 +3,8 @@
 Two explanations of the whole scene are fitted to the same data: the patch is metal (r_s = r_p = -1), or it is some
 dielectric. Each says what the other patches are relative to it, and the other patches must then be possible materials:
 brightness |H| that agrees with their ratio (Eq. 2 and 3), no gain, a permittivity from 1 to about ten. And each says
-how strong V is beside H in the patch itself, relative to the direct path, which reaches both boards alike: metal returns
-both polarisations fully, a dielectric loses most of p at these angles.
+how strong V is beside H in the patch itself, relative to the direct path, which reaches both boards alike: metal
+returns both polarisations fully, a dielectric loses most of p at these angles.
 
 The evidence is the difference of both best sums of squares, dielectric minus metal: positive speaks for metal. It is
 half of minus twice the log likelihood ratio up to the priors of leakage, angle and brightness, which both share.
@@ -24,7 +24,7 @@ from polysight.host.polarimetry import fresnel, permittivity_from_ratio, ratio_f
 Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
-"""How far V over H of metal may lie from that of the direct path: the boards' antenna patterns differ off their axis."""
+"""How far V over H of metal may lie from that of the direct path: the boards' patterns differ off their axis."""
 _LARGEST = 10.0  # |eps| of common materials; beyond it costs
 _NEAR_METAL = 0.12  # |t - 1|: another piece of metal need not be a possible dielectric
 _STARTS = [

@@ -117,7 +117,7 @@ class MaterialsResult:
         return replace(self, patches=patches, metal=metal, bands={}, withheld=True)
 
     def p_sigma(self, usable: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-        """Standard deviation of each pixel's P, float32 [ny, nx]: not a number without a result, or outside `usable`."""
+        """Standard deviation of each pixel's P, float32 [ny, nx]; not a number without a result, or not `usable`."""
         h, v = self.calibrated.h, self.calibrated.v
         if self.withheld:
             return np.full(h.shape, np.nan, np.float32)

@@ -168,6 +168,7 @@ class Model(ABC):
 
         `errors` [patch, d, d] are covariances of the patches' features, for models that weigh them.
         """
+        del errors
         return majority(*self.by_pixel(x), patches)
 
 

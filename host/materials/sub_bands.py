@@ -13,6 +13,7 @@ import numpy.typing as npt
 from polysight.host.imaging import ChannelImages, SubBand
 from polysight.host.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
 from polysight.host.materials.inputs import Optics
+from polysight.host.materials.inversion import ratio_error
 from polysight.host.materials.layers import Bands, Spectrum
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.materials.result import MaterialsResult
@@ -85,9 +86,12 @@ def band_rows(
         h, v, error = _relative_to_metal(found, made, leakage, smooth_px, reference)
         for r in found.patches:
             at = r.patch.interior & made.valid
-            out[r.patch.label].append(
-                {"first_hz": band.first_hz, "last_hz": band.last_hz, **_seen(h[at], v[at], error)}
-            )
+            seen = _seen(h[at], v[at], error)
+            if seen["ratio"] is not None:  # leakage is the same in every sub-band, and not known exactly
+                inverse = 1 / complex(seen["ratio"]["real"], seen["ratio"]["imag"])
+                left = float(ratio_error(found.inversion, found.prior, inverse))
+                seen["inverse_ratio_std"] = math.hypot(seen["inverse_ratio_std"], left)
+            out[r.patch.label].append({"first_hz": band.first_hz, "last_hz": band.last_hz, **seen})
     return out
 
 

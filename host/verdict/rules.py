@@ -74,7 +74,8 @@ def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Rea
     lost = max(masked_share, frames - absent)
     if lost > SOME_POSITIONS:
         out.append(Reason(
-            "none" if lost > FEW_POSITIONS else "care", f"{100 * lost:.1f} % of the recorded positions or frames are masked",
+            "none" if lost > FEW_POSITIONS else "care",
+            f"{100 * lost:.1f} % of the recorded positions or frames are masked",
             "packets were lost, or the direct path was not found there",
             "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost,
         ))  # fmt: skip
@@ -165,7 +166,7 @@ def metal_reasons(how: str, enough: bool, given: bool, score: float, others: int
     if others == 0 and not given:
         why = "it is the only patch: nothing else in the scene can show that it is metal"
     elif given:
-        why = "relative to it the other patches are no possible materials, and it does not return both polarisations alike"
+        why = "relative to it the other patches are no possible materials, or it does not return s and p alike"
     else:
         why = "seen from it the other patches are no possible materials, or too few of them tell"
     return [Reason("none", f"no metal reference: the patch {how} is not shown to be metal", why, give, 8.0)]
@@ -187,12 +188,14 @@ def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], 
     """Where the plates lie beside the rig file's plane."""
     if not known:
         return [Reason(
-            "care", f"nothing tells where the plane is; the angle is taken as the rig file says, +-{theta_std_deg:.2f} degrees",
+            "care",
+            f"nothing tells where the plane is; the angle is the rig file's, +-{theta_std_deg:.2f} degrees",
             "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
         )]  # fmt: skip
     if abs(offset_mm) > PLANE_GATE_MM:
         return [Reason(
-            "none", f"the plates lie {offset_mm:+.0f} mm off the rig file's plane", "they are at the edge of the range gate",
+            "none", f"the plates lie {offset_mm:+.0f} mm off the rig file's plane",
+            "they are at the edge of the range gate",
             "measure geometry.object_distance_mm and correct the rig file", 7.0,
         )]  # fmt: skip
     out, tilt = [], max(abs(t) for t in tilt_deg)
@@ -204,7 +207,8 @@ def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], 
         ))  # fmt: skip
     if tilt > PLANE_TILT_DEG:
         out.append(Reason(
-            "care", f"the plates' plane is tilted by {tilt:.1f} degrees", "tilted plates shine past the scanned positions",
+            "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
+            "tilted plates shine past the scanned positions",
             "lay the plates parallel to the stage", 1.4,
         ))  # fmt: skip
     return out

@@ -52,7 +52,8 @@ def test_metal_among_dielectrics_is_mostly_recognised(plates, least):
 
 def test_alone_nothing_is_shown():
     evidence = metal_evidence([], Uncertain(3e-3), 1.0 + 0j)
-    assert not evidence.enough and evidence.others == 0
+    assert not evidence.enough
+    assert evidence.others == 0
 
 
 def test_a_second_piece_of_metal_agrees():

@@ -109,9 +109,9 @@ def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
         scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
     )
     assert len(found.patches) == 9
-    assert all(p.truth is not None and p.verdict is not None for p in found.patches)
-    right = [p for p in found.patches if p.verdict.name == p.truth.name]
-    assert len(right) >= 8
+    named = [p for p in found.patches if p.verdict is not None]
+    assert [p.truth.name for p in found.patches if p.verdict is None] == ["copper"]  # the reference
+    assert sum(p.verdict.name == p.truth.name for p in named) >= 7
     assert pixel_accuracy(found) > 0.85
     assert found.metal.certain
     for p in found.patches:

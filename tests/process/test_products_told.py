@@ -33,10 +33,9 @@ def test_plates_named_right_are_counted_and_the_mark_of_an_earlier_run_is_remove
     rename_pet(scan, "no such material")
     told = told_by("process", scan, "--out", out, "--metal", METAL).splitlines()
     segments = content(out / "materials.json")["segments"]
-    assert told[0].startswith(f"simulated scan small: {len(segments)} patches; metal ")
-    assert told[1].startswith("1 of 2 plates named right, ")
-    share = float(told[1].split()[-5])
-    assert 0 < share < 100
+    assert told[0] == "verdict:  usable with care"
+    assert any(line.startswith(f"simulated scan small: {len(segments)} patches; metal ") for line in told)
+    assert any(line.startswith("0 of 1 plates named right, ") for line in told)  # copper is the reference
     assert f"report:   {out / 'report.html'}" in told
     assert f"products: {out}/" in told
     quality = content(out / "quality.json")
@@ -47,8 +46,7 @@ def test_plates_named_right_are_counted_and_the_mark_of_an_earlier_run_is_remove
     rename_pet(scan, pet["name"])
     taken_again(scan)
     told = told_by("process", scan, "--out", out, "--metal", METAL).splitlines()
-    assert told[1].startswith("2 of 2 plates named right, ")
-    assert float(told[1].split()[-5]) > share
+    assert any(line.startswith("1 of 1 plates named right, ") for line in told)
     assert not (out / FINISHED).exists()
     quality = content(out / "quality.json")
     assert (quality["rows_retaken"], quality["rows_incomplete"]) == (2, [5])

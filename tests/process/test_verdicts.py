@@ -165,7 +165,7 @@ def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
     assert msgspec.json.decode((tmp_path / "out/labels.json").read_bytes())["labels"].keys() <= {"patch", "patch (2)"}
 
 
-def test_p_sigma_covers_the_error_of_p(examine, rig):
+def test_p_sigma_covers_the_error_of_p(examine):
     scene = world(disturbances={"leakage_measured": 0.003})
     findings, true = examine(scene)
     found, sigma = findings.found, findings.found.p_sigma(findings.images.valid)

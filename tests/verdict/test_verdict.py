@@ -57,7 +57,8 @@ def test_no_result_has_an_exit_status_of_its_own():
     error = verdict_of(ALL).error("the images are kept")
     assert isinstance(error, NoResult)
     assert error.exit_status == 7
-    assert "c" in error.what and "the images are kept" in error.remedy
+    assert "c" in error.what
+    assert "the images are kept" in error.remedy
 
 
 def test_every_level_has_words():
@@ -83,7 +84,8 @@ def test_rows_and_frames_count_against_the_plan(recorded, received, faults, mask
     reasons = recording_reasons(Coverage(27, recorded, 27 * 100, received, faults), masked)
     assert level(reasons) == want
     if recorded == 22:
-        assert "5 of 27" in reasons[0].what and "18.5 %" in reasons[0].what
+        assert "5 of 27" in reasons[0].what
+        assert "18.5 %" in reasons[0].what
 
 
 @pytest.mark.parametrize(
@@ -156,5 +158,5 @@ def test_every_reason_says_what_why_and_what_to_do():
     ]
     assert len(reasons) >= 16
     for r in reasons:
-        assert r.what and r.why and r.do
-        assert not r.what.endswith(".") and not r.do.endswith(".")
+        assert all((r.what, r.why, r.do))
+        assert not any(text.endswith(".") for text in (r.what, r.do))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from polysight.host.imaging.geometry import Antennas, image_grid, row_offsets_m
 from polysight.host.imaging.reduce import scene_gate_m
+from polysight.host.store import ManifestFault
 from polysight.host.store.source import RowData
 from polysight.host.sync.chain import SyncedRow
 from polysight.shared.config import Board, Instrument, load_instrument
@@ -87,6 +88,7 @@ class RepeatedRows:
     scan_id: str = "benchmark"
     mirrored: bool = False
     synchronised: bool = False
+    manifest_faults: tuple[ManifestFault, ...] = ()
 
     def recording_facts(self) -> dict[str, Any]:
         """None are known."""

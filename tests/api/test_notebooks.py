@@ -56,7 +56,7 @@ def test_simulate_and_image(tmp_path, monkeypatch, capsys):
 def test_own_material(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(REPO / "examples" / "notebooks" / "own-material.ipynb")
-    assert list(names["materials"]["name"].values) == ["copper", "my material"]
+    assert list(names["materials"]["name"].values) == ["", "my material"]
 
 
 def test_every_notebook_is_run():

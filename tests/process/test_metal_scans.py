@@ -57,7 +57,7 @@ def scan(rig: Instrument, tmp_path_factory):
                 "burst": {"pulses": 4},
                 "image": {"columns": 40, "rows": 40, "pixel_mm": 4.0},
                 "plates": [{"name": name, "centre_mm": [0.0, 0.0], "size_mm": [360.0, 260.0], **PLATES[name]}],
-                "disturbances": {"leakage_measured": 0.002, **disturbances},
+                "disturbances": {"leakage_measured": 0.0005, **disturbances},
             }
             scene = decode_scene(raw, "test")
             made[key] = simulate(rig, scene, tmp_path_factory.mktemp("metal") / "scan")
@@ -107,7 +107,8 @@ def test_layers_come_back_where_one_interface_is_off(scan, reference, rig, name)
     if name == "water":
         assert fit.permittivity.real == pytest.approx(truth.real, rel=0.1)
         assert fit.permittivity.imag == pytest.approx(truth.imag, rel=0.1)
-        assert row["permittivity"]["real"] < truth.real / 5  # off by a factor
+        single = row["permittivity"]  # off by a factor, or that of no material
+        assert single is None or single["real"] < truth.real / 5
     else:
         assert abs(fit.permittivity - truth) < 0.05 * abs(truth)
     assert not fit.ambiguous

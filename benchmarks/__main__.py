@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.measure import one_thread_each
 
-NAMES = ("capture", "sync", "image", "whole", "scaling", "accuracy", "pi")
+NAMES = ("capture", "sync", "image", "whole", "scaling", "accuracy", "coverage", "pi")
 
 
 def main(argv: list[str]) -> int:

@@ -17,11 +17,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from polysight.data import packaged
 from polysight.host.imaging import PlaneEstimate
-from polysight.host.materials import MetalChoice, match_truth, truth_plates
+from polysight.host.materials import PatchEstimate, Seen, invert, match_truth, measured_ratio, truth_plates
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
 from polysight.host.process import Findings, Options
@@ -68,11 +69,11 @@ class Cubes:
 
     mirrored, synchronised, manifest_faults, simulated = False, True, (), True
 
-    def __init__(self, rig: Instrument, scene: Scene, drop_rows: int = 0) -> None:
+    def __init__(self, rig: Instrument, scene: Scene, drop_rows: int = 0, seed: int | None = None) -> None:
         self.instrument: Instrument = apply_scene(rig, scene)
         self.plan: RasterPlan = plan_raster(self.instrument.grid)
         self.scan_id, self._drop = scene.name, drop_rows
-        self._cubes = {b.name: synced_cube(rig, scene, b.name) for b in self.instrument.receivers}
+        self._cubes = {b.name: synced_cube(rig, scene, b.name, seed=seed) for b in self.instrument.receivers}
 
     def rows(self) -> Iterator[int]:
         """All rows of the plan, but the last ones that were dropped."""
@@ -124,8 +125,6 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     """A metal plate over the plane, on the rig file's plane, with the scene's rig: the same leakage and gains."""
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     whole = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
-    import msgspec
-
     alone = msgspec.structs.replace(scene, plates=whole, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
     pipeline = _imaged(Cubes(rig, alone))
     images = pipeline.form_images()
@@ -198,6 +197,52 @@ def _table(rows: list[PatchFigures], what: str) -> dict[str, float]:
     return entry
 
 
+def _std(p: PatchEstimate) -> float:
+    """Standard deviation of a permittivity, root of the mean of both parts' variance; NaN without one."""
+    return float("nan") if p.covariance is None else float(np.sqrt(np.trace(p.covariance) / 2))
+
+
+def nominal_widths(repeats: int = 5) -> tuple[float, float]:
+    """Median relative standard deviation of the permittivities at nominal conditions: as stated, and its bound.
+
+    Flat smooth plates on the rig file's plane, leakage measured to 0.003. The bound is what the same inversion states
+    when a ratio's error is that of noise alone (its scatter over `repeats` noises), with the same priors.
+    """
+    rig = load_instrument(packaged(Path("instrument.toml")))
+    plates = [
+        {"name": n, "centre_mm": [x, y], "size_mm": [46.0, 46.0]}
+        | ({"metal": True} if n == "metal" else {"permittivity": list(MATERIALS[n])})
+        for n, (x, y) in zip(("ceramic", "acrylic", "PET", "rubber", "metal", "glass"), PLACES, strict=True)
+    ]
+    scene = decode_scene(
+        {
+            "name": "nominal", "grid": GRID, "object_distance_mm": 499.0, "image": {"columns": 116, "rows": 90},
+            "plates": plates, "disturbances": {"leakage_measured": 0.003},
+        },
+        "nominal",
+    )  # fmt: skip
+    runs = []
+    for k in range(repeats):
+        pipeline = _imaged(Cubes(rig, scene, seed=100 + k))
+        runs.append(pipeline.examine(pipeline.form_images(), Options(model="none")).found)
+    ratios = np.array([[p.inverse_ratio for p in run.inversion.patches] for run in runs], np.complex128)
+    noise = np.sqrt((np.var(ratios.real, axis=0, ddof=1) + np.var(ratios.imag, axis=0, ddof=1)) / 2)
+    first, size = runs[0], np.abs([p.permittivity or np.nan for p in runs[0].inversion.patches])
+    theta = float(np.mean(first.theta_rad))
+    seen = [
+        Seen(complex(measured_ratio(p.inverse_ratio, *first.inversion.leakage)), max(float(s), 1e-5), theta)
+        for p, s in zip(first.inversion.patches, noise, strict=True)
+    ]
+    least = invert(seen, replace(first.prior, reference_std=float(np.median(noise))))
+    stated, bound = (
+        float(
+            np.median([np.sqrt(np.trace(p.covariance) / 2) for p in found.patches if p.covariance is not None] / size)
+        )
+        for found in (first.inversion, least)
+    )
+    return stated, bound
+
+
 def _one(job: tuple[int, bool]) -> list[PatchFigures]:
     return figures(*job)
 
@@ -253,6 +298,12 @@ def run(args: argparse.Namespace) -> int:
     print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")
     for w in said:
         print("   ", w)
+    stated, bound = nominal_widths()
+    out["nominal"] = {"stated": stated, "bound": bound}
+    print(
+        f"nominal conditions, leakage measured: stated {100 * stated:.2f} % (median), noise alone with the same priors"
+        f" {100 * bound:.2f} %: {stated / bound:.2f} times"
+    )
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         content = {"summary": out, "patches": [asdict(r) for r in rows + raw], "without": without}
@@ -260,4 +311,4 @@ def run(args: argparse.Namespace) -> int:
     return int(any(w[3] for w in said))
 
 
-__all__ = ["MetalChoice", "add_arguments", "draw_scene", "figures", "judged", "run"]
+__all__ = ["add_arguments", "draw_scene", "figures", "judged", "run"]

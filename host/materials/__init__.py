@@ -24,7 +24,15 @@ from polysight.host.materials.concentration import (
     polarisation_angle_rad,
 )
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, ImagePair, KnownScene, MetalChoice, Optics
-from polysight.host.materials.inversion import Inversion, PatchEstimate, Seen, Uncertain, invert, ratio_error
+from polysight.host.materials.inversion import (
+    Inversion,
+    PatchEstimate,
+    Seen,
+    Uncertain,
+    invert,
+    measured_ratio,
+    ratio_error,
+)
 from polysight.host.materials.knn import Fit, Weights, fit_weights
 from polysight.host.materials.layers import Layer, LayerFit, fit_layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
@@ -167,6 +175,7 @@ __all__ = [
     "make_library",
     "match_patches",
     "match_truth",
+    "measured_ratio",
     "median_ratio",
     "metal_by_label",
     "metal_evidence",

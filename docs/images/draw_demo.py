@@ -39,10 +39,10 @@ def draw(products: Path, to: Path) -> None:
         bar.set_label("dB", fontsize=12, color=MUTED)
         ax.set_title(title, fontsize=19, color=INK, fontweight="bold", loc="left")
         ax.set_facecolor("#d9dce3")
-    for n, part in enumerate(sorted(materials["segments"], key=lambda s: s["name"])):
+    for n, part in enumerate(sorted(materials["segments"], key=lambda s: s["name"] or "")):
         axes[3].add_patch(Polygon(part["outline_mm"], facecolor=PALETTE[n] + "99", edgecolor=INK, linewidth=1.2))
         x0, y0, x1, y1 = part["box_mm"]
-        words = part["name"].split(" (")[0].replace(" ", "\n", 1)
+        words = (part["name"] or "metal").split(" (")[0].replace(" ", "\n", 1)
         eps = part["permittivity"]
         told = (
             "reference"

@@ -9,6 +9,7 @@ by simulators that share nothing with the host's optics; what it says of a real 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import tempfile
 from collections.abc import Iterator
@@ -22,7 +23,7 @@ import numpy as np
 
 from polysight.data import packaged
 from polysight.host.imaging import PlaneEstimate
-from polysight.host.materials import PatchEstimate, Seen, invert, match_truth, measured_ratio, truth_plates
+from polysight.host.materials import UNKNOWN, PatchEstimate, Seen, invert, match_truth, measured_ratio, truth_plates
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
 from polysight.host.process import Findings, Options
@@ -38,11 +39,18 @@ MATERIALS: dict[str, tuple[float, float]] = {
     "glass fibre": (4.69, 0.7), "rubber": (5.06, 1.11), "silicone": (3.52, 0.82), "ceramic": (4.75, 2.43),
     "liquid behind glass": (3.66, 0.43), "glass": (6.3, 0.2), "marble": (7.5, 0.25),
 }  # fmt: skip
+KNOWN: dict[str, tuple[float, float]] = {
+    "rubber": (5.06, 1.11), "cardboard (rough)": (4.54, 0.56), "silicone rubber": (3.52, 0.82),
+    "PET (0.5 mm)": (3.78, 0.7), "ceramic": (4.75, 2.43), "acrylic (3 mm)": (4.0, 0.4), "glass fiber": (4.69, 0.7),
+    "wood (thin, smooth)": (2.61, 0.01),
+}  # fmt: skip
+"""Materials of the simulated library: named scenes hold these, all specimens alike."""
 CLASSES = {"low loss": 0.05, "medium": 0.18, "lossy": np.inf}
 """Material classes by their loss tangent's upper end."""
 GRID = {"columns": 45, "rows": 43, "step_x_mm": 10.0, "step_y_mm": 6.0}
 PLACES = [(x, y) for y in (-34.0, 34.0) for x in (-66.0, 0.0, 66.0)]
-KINDS = ("full", "no metal", "no direct path", "noise", "empty")
+KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named")
+SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
 CHI2_68, CHI2_95 = 2.279, 5.991
 
 
@@ -93,14 +101,15 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     """A scene of six plates, or of what `kind` says, with every nuisance drawn."""
     rng = np.random.default_rng([20261122, seed, KINDS.index(kind)])
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
-    names = rng.choice(list(MATERIALS), len(PLACES), replace=False).tolist()
+    materials = KNOWN if kind == "named" else MATERIALS
+    names = rng.choice(list(materials), len(PLACES), replace=False).tolist()
     metal = None if kind == "no metal" or (kind == "full" and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
     tilted, plates = rng.random() < 0.5, []
     for i, (x, y) in enumerate(PLACES):
         place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
         relief = {"height_mm": rng.uniform(-0.5, 0.5), "tilt_deg": (rng.uniform(-1, 1, 2) * tilted).tolist()}
         what = {"name": "metal", "metal": True} if i == metal else {
-            "name": names[i], "permittivity": list(MATERIALS[names[i]]), "rough_mm": rng.uniform(0, 0.2)}  # fmt: skip
+            "name": names[i], "permittivity": list(materials[names[i]]), "rough_mm": rng.uniform(0, 0.2)}  # fmt: skip
         plates.append({**place, **relief, **what})
     if kind == "no metal":
         plates = plates[: int(rng.integers(1, len(PLACES) + 1))]
@@ -109,7 +118,7 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
         {
             "name": f"drawn {kind} {seed}", "seed": 1000 + seed, "grid": GRID, "object_distance_mm": 499.0,
             "image": {"columns": 116, "rows": 90},
-            "specimen_spread": [0.03, 0.3], "plane_shift_mm": rng.uniform(-10, 10),
+            "specimen_spread": [0.0, 0.0] if kind == "named" else [0.03, 0.3], "plane_shift_mm": rng.uniform(-10, 10),
             "plane_tilt_deg": (rng.uniform(-1, 1, 2) * (not tilted)).tolist(),
             "plates": [] if kind in ("empty", "noise") else plates,
             "disturbances": {
@@ -142,7 +151,7 @@ def _imaged(source: Any) -> Pipeline:
 def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Instrument, Findings, PlaneEstimate]:
     """One scene, drawn, simulated and judged."""
     rig, scene = load_instrument(packaged(Path("instrument.toml"))), draw_scene(seed, kind)
-    options = Options(model="none")
+    options = Options(model=None if kind == "named" else "none")
     if kind == "full" and not any(p.metal for p in scene.plates):
         options = replace(options, reference=metal_scan(rig, scene))
     if raw or kind in ("no direct path", "noise"):
@@ -247,6 +256,28 @@ def _one(job: tuple[int, bool]) -> list[PatchFigures]:
     return figures(*job)
 
 
+def _names(seed: int) -> list[tuple[float, bool]]:
+    """Probability beside each name of one scene, and whether the name is right."""
+    scene, rig, findings, _ = judged(seed, "named")
+    plates, found = truth_plates(truth(rig, scene, scene.seed)), findings.found
+    true = match_truth([r.patch for r in found.patches], plates)
+    named = [(r.verdict, true[r.patch.label]) for r in found.patches if r.patch.label in true]
+    return [(v.confidence, v.name == plate.name) for v, plate in named if v is not None and v.name != UNKNOWN]
+
+
+def _reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
+    """How often names are right beside the probability they were given; printed and returned by bin."""
+    out = []
+    for low, high in itertools.pairwise(SURE):
+        inside = [(p, right) for p, right in pairs if low <= p < high]
+        if inside:
+            said, right = (float(np.mean(x)) for x in zip(*inside, strict=True))
+            out.append({"names": len(inside), "probability": said, "right": right})
+            print(f"  probability {100 * low:3.0f}..{min(100 * high, 100):3.0f} %: {len(inside):4d} names, said"
+                  f" {100 * said:.0f} %, right {100 * right:.0f} %")  # fmt: skip
+    return out
+
+
 def _without(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
     seed, kind = job
     _, _, findings, _ = judged(seed, kind)
@@ -261,6 +292,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", type=int, default=40, help="full scenes, from samples (default: 40)")
     parser.add_argument("--raw", type=int, default=4, help="full scenes from raw data (default: 4)")
     parser.add_argument("--without", type=int, default=20, help="scenes that hold nothing to name (default: 20)")
+    parser.add_argument("--named", type=int, default=12, help="scenes of the library's materials (default: 12)")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
     parser.add_argument("--json", type=Path, default=None, help="write every patch here")
@@ -274,6 +306,7 @@ def run(args: argparse.Namespace) -> int:
         found = list(pool.map(_one, jobs))
         kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
         without = list(pool.map(_without, kinds))
+        named = [pair for one in pool.map(_names, range(args.first, args.first + args.named)) for pair in one]
     rows = [r for one in found[: args.scenes] for r in one]
     raw = [r for one in found[args.scenes :] for r in one]
     out: dict[str, Any] = {"all": _table(rows, "all, from samples")}
@@ -298,6 +331,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")
     for w in said:
         print("   ", w)
+    print(f"names of the library's materials, {args.named} scenes with every nuisance but other specimens")
+    reliability = _reliability(named)
     stated, bound = nominal_widths()
     out["nominal"] = {"stated": stated, "bound": bound}
     print(
@@ -306,7 +341,7 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
-        content = {"summary": out, "patches": [asdict(r) for r in rows + raw], "without": without}
+        content = {"summary": out, "names": reliability, "patches": [asdict(r) for r in rows + raw], "without": without}
         args.json.write_text(json.dumps(content, indent=1) + "\n")
     return int(any(w[3] for w in said))
 

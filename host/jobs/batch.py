@@ -95,7 +95,7 @@ def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
     return list(jobs.values())
 
 
-PRODUCTS_VERSION = 3  # counts changes of what products of the same data hold
+PRODUCTS_VERSION = 4  # counts changes of what products of the same data hold
 NOT_DATA = ("products", ".products.new", ".products.old", "products-export", "control")  # folders of a scan
 
 
@@ -297,7 +297,7 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
         masked, patches = _found(out / o.name) if o.status in ("done", "skipped") else ("", "")
         seconds = f"{o.seconds:.0f}" if o.seconds else ""
         memory = f"{o.memory_gb:.1f} GB" if o.memory_gb else ""
-        rows.append((o.name, o.status, seconds, memory, masked, patches, o.message))
+        rows.append((o.name, o.status, seconds, memory, masked, patches, o.message or _verdict(out / o.name)))
     widths = [max(len(row[k]) for row in rows) for k in range(6)]
     lines = []
     for row in rows:
@@ -308,6 +308,17 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
     counts = ", ".join(f"{n} {status}" for status, n in count.items() if n)
     end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY}"
     return "\n".join([*lines, end, ""])
+
+
+def _verdict(products: Path) -> str:
+    """What the products say of themselves, where that is not `good`; with the first reason."""
+    try:
+        verdict = SavedProducts(products).verdict
+    except (PolysightError, AttributeError, KeyError, TypeError):
+        return ""
+    if verdict is None or verdict.level == "good":
+        return ""
+    return f"{verdict.text}: {verdict.reasons[0].what}" if verdict.reasons else verdict.text
 
 
 def _found(products: Path) -> tuple[str, str]:

@@ -11,6 +11,7 @@ import msgspec
 from polysight.host.jobs.batch import Job
 from polysight.host.jobs.process import process
 from polysight.host.products import FINISHED, write_json
+from polysight.host.verdict import NoResult
 from polysight.shared.errors import PolysightError
 
 
@@ -27,6 +28,8 @@ def main() -> int:
     except OSError as e:
         sys.stderr.write(f"{e.filename or job.out}: {e.strerror or e}\n")
         return 1
+    if status == NoResult.exit_status:
+        status = 0  # the scan is processed: its products say that nothing can be named
     if status == 0:
         used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
         seconds = round(time.monotonic() - began, 1)

@@ -111,7 +111,9 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
         return status
     library = Library.load(library_path)
     refused = [{s["label"]: s for s in p.segments if s.get("refused")} for p in products]
-    scans = [_without(p.patches, labels) for p, labels in zip(products, refused, strict=True)]
+    # The metal reference is never judged by itself.
+    metal = [{s["label"] for s in p.segments if s.get("metal_reference")} for p in products]
+    scans = [_without(p.patches, r.keys() | m) for p, r, m in zip(products, refused, metal, strict=True)]
     classifier = Classifier(library, model=model, angles_deg=[s.angle_deg for s in scans])
     matched = match_patches(scans)
     if not matched:

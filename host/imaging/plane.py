@@ -38,6 +38,7 @@ _TILT_PRIOR_RAD = 0.02
 """Standard deviation of a plane's tilt before it is seen: one degree."""
 _LEAST_STD_M = 3e-4
 """A plate's range is not trusted better than this: neighbours' sidelobes reach into it."""
+_MOST_TILT = 0.035
 _PHASE_FITS_RAD = 0.5
 """Plates whose phases lie on one plane within this are resolved; it is a fifth of what chance leaves."""
 _PHASE_STD_M = 5e-5
@@ -149,7 +150,9 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         finer, fine_covariance = _fit(places[fine], phase[0][fine], np.full(int(fine.sum()), _PHASE_STD_M))
         off = phase[0][fine] - _at(finer, places[fine])
         agree = float(np.sqrt(np.mean((off * phase[1]) ** 2))) < _PHASE_FITS_RAD
-        if agree and fine.sum() >= 4 and abs(finer[0] - plane[0]) < 3 * np.sqrt(covariance[0, 0]) + _LEAST_STD_M:
+        # Thin sheets turn the phase by themselves: a plane that the ranges do not bear out is none.
+        apart = np.abs(finer - plane) < 3 * np.sqrt(np.diag(covariance)) + [_LEAST_STD_M, 3e-3, 3e-3]
+        if agree and fine.sum() >= 4 and bool(apart.all()) and float(np.hypot(*finer[1:])) < _MOST_TILT:
             plane, covariance, heights, by_phase = finer, fine_covariance, phase[0], True
     std = np.sqrt(np.diag(covariance))
     return PlaneEstimate(

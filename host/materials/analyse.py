@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from polysight.host.materials.classify import Classifier, NamedPatch, features_of
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
-from polysight.host.materials.inversion import Inversion, Uncertain, feature_errors, invert
+from polysight.host.materials.inversion import Inversion, PatchEstimate, Seen, Uncertain, feature_errors, invert
 from polysight.host.materials.measure import LEAST_STD, Refused, all_refused, background, reference_std, seen
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box, no_metal
 from polysight.host.materials.metal_evidence import metal_evidence
@@ -35,6 +35,10 @@ from polysight.shared.errors import DataError
 
 FILLED = 0.1
 """|H| relative to metal over an image without edges from which on one material fills it, rather than none."""
+CHI2_95 = 5.99
+"""A material is not named whose permittivity lies outside the patch's 95 % region."""
+SPECIMEN_STD = 0.03
+"""Relative difference of two specimens of a material that such a comparison allows for."""
 ACTIVE = 2.0
 """Standard deviations of gain, or of a real part below 1, beyond which a permittivity is that of no material."""
 
@@ -83,7 +87,7 @@ def analyse(
         for p in found.patches
     }
     refused |= {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
-    named = _names(classifier, (sh, sv, sp), (inversion, prior), judged, float(np.mean(theta)))
+    named = _names(classifier, (sh, sv, sp), (inversion, prior), judged, measured, float(np.mean(theta)))
     truth = match_truth(found.patches, known.plates)
     results = tuple(
         PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
@@ -97,6 +101,7 @@ def _names(
     channels: tuple[Image, Image, Image],
     errors: tuple[Inversion, Uncertain],
     judged: list[Patch],
+    measured: list[Seen],
     theta_rad: float,
 ) -> dict[int, NamedPatch]:
     """Patch number to its name, with the error budget's share in it; the metal reference is not named by itself."""
@@ -108,9 +113,24 @@ def _names(
         at = patch.interior
         by_h, by_q = _to_angle(estimate.permittivity, theta_rad + errors[0].theta_error_rad, classifier.angles_deg)
         features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
-    covariances = np.stack([feature_errors(*errors, i) for i in range(len(judged))])
+    covariances = np.stack([feature_errors(*errors, i, s.std) for i, s in enumerate(measured)])
     named = classifier.scan(features, covariances)
-    return dict(zip((patch.label for patch in judged), named, strict=True))
+    known = classifier.permittivities
+    kept = [
+        n if _compatible(known.get(n.verdict.name), e) else n.unknown()
+        for n, e in zip(named, errors[0].patches, strict=True)
+    ]
+    return dict(zip((patch.label for patch in judged), kept, strict=True))
+
+
+def _compatible(permittivity: complex | None, estimate: PatchEstimate) -> bool:
+    """Whether a material's permittivity lies in the patch's 95 % region, as far as both are known."""
+    if permittivity is None or estimate.permittivity is None or estimate.covariance is None:
+        return True
+    away = estimate.permittivity - permittivity
+    pair = np.array([away.real, away.imag])
+    own = np.diag([(SPECIMEN_STD * abs(permittivity)) ** 2] * 2)
+    return float(pair @ np.linalg.solve(estimate.covariance + own, pair)) < CHI2_95
 
 
 def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequence[float]) -> tuple[float, complex]:

@@ -7,7 +7,7 @@ compare with. `Classifier` uses the one that was fitted with the library, or tha
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -123,6 +123,10 @@ class NamedPatch:
     distance: Real
     verdict: Verdict
 
+    def unknown(self) -> NamedPatch:
+        """The same patch, called unknown; its pixels keep their own names."""
+        return replace(self, verdict=replace(self.verdict, name=UNKNOWN))
+
 
 class Classifier:
     """Names pixels and patches by the library.
@@ -175,6 +179,17 @@ class Classifier:
             samples = samples.joined(Samples.of(part))
         self._model.fit(samples)
         self._width = max(len(UNKNOWN), *(len(n) for n in library.names))
+
+    @property
+    def permittivities(self) -> dict[str, complex]:
+        """Name to the mean true permittivity of its library entries, where all are known."""
+        out: dict[str, complex] = {}
+        for name in self.library.names:
+            known = [e.permittivity for e in self.library.entries if e.name == name]
+            values = [complex(p[0], -p[1]) for p in known if p is not None]
+            if values and len(values) == len(known):
+                out[name] = complex(np.mean(values))
+        return out
 
     def scan(self, patches: Sequence[Real], errors: Real | None = None) -> list[NamedPatch]:
         """Name the patches of one scan, or of several scans of the same patches, together.

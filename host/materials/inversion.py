@@ -362,9 +362,11 @@ def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real
     return np.sqrt(np.maximum(total, 0.0) / 2)
 
 
-def feature_errors(found: Inversion, prior: Uncertain, i: int) -> Real:
-    """Covariance that leakage and metal reference leave in ln|H|, ln|V| and arg P of a patch, float64 [3, 3].
+def feature_errors(found: Inversion, prior: Uncertain, i: int, std: float) -> Real:
+    """Covariance of ln|H|, ln|V| and arg P of a patch by the error budget, float64 [3, 3].
 
+    Leakage and metal reference as the inversion left them; the patch's brightness, common to both channels; and the
+    standard deviation `std` of its own V / H.
     To first order in leakage about the solution: with s = r_s and t = r_p / r_s, h' = h - da p - ... (Eq. 8 and 9).
     """
     t = found.patches[i].inverse_ratio
@@ -382,4 +384,6 @@ def feature_errors(found: Inversion, prior: Uncertain, i: int) -> Real:
 
     (h, h_angle), (v, v_angle) = both(by_h), both(by_v)
     rows = np.stack([h, v, h_angle - v_angle])
-    return rows @ c @ rows.T
+    dull = found.brightness_std**2 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    own = (std / abs(own_t)) ** 2 * np.diag([0.0, 1.0, 1.0])
+    return rows @ c @ rows.T + dull + own

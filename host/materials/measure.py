@@ -33,6 +33,8 @@ LEAST_LEVEL = 2.0
 """|H| beside the background's root mean square."""
 ODD_SHARE, ODD_RATIO = 0.15, 0.15
 """Several kinds together: so many pixels whose V / H is so far from the median's."""
+HALVES_APART = 0.035
+"""Difference of V / H between opposite halves of a patch, beyond which two materials touch in it."""
 _AROUND_PX = 6  # of patches, that is not background
 
 
@@ -90,6 +92,9 @@ def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refu
     dim = float(np.median(np.abs(v[at]))) < 0.12 * float(np.median(level))
     if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
         return Refused("H and V do not agree", "their phases differ from pixel to pixel, as in noise", move)
+    if _halves_apart(h, v, at) > HALVES_APART:
+        what = "several kinds together"
+        return Refused(what, "its halves have different ratios", "move the plates apart, or draw boxes")
     odd = np.abs(v[at] / h[at] - 1 / median_ratio(h[at], v[at])) > ODD_RATIO
     if float(odd.mean()) > ODD_SHARE:
         what = "several kinds together"
@@ -97,6 +102,20 @@ def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refu
             what, f"{100 * odd.mean():.0f} % of its pixels have another ratio", "move the plates apart, or draw boxes"
         )
     return None
+
+
+def _halves_apart(h: Image, v: Image, at: Mask) -> float:
+    """Largest difference of the median V / H between opposite halves of a patch."""
+    rows, columns = np.nonzero(at)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values, largest = v[at] / h[at], 0.0
+    for place in (rows, columns):
+        low, high = values[place < np.median(place)], values[place > np.median(place)]
+        if min(low.size, high.size) >= LEAST_PIXELS // 2:
+            real = float(np.nanmedian(low.real) - np.nanmedian(high.real))
+            imag = float(np.nanmedian(low.imag) - np.nanmedian(high.imag))
+            largest = max(largest, float(np.hypot(real, imag)))
+    return largest
 
 
 def seen(patch: Patch, h: Image, v: Image, theta_rad: float, local_std: float = 0.0) -> Seen:

@@ -38,8 +38,10 @@ class MetalReference:
 
     @property
     def certain(self) -> bool:
-        """Whether it is metal beyond doubt: given, or shown by the rest of the scene."""
-        return self.given or (self.evidence is not None and self.evidence.enough)
+        """Whether it is taken for metal with reason: the rest of the scene shows it, or it is given, unopposed."""
+        if self.evidence is None:
+            return self.given
+        return self.evidence.enough or (self.given and not self.evidence.against)
 
 
 def metal_in_box(

@@ -25,6 +25,10 @@ Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
 """How far V over H of metal may lie from that of the direct path: the boards' patterns differ off their axis."""
+SURE_SCORE = 2.5
+WEAK_V_DB = -3.0
+"""V over H beside the direct path below which a patch is hardly metal: 0 is metal, -4 dB is bare water."""
+_UNLIKE = 0.2
 _LARGEST = 10.0  # |eps| of common materials; beyond it costs
 _NEAR_METAL = 0.12  # |t - 1|: another piece of metal need not be a possible dielectric
 _STARTS = [
@@ -43,7 +47,8 @@ class MetalEvidence:
     score
         Sum of squares of the best dielectric less that of metal; positive speaks for metal.
     others
-        How many other patches were asked.
+        How many other patches tell: those that are unlike the judged one. One that looks the same is metal beside
+        metal, or water beside water.
     channel_ratio_db
         V over H of the patch relative to the direct path; None where that was not known.
     agreeing
@@ -57,12 +62,23 @@ class MetalEvidence:
 
     @property
     def needed(self) -> float:
-        """Score from which the patch counts as metal: the fewer patches were asked, the more.
+        """Score from which the patch counts as metal: the fewer patches tell, the more.
 
         From random scenes of Table 2's and other materials with and without metal (benchmarks/verdicts): of those
         without metal none reached it.
         """
-        return np.inf if self.others == 0 else 1.5 if self.others == 1 else 0.5 if self.others < 4 else -3.0
+        return np.inf if self.others == 0 else 1.5 if self.others == 1 else 0.5 if self.others < 6 else -2.0
+
+    @property
+    def sure(self) -> bool:
+        """Whether it is metal beyond doubt: very lossy dielectrics (wet, conducting) come close to metal."""
+        return self.enough and self.score >= SURE_SCORE
+
+    @property
+    def against(self) -> bool:
+        """Whether what is seen speaks against metal, whoever says that it is."""
+        weak = self.channel_ratio_db is not None and self.channel_ratio_db < WEAK_V_DB
+        return weak or (self.others > 0 and self.score < -1.0)
 
     @property
     def enough(self) -> bool:
@@ -94,7 +110,8 @@ def metal_evidence(seen: list[Seen], prior: Uncertain, channel_ratio: complex | 
     starts = [np.concatenate([np.zeros(8), [np.log(e.real), np.log(-e.imag)]]) for e in _STARTS]
     starts.sort(key=lambda x: float(np.sum(metal.residuals(x) ** 2)))
     as_dielectric = min(_best(metal, x) for x in starts[:_REFINED])
-    return MetalEvidence(as_dielectric - as_metal, len(seen), level, agreeing)
+    unlike = sum(abs(s.inverse_ratio - 1) > _UNLIKE for s in seen)
+    return MetalEvidence(as_dielectric - as_metal, unlike, level, agreeing)
 
 
 def _best(model: _Explanation, start: Real) -> float:
@@ -125,7 +142,8 @@ class _Explanation:
         if x.size > 8:
             eps = complex(np.exp(min(x[8], 4.0)), -np.exp(min(x[9], 4.0)))
             own, own_s = 1 / complex(ratio_from_permittivity(eps, middle)), complex(fresnel(eps, middle)[0])
-            bounds = [max(0.0, x[8] - np.log(15)) / 0.1, max(0.0, x[9] - np.log(20)) / 0.1, max(0.0, -x[8]) / 0.1]
+            bounds = [max(0.0, x[8] - np.log(30)) / 0.1, max(0.0, x[9] - np.log(30)) / 0.1, max(0.0, -x[8]) / 0.1]
+            bounds.append(max(0.0, np.log(abs(eps) / _LARGEST)) / 0.6)  # such dielectrics are rare
         c = self.q * (own + b) / (1 + a * own) / (1 + p.reference_std * complex(x[5], x[6]))
         t = (c - b) / (1 - a * c)
         with np.errstate(divide="ignore", invalid="ignore"):

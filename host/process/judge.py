@@ -64,7 +64,7 @@ def judge(
     reasons = recording_verdict(quality)
     refused = {r.patch.label: r.refused.what for r in found.patches if r.refused is not None}
     gaining = {
-        r.patch.label: r.permittivity.text
+        r.patch.label: r.refused.what
         for r in found.patches
         if r.refused is not None and r.refused.what in GAIN and r.permittivity.value is not None
     }
@@ -72,11 +72,9 @@ def judge(
     reasons += passivity_reasons(gaining)
     metal = found.metal
     if found.patches and metal.evidence is not None:
-        e = metal.evidence
-        label = "" if metal.label is None else f"{metal.label}"
-        reasons += metal_reasons(label, e.enough, metal.given, e.score, e.others)
-    if metal.label in refused and not metal.given:
-        reasons += metal_reasons(f"{metal.label}", False, False, 0.0, 0)
+        e, patch = metal.evidence, "the given box" if metal.label is None else f"patch {metal.label}"
+        enough = e.enough and (metal.given or metal.label not in refused)
+        reasons += metal_reasons(patch, enough, enough and e.sure, metal.given, e.against, e.others == 0)
     if found.prior.channels_known:
         levels = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
         reasons += level_reasons({k: float(np.median(np.abs(v))) for k, v in levels.items()})
@@ -105,7 +103,7 @@ def _by_leakage(found: MaterialsResult) -> float:
 def error_budget(found: MaterialsResult, plane: PlaneEstimate | None) -> dict[str, Any]:
     """What the joint inversion found, for materials.json: leakage, angle, plane, evidence for metal."""
     i, prior = found.inversion, found.prior
-    source = "measured" if prior.leakage_measured else "scene" if i.leakage_determined else "prior"
+    source = "measured" if prior.leakage_measured else "scene" if i.leakage_determined else "prior and scene"
     evidence = found.metal.evidence
     angle = float(np.degrees(np.mean(found.theta_rad) + i.theta_error_rad))
     return {

@@ -237,7 +237,7 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
 
 _SOURCES = {
     "measured": "measured (rig file)",
-    "prior": "not measured; its prior is used",
+    "prior and scene": "not measured; its prior, and what the scene shows of it",
     "scene": "estimated from the scene",
 }
 

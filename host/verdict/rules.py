@@ -14,7 +14,7 @@ from polysight.host.verdict.verdict import Reason
 
 FEW_POSITIONS = 0.5
 """Share of absent or masked positions from which nothing can be said of the scene."""
-SOME_POSITIONS = 0.02
+SOME_POSITIONS = 0.005
 """Share of absent or masked positions that is worth a word."""
 DIRECT_SNR_NONE_DB = -14.0
 """Direct path over noise in one sample of one chirp and channel, below which there is none."""
@@ -111,7 +111,8 @@ def level_reasons(levels: Mapping[str, float | None]) -> list[Reason]:
     for channel, level in levels.items():
         if level is not None and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
             weak = level > DIRECT_LEVELS[1]
-            what = f"{channel}: metal is {20 * np.log10(level):+.0f} dB beside the direct path"
+            state = "weak" if weak else "strong"
+            what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB beside it"
             why = (
                 "the direct path is weakened by something in its way; the object reaches into its estimate"
                 if weak
@@ -151,25 +152,49 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
     ]
 
 
-def metal_reasons(how: str, enough: bool, given: bool, score: float, others: int) -> list[Reason]:
-    """The metal reference: shown to be metal by the scene, given by the user, or neither."""
-    if enough:
-        return []
+def metal_reasons(patch: str, enough: bool, sure: bool, given: bool, against: bool, alone: bool) -> list[Reason]:
+    """The metal reference: shown to be metal by the scene, given by the user, or neither.
+
+    Parameters
+    ----------
+    patch
+        What it is called, e.g. "patch 3".
+    enough, sure
+        The rest of the scene shows that it is metal; and beyond doubt.
+    given
+        A person says so.
+    against
+        What is seen speaks against it.
+    alone
+        No other patch tells.
+    """
     give = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
-    if given and score > -20:
-        if others == 0 or score > -6:
-            return []
-        return [Reason(
-            "care", "the given metal reference does not look like metal",
-            "relative to it the other patches are no possible materials", give, 4.0,
-        )]  # fmt: skip
-    if others == 0 and not given:
-        why = "it is the only patch: nothing else in the scene can show that it is metal"
-    elif given:
-        why = "relative to it the other patches are no possible materials, or it does not return s and p alike"
-    else:
-        why = "seen from it the other patches are no possible materials, or too few of them tell"
-    return [Reason("none", f"no metal reference: the patch {how} is not shown to be metal", why, give, 8.0)]
+    if given and against:
+        return [
+            Reason(
+                "none" if not enough and not alone else "care",
+                f"the given metal reference ({patch}) does not look like metal",
+                "it does not return both polarisations alike, or the other patches are no possible materials beside it",
+                give,
+                8.0,
+            )
+        ]
+    if given or sure:
+        return []
+    if enough:
+        return [
+            Reason(
+                "care",
+                f"the metal reference ({patch}) is likely metal, not certainly",
+                "a wet or conducting plate could look like it; all permittivities hang on it",
+                give,
+                2.8,
+            )
+        ]
+    why = "seen from it the other patches are no possible materials, or too few of them tell"
+    if alone:
+        why = "nothing else in the scene can show that it is metal"
+    return [Reason("none", f"no metal reference: {patch} is not shown to be metal", why, give, 8.0)]
 
 
 def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Reason]:
@@ -178,7 +203,8 @@ def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> 
         return []
     source = "estimated from the scene" if determined else "never measured; its prior is used"
     return [Reason(
-        "care", f"leakage was {source}: it leaves {100 * relative_error:.0f} % in the permittivities",
+        "care",
+        f"leakage was {source}: it leaves {100 * relative_error:.0f} % in permittivities, and names suffer too",
         "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
         "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
     )]  # fmt: skip
@@ -215,14 +241,14 @@ def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], 
 
 
 def passivity_reasons(gaining: Mapping[int, str]) -> list[Reason]:
-    """Patches whose permittivity has gain beyond its error: number to the value as text."""
+    """Patches whose permittivity is that of no passive material beyond its error: number to what is wrong with it."""
     return [
         Reason(
-            "care", f"patch {label} would amplify ({value}): not printed as a material",
+            "care", f"patch {label} is not printed as a material: {what}",
             "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place",
             "measure leakage; if the plate is thin, fit it as a layer (polysight permittivity --layer)", 2.2,
         )
-        for label, value in gaining.items()
+        for label, what in gaining.items()
     ]  # fmt: skip
 
 

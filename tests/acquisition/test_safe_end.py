@@ -223,7 +223,9 @@ def test_scan_whose_messages_nobody_reads_is_made_and_processed(rig, tmp_path, m
     made, streams = [], [kind(), kind()]
     monkeypatch.setattr(live, "_check_options", lambda *_: None)
     monkeypatch.setattr(live, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
-    monkeypatch.setattr(live, "make_products", lambda *given: made.append(given) or SimpleNamespace(summary=str))
+    monkeypatch.setattr(
+        live, "make_products", lambda *given: made.append(given) or SimpleNamespace(summary=str, exit_status=0)
+    )
     update = progress.ScanBar.update
 
     def updated(bar, p) -> None:

@@ -113,18 +113,19 @@ def test_a_weak_direct_path_shows_in_the_metals_level():
 
 
 @pytest.mark.parametrize(
-    ("enough", "given", "score", "others", "want"),
+    ("enough", "sure", "given", "against", "alone", "want"),
     [
-        (True, False, 4.0, 8, "good"),
-        (False, False, -30.0, 8, "none"),
-        (False, False, 0.0, 0, "none"),
-        (False, True, 0.0, 0, "good"),
-        (False, True, -10.0, 4, "care"),
-        (False, True, -60.0, 4, "none"),
+        (True, True, False, False, False, "good"),
+        (True, False, False, False, False, "care"),
+        (False, False, False, True, False, "none"),
+        (False, False, False, False, True, "none"),
+        (False, False, True, False, True, "good"),
+        (False, False, True, True, True, "care"),
+        (False, False, True, True, False, "none"),
     ],
 )
-def test_metal_is_never_judged_by_itself(enough, given, score, others, want):
-    assert level(metal_reasons("3", enough, given, score, others)) == want
+def test_metal_is_never_judged_by_itself(enough, sure, given, against, alone, want):
+    assert level(metal_reasons("patch 3", enough, sure, given, against, alone)) == want
 
 
 def test_other_rules():
@@ -147,8 +148,9 @@ def test_every_reason_says_what_why_and_what_to_do():
         *direct_path_reasons("RH", -6.0, 0.3, 1.0),
         *signal_reasons({1: "noise"}, 2),
         *signal_reasons({}, 0),
-        *metal_reasons("1", False, False, -9.0, 3),
-        *metal_reasons("1", False, True, -9.0, 3),
+        *metal_reasons("patch 1", False, False, False, True, False),
+        *metal_reasons("patch 1", False, False, True, True, False),
+        *metal_reasons("patch 1", True, False, False, False, False),
         *leakage_reasons(False, True, 0.1),
         *plane_reasons(False, 0.0, (0.0, 0.0), 0.3),
         *plane_reasons(True, 14.0, (0.0, 0.0), 0.3),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,8 +32,8 @@ LEAST_LEVEL = 2.0
 """|H| beside the background's root mean square."""
 ODD_SHARE, ODD_RATIO = 0.15, 0.15
 """Several kinds together: so many pixels whose V / H is so far from the median's."""
-HALVES_APART = 0.035
-"""Difference of V / H between opposite halves of a patch, beyond which two materials touch in it."""
+HALVES_APART = 0.05
+"""Difference of V / H between opposite halves of a dielectric (of metal thrice), beyond which two materials touch."""
 _AROUND_PX = 6  # of patches, that is not background
 
 
@@ -62,7 +61,7 @@ def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[f
     return levels[0], levels[1]
 
 
-def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refused | None:
+def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float], uneven: float) -> Refused | None:
     """Why a patch is no plate; None when it may be one.
 
     Parameters
@@ -73,6 +72,8 @@ def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refu
         complex [ny, nx], relative to metal (or to anything), smoothed inside patches.
     dark
         Of :func:`background`, in the same units.
+    uneven
+        How far halves of the metal reference differ: what the scan itself makes of one material.
     """
     at = patch.interior & np.isfinite(h) & np.isfinite(v)
     move = "check the image, the direct path and the range profile"
@@ -92,7 +93,8 @@ def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refu
     dim = float(np.median(np.abs(v[at]))) < 0.12 * float(np.median(level))
     if not dim and cross < 0.7 * np.sqrt(power_h * power_v):
         return Refused("H and V do not agree", "their phases differ from pixel to pixel, as in noise", move)
-    if _halves_apart(h, v, at) > HALVES_APART:
+    allowed = max(HALVES_APART, uneven) * (1 + 2 * float(np.median(np.abs(v[at])) / np.median(level)))
+    if halves_apart(h, v, at) > allowed:
         what = "several kinds together"
         return Refused(what, "its halves have different ratios", "move the plates apart, or draw boxes")
     odd = np.abs(v[at] / h[at] - 1 / median_ratio(h[at], v[at])) > ODD_RATIO
@@ -104,7 +106,7 @@ def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float]) -> Refu
     return None
 
 
-def _halves_apart(h: Image, v: Image, at: Mask) -> float:
+def halves_apart(h: Image, v: Image, at: Mask) -> float:
     """Largest difference of the median V / H between opposite halves of a patch."""
     rows, columns = np.nonzero(at)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,10 +148,11 @@ def reference_std(spread: float) -> float:
     return float(np.hypot(SPREAD_SHARE * spread, LEAST_STD)) if np.isfinite(spread) else LEAST_STD
 
 
-def all_refused(patches: Sequence[Patch], h: Image, v: Image, dark: tuple[float, float]) -> dict[int, Refused]:
-    """Patch number to why it is no plate, for those that are none."""
-    found = ((p.label, refused(p, h, v, dark)) for p in patches)
-    return {label: why for label, why in found if why is not None}
+def all_refused(found: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask) -> dict[int, Refused]:
+    """Patch number to why it is no plate, for those that are none. `metal` is the inside of the metal reference."""
+    uneven = halves_apart(h, v, metal)
+    why = ((p.label, refused(p, h, v, dark, uneven if np.isfinite(uneven) else 0.0)) for p in found.patches)
+    return {label: reason for label, reason in why if reason is not None}
 
 
 def ratio_sigma(

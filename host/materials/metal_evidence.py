@@ -25,7 +25,7 @@ Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
 """How far V over H of metal may lie from that of the direct path: the boards' patterns differ off their axis."""
-SURE_SCORE = 2.5
+SURE_SCORE = 3.5
 WEAK_V_DB = -3.0
 """V over H beside the direct path below which a patch is hardly metal: 0 is metal, -4 dB is bare water."""
 _UNLIKE = 0.2

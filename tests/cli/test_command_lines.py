@@ -98,8 +98,8 @@ def test_materials_of_a_scan_or_of_its_products(scan, capsys):
     assert lines[0] == f"{scan / 'products'}: simulated scan s7"
     assert lines[:4] == lines[4:]
     assert lines[1].split() == ["1", "copper", "metal-like"]
-    assert lines[2].split() == ["2", "PET", "62", "%", "4.50", "-", "j", "0.40", "+-", "0.07"]
-    assert lines[3].split() == ["3", "not", "named", "4.50", "-", "j", "0.40"]
+    assert lines[2].split() == ["2", "PET", "62", "%", "4.50", "-", "j0.40", "+-", "0.07,", "0.08"]
+    assert lines[3].split() == ["3", "not", "named", "4.50", "-", "j0.40"]
     assert main(["materials", str(scan), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["segments"] == SEGMENTS
     (scan / "products" / "materials.json").unlink()

@@ -148,7 +148,7 @@ def test_off_the_librarys_angle_there_is_a_report_without_names(made, other_angl
     assert materials["model"] is None
     other = next(s for s in materials["segments"] if not s["metal_reference"])
     assert other["name"] is None
-    assert other["permittivity"] is not None
+    assert (other["permittivity"] is None) == (other["refused"] is not None)  # so coarse a scan may not tell
     page = (made / "out" / "report.html").read_text()
     assert "and other.npz holds" in page
     assert "plates named right" not in page

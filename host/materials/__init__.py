@@ -36,7 +36,7 @@ from polysight.host.materials.inversion import (
 from polysight.host.materials.knn import Fit, Weights, fit_weights
 from polysight.host.materials.layers import Layer, LayerFit, fit_layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
-from polysight.host.materials.measure import Refused
+from polysight.host.materials.measure import NOT_PASSIVE, Refused
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
 from polysight.host.materials.metal_evidence import MetalEvidence, metal_evidence
 from polysight.host.materials.patch_files import (
@@ -106,6 +106,7 @@ __all__ = [
     "FOUND",
     "METALS",
     "MODELS",
+    "NOT_PASSIVE",
     "PAPER",
     "PATCHES",
     "SAME_ANGLE_DEG",

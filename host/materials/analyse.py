@@ -12,7 +12,16 @@ import numpy.typing as npt
 from polysight.host.materials.classify import Classifier, NamedPatch, features_of
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
 from polysight.host.materials.inversion import Inversion, PatchEstimate, Seen, Uncertain, feature_errors, invert
-from polysight.host.materials.measure import LEAST_STD, Refused, all_refused, background, reference_std, seen
+from polysight.host.materials.measure import (
+    AMPLIFIES,
+    BELOW_AIR,
+    LEAST_STD,
+    Refused,
+    all_refused,
+    background,
+    reference_std,
+    seen,
+)
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box, no_metal
 from polysight.host.materials.metal_evidence import metal_evidence
 from polysight.host.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
@@ -149,9 +158,9 @@ def _no_material(e: Permittivity) -> Refused | None:
     move = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
     points = "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place"
     if e.value.imag > ACTIVE * e.loss_std + 0.02:
-        return Refused("it would amplify beyond its error bar", points, move)
+        return Refused(AMPLIFIES, points, move)
     if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
-        return Refused("its permittivity would be below that of air", points, move)
+        return Refused(BELOW_AIR, points, move)
     return None
 
 

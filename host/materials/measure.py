@@ -37,6 +37,12 @@ HALVES_APART = 0.05
 _AROUND_PX = 6  # of patches, that is not background
 
 
+AMPLIFIES = "it would amplify beyond its error bar"
+BELOW_AIR = "its permittivity would be below that of air"
+NOT_PASSIVE = (AMPLIFIES, BELOW_AIR)
+"""Why a permittivity is that of no passive material: patches that are plates, and yet refused."""
+
+
 @dataclass(frozen=True)
 class Refused:
     """Why nothing is said of a patch."""

@@ -51,21 +51,18 @@ class MetalEvidence:
         metal, or water beside water.
     channel_ratio_db
         V over H of the patch relative to the direct path; None where that was not known.
-    agreeing
-        Numbers of other patches that look like metal relative to this one.
     """
 
     score: float
     others: int
     channel_ratio_db: float | None
-    agreeing: tuple[int, ...] = ()
 
     @property
     def needed(self) -> float:
         """Score from which the patch counts as metal: the fewer patches tell, the more.
 
-        From random scenes of Table 2's and other materials with and without metal (benchmarks/verdicts): of those
-        without metal none reached it.
+        Limits are from random scenes with and without metal, of common and of very lossy materials
+        (tests/materials/test_metal_evidence.py draws such).
         """
         return np.inf if self.others == 0 else 1.5 if self.others == 1 else 0.5 if self.others < 6 else -2.0
 
@@ -98,10 +95,6 @@ def metal_evidence(seen: list[Seen], prior: Uncertain, channel_ratio: complex | 
     channel_ratio
         V / H of the patch itself in images that are referenced to the direct path; None where they are not.
     """
-    agreeing = tuple(
-        i for i, s in enumerate(seen)
-        if abs(s.inverse_ratio - 1) < _NEAR_METAL and s.brightness is not None and abs(np.log(s.brightness)) < 0.15
-    )  # fmt: skip
     level = None if channel_ratio is None or not abs(channel_ratio) > 0 else 20 * float(np.log10(abs(channel_ratio)))
     if not seen:
         return MetalEvidence(0.0, 0, level)
@@ -111,7 +104,7 @@ def metal_evidence(seen: list[Seen], prior: Uncertain, channel_ratio: complex | 
     starts.sort(key=lambda x: float(np.sum(metal.residuals(x) ** 2)))
     as_dielectric = min(_best(metal, x) for x in starts[:_REFINED])
     unlike = sum(abs(s.inverse_ratio - 1) > _UNLIKE for s in seen)
-    return MetalEvidence(as_dielectric - as_metal, unlike, level, agreeing)
+    return MetalEvidence(as_dielectric - as_metal, unlike, level)
 
 
 def _best(model: _Explanation, start: Real) -> float:

@@ -65,11 +65,6 @@ class Permittivity:
         return max(self.shares, key=lambda s: self.shares[s]) if self.shares else None
 
     @property
-    def text(self) -> str:
-        """The value as a person reads it; empty without one."""
-        return "" if self.value is None else format_permittivity(self.value)
-
-    @property
     def metal_like(self) -> bool:
         """Whether P is known and too close to 1 for a permittivity."""
         return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_LIKE

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from polysight.host.imaging import PlaneEstimate
-from polysight.host.materials import Classifier, MaterialsResult
+from polysight.host.materials import NOT_PASSIVE, Classifier, MaterialsResult
 from polysight.host.process.quality import Quality
 from polysight.host.verdict import (
     Coverage,
@@ -24,8 +24,6 @@ from polysight.host.verdict import (
     signal_reasons,
     verdict_of,
 )
-
-GAIN = ("it would amplify beyond its error bar", "its permittivity would be below that of air")
 
 
 def recording_verdict(quality: Quality) -> list[Reason]:
@@ -66,7 +64,7 @@ def judge(
     gaining = {
         r.patch.label: r.refused.what
         for r in found.patches
-        if r.refused is not None and r.refused.what in GAIN and r.permittivity.value is not None
+        if r.refused is not None and r.refused.what in NOT_PASSIVE and r.permittivity.value is not None
     }
     reasons += signal_reasons({k: v for k, v in refused.items() if k not in gaining}, len(found.patches))
     reasons += passivity_reasons(gaining)

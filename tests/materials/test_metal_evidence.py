@@ -56,7 +56,9 @@ def test_alone_nothing_is_shown():
     assert evidence.others == 0
 
 
-def test_a_second_piece_of_metal_agrees():
-    seen, _, channel = scene(np.random.default_rng(0), 4, True, 0.0)
-    second = Seen(1.01 - 0.02j, 0.005, THETA, 1.02)
-    assert metal_evidence([*seen, second], Uncertain(3e-3), channel).agreeing == (4,)
+def test_a_patch_that_looks_the_same_is_no_witness():
+    """Water beside water looks like metal beside metal."""
+    alike = [Seen(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
+    evidence = metal_evidence(alike, Uncertain(3e-3), 1.0 + 0j)
+    assert evidence.others == 0
+    assert not evidence.enough

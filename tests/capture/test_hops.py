@@ -124,6 +124,9 @@ unshare -n sleep 20 & other=$!
 until [ "$(readlink /proc/$other/ns/net)" != "$(readlink /proc/self/ns/net)" ]; do :; done
 ip link set c1 netns $other
 nsenter -t $other -n sh -c 'ip link set c1 up; ip address add 192.168.33.180/24 dev c1'
+until nsenter -t $other -n ip link show c1 | grep -q 'state UP'; do :; done
+until ip link show c0 | grep -q 'state UP'; do :; done
+ip neigh flush dev c0
 try mute
 kill $other
 """

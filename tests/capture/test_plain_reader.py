@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import socket
 import struct
@@ -89,10 +90,13 @@ def test_manifest(tmp_path):
     with ManifestWriter(tmp_path / "manifest.jsonl", create=True) as writer:
         for fact in facts:
             writer.append(fact)
-    found = [json.loads(line) for line in (tmp_path / "manifest.jsonl").read_text("ascii").splitlines()]
-    for fact in found:
+    lines = (tmp_path / "manifest.jsonl").read_bytes().splitlines()
+    found = [json.loads(line) for line in lines]
+    for count, fact in enumerate(found):
         crc = fact.pop("crc")
         assert crc == f"{zlib.crc32(json.dumps(fact, sort_keys=True, separators=(',', ':')).encode()):08x}"
+        assert fact.pop("count") == count
+        assert fact.pop("previous") == (hashlib.sha256(lines[count - 1]).hexdigest()[:16] if count else "")
     assert found == facts
 
 

@@ -202,11 +202,13 @@ def test_library(bench, scan):
 
 
 def test_nothing_to_refer_to(bench, scan):
-    """No metal, no plates: the images are written all the same, and the message says so."""
+    """No metal, no plates: no result, and the images and the report are written all the same."""
     ended = bench.polysight("process", scan, "--out", "out")
-    refused(ended, "metal", "--metal", "the images are written: out/image.npz", status=3)
+    assert ended.status == 7, ended
+    assert "no result" in ended.out
+    assert "no patch was found" in ended.out
     assert (bench.folder / "out" / "image.npz").exists()
-    assert not (bench.folder / "out" / "report.html").exists()
+    assert "no result" in (bench.folder / "out" / "report.html").read_text()
 
 
 def test_out_is_taken(bench, scan):

@@ -42,9 +42,9 @@ def test_x_and_y_are_the_rigs_whichever_way_the_scan_was_taken(tmp_path, capsys,
     scene = decode_scene({**SCENE, "points": [{"position_mm": at_mm}]}, "t").with_disturbances(ideal=True)
     data = simulate(RIG, scene, tmp_path, layout="authors", by_columns=by_columns)
     found_by_the_builder = tilt[::-1] if by_columns else tilt  # which images the rig mirrored in x = y
-    swept = Focus(np.linspace(-6, 6, 3), np.ones(3), 0.0, found_by_the_builder, 1.0)
+    swept = Focus(np.linspace(-6, 6, 3), np.array([0.1, 1.0, 0.1]), 0.0, found_by_the_builder, 1.0)
     drawn = []
-    monkeypatch.setattr(offline, "focus_sweep", lambda *_: swept)
+    monkeypatch.setattr(offline, "focus_sweep", lambda *_, **__: swept)
     monkeypatch.setattr(offline, "focus_figure", lambda *given: drawn.append(given) or b"")
     assert main(["focus", str(data), "--out", str(tmp_path / "focus")]) == 0
     said = capsys.readouterr().out

@@ -1,35 +1,66 @@
-"""Discriminant of logarithms that knows where its errors come from: pixel, patch and scan.
+"""Materials as distributions, told apart by all that errors and specimens do: pixel, patch, specimen, scan.
 
 On ln|H|, ln|V| and arg P errors of gain and of phase are additive. A pixel of material m in patch p of scan s is
 
-    z = mean_m + g_s + u_p + e,
+    z = mean_m + F_m d + g_s + u_p + e,
 
-with e the pixel's own error (speckle), u_p that of the whole patch (its placement, uneven illumination) and g_s that of
-the scan's metal reference, which all patches of the scan inherit: a linear model with random effects (Searle, Casella
-and McCulloch, Variance Components, chapter 5). The three covariances are estimated from the library by the residual
-mean squares of pixels, patches and scans. A decision then weighs each error as it should:
+with e the pixel's own error (speckle), u_p that of the whole patch (its placement, uneven illumination), g_s that of
+the scan's metal reference, which all patches of the scan inherit, and d the deviation of the specimen from its
+material in ln eps' and ln eps'', which F_m turns into features (`specimens.py`): a linear model with random effects
+(Searle, Casella and McCulloch, Variance Components, chapter 5). Where V nearly vanishes its error is additive, and is
+taken so (`softened`). The covariances are estimated from the library: by residual mean squares of pixels, patches and
+scans, and patches' by expectation maximisation into placement and specimen. A decision weighs each as it should:
 
-* a pixel on its own carries all three;
+* a pixel on its own carries all of them;
 * a patch is named from the mean of its pixels, in which e has averaged out;
-* the patches of a scan are named together. g_s is the same for all of them, so its estimate and the names are found in
-  turns (expectation maximisation); with one patch in the scan nothing is gained and nothing lost.
+* the patches of a scan are named together. g_s, and what the error budget leaves of leakage, angle and reference, is
+  the same for all of them, so that its estimate and the names are found in turns (expectation maximisation).
 
-Several incidence angles are several scans: their errors are taken to be independent.
+The result is a probability of each material and of none of them (`none_of_these.py`).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import f as f_distribution
 
-from polysight.host.materials.samples import Model, NamedScan, Real, Samples, by_angle
+from polysight.host.materials.none_of_these import cost_of_none
+from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle
+from polysight.host.materials.specimens import effect, fit_spread, softened
 
 REJECTED = 0.01
 """Share of the known materials' pixels, and of their patches, that may be called unknown."""
+NONE = 0.02
+"""Probability, before anything is measured, that a patch is none of the library's materials."""
 METAL_LIKE = 0.25
 """|1/P - 1| of a patch below this: the reference or another metal. It has no error of its own, so it tells of none."""
 _ROUNDS = 30
+_LN_2PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What a scan's patches have in common: an error, its covariance, and what it does to each patch.
+
+    `design` [patch, d, q] turns the error's q numbers into deviations; `value` [q]; `covariance` [q, q].
+    """
+
+    design: Real
+    value: Real
+    covariance: Real
+
+    @property
+    def shift(self) -> Real:
+        """Deviations that the error makes, [patch, d]."""
+        return np.asarray(self.design @ self.value, np.float64)
+
+    @property
+    def spread(self) -> Real:
+        """Their covariances, [patch, d, d]."""
+        return np.asarray(self.design @ self.covariance @ self.design.mT, np.float64)
 
 
 class ErrorDiscriminant(Model):
@@ -39,139 +70,184 @@ class ErrorDiscriminant(Model):
     ----------
     channels
         One of `CHANNELS`.
-    own
-        Share of a material's own covariances in those it is judged by; the rest is the mean of all materials. 0 is a
-        linear discriminant; above 0 materials may differ in spread, as they do where V nearly vanishes.
     """
 
     knows_scans = True
 
-    def __init__(self, channels: str = "H+V+P", own: float = 0.0) -> None:
-        self.channels, self.own = channels, own
+    def __init__(self, channels: str = "H+V+P") -> None:
+        self.channels = channels
 
     def fit(self, samples: Samples) -> ErrorDiscriminant:
         """Estimate means and covariances."""
-        z = self._features(samples.x)
-        self.names = np.unique(samples.names)
-        width = z.shape[1]
-        per_angle = width // (samples.x.shape[1] // 4)
-        self._same_angle = np.arange(width)[:, None] // per_angle == np.arange(width)[None] // per_angle
-        of = np.searchsorted(self.names, samples.names)
-        anchor = np.stack([self._middle(z[of == k]) for k in range(len(self.names))])
-        d = self._wrapped(z - anchor[of])
-
-        ids, patch = np.unique(samples.patches, return_inverse=True)
-        count = np.bincount(patch).astype(float)
-        first = np.array([np.flatnonzero(patch == i)[0] for i in range(len(ids))])
-        material, scan = of[first], np.unique(samples.groups, return_inverse=True)[1][first]
+        self.names, of = np.unique(samples.names, return_inverse=True)
+        self.angles_rad = np.radians(samples.angles_deg)
+        self._anchor(samples.x, of)
+        d = self._deviations(samples.x)[np.arange(of.size), of]
+        width = d.shape[1]
+        _, patch, count = np.unique(samples.patches, return_inverse=True, return_counts=True)
+        first = np.zeros(count.size, np.intp)
+        first[patch[::-1]] = np.arange(of.size)[::-1]
+        material, scan, plate = of[first], np.unique(samples.groups, return_inverse=True)[1][first], samples.plates[first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
         tells = ~self._metal_like(samples.x, patch)
         if not tells.any():
             tells[:] = True
 
-        offset, level = _two_way(mean, material, scan, tells)
-        self.mean = anchor + level
+        offset, self.level = _two_way(mean, material, scan, tells)
         self.pixels = float(np.median(count))
         self.placements = np.bincount(material).astype(float)
-        residual = mean - level[material] - offset[scan]
-        scans = len(np.unique(scan[tells]))
-        dof = max(int(tells.sum()) - len(np.unique(material[tells])) - scans + 1, 1)
-        pixel = d - mean[patch]
-        told = tells[patch]
-        within = _covariance(pixel[told], max(int(told.sum() - tells.sum()), 1))
-        between = self._independent(_covariance(residual[tells], dof))
-        shrink = width / (width + dof)
-        between = (1 - shrink) * between + shrink * np.diag(np.diag(between))
-        floor = 1e-8 * np.eye(width)
-        self.within, self.between = [], []
-        for k in range(len(self.names)):
-            w, b = within, between
-            if self.own and tells[material == k].any() and (material == k).sum() > 2:
-                mine = material == k
-                w = (1 - self.own) * w + self.own * _covariance(pixel[of == k], (of == k).sum() - mine.sum())
-                b = (1 - self.own) * b + self.own * self._independent(_covariance(residual[mine], mine.sum() - 1))
-            self.within.append(self._independent(w))
-            self.between.append(_positive(b - self.within[k] / self.pixels) + floor)
+        self.plates = np.array([np.unique(plate[material == k]).size for k in range(self.names.size)], np.float64)
+        residual = mean - self.level[material] - offset[scan]
+        scans = np.unique(scan[tells]).size
+        dof = max(int(tells.sum()) - np.unique(material[tells]).size - scans + 1, 1)
+        pixel, told = d - mean[patch], tells[patch]
+        self.within = self._independent(_covariance(pixel[told], max(int(told.sum() - tells.sum()), 1)))
+        self._effects = self._effect_of_specimens()
+        self._fit_patches(residual[tells] * np.sqrt(tells.sum() / dof), material[tells], plate[tells], dof)
         each = max(tells.sum() / scans, 1.0)
         common = self._independent(_covariance(offset[np.unique(scan[tells])], max(scans - 1, 1)))
-        self.scan = _positive(common - between / each) + floor
-        own_dof = float(np.median(self.placements)) - 1
-        free = (1 - self.own) * dof + self.own * own_dof  # a covariance is known from so many placements
-        self._set_thresholds((mean - level[material])[tells], material[tells], (d - level[of])[told], of[told], free)
+        self.scan = _positive(common - self.between / each) + 1e-8 * np.eye(width)
+        self._set_thresholds(
+            (mean - self.level[material])[tells], material[tells], (d - self.level[of])[told], of[told], float(dof)
+        )
         return self
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name of each pixel on its own, and its distance over the threshold."""
-        q, cost = self._costs(self._deviations(x), self._pixel_covariances())
+        q, cost = _costs(self._deviations(x) - self.level, self._pixel_covariances())
         best = cost.argmin(axis=1)
         return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
 
     def distance(self, x: Real, names: npt.NDArray) -> Real:
         """Distance of each pixel to the material it was named by whatever classifier, over the threshold."""
-        q, _ = self._costs(self._deviations(x), self._pixel_covariances())
+        q, _ = _costs(self._deviations(x) - self.level, self._pixel_covariances())
         return np.sqrt(q[np.arange(len(x)), np.searchsorted(self.names, names)] / self.pixel_level)
 
-    def by_scan(self, x: Real, patches: npt.NDArray, errors: Real | None = None) -> NamedScan:
-        """Names in one scan: the reference's error is found from all patches, and what is named is freed of it.
+    def by_scan(
+        self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
+    ) -> NamedScan:
+        """Names in one scan: what all patches' errors have in common is found, and taken off.
 
-        `errors` [patch, d, d] are covariances that come to each patch's own, in ln|H|, ln|V| and arg P.
+        `errors` come to the library's own. With `others`, pixels are named by their patch, up to so large a share.
         """
-        ids, patch = np.unique(patches, return_inverse=True)
-        d = self._deviations(x)
-        mean = np.stack([d[patch == i].mean(axis=0) for i in range(len(ids))])
-        pixels = min([self.pixels, *np.bincount(patch).tolist()])
+        _, patch = np.unique(patches, return_inverse=True)
+        ids = np.unique(patches)
+        d = self._deviations(x) - self.level
+        mean = np.stack([d[patch == i].mean(axis=0) for i in range(ids.size)])
         tells = ~self._metal_like(x, patch)
-        own = [self._patch_covariance(k, pixels) for k in range(len(self.names))]
-        offset, spread = self._reference_error(mean[tells], own)
-        more = np.zeros((len(ids), *spread.shape)) if errors is None or self.channels != "H+V+P" else errors[ids]
-        q, cost = self._costs(self._wrapped(mean - offset), [c + spread for c in own], more)
-        at = np.arange(len(ids)), cost.argmin(axis=1)
-        alone = [self._patch_covariance(k, 1.0) + spread for k in range(len(self.names))]
-        pixel_q, pixel_cost = self._costs(self._wrapped(d - offset), alone)
+        own = self._patch_covariances(min([self.pixels, *np.bincount(patch).tolist()]))
+        mine = np.zeros((ids.size, *self.scan.shape))
+        if errors is not None and errors.own.shape[1:] == mine.shape[1:]:
+            mine = errors.own
+        else:
+            errors = None
+        none = self._none(x, patch, own + mine.mean(axis=0))
+        scene = self._scene(mean, own + mine[:, None], errors, tells, none)
+        q, cost = _costs(mean - scene.shift[:, None], own + (mine + scene.spread)[:, None])
+        probability = _probabilities(cost, none)
+        at = np.arange(ids.size), cost.argmin(axis=1)
+        alone = self._patch_covariances(1.0)[None] + (mine + scene.spread)[:, None]
+        pixel_q, pixel_cost = _costs(d - scene.shift[patch][:, None], alone[patch])
+        if others is not None:
+            prior = (1 - others) * probability[:, :-1] + others / self.names.size
+            pixel_cost = pixel_cost - 2 * np.log(prior[patch])
         of = np.arange(len(x)), pixel_cost.argmin(axis=1)
         return NamedScan(
             self.names[of[1]],
             np.sqrt(pixel_q[of] / self.pixel_level),
             ids,
             self.names[at[1]],
-            _probabilities(cost, self.patch_level)[at],
-            np.sqrt(q[at] / self.patch_level),
+            probability[at],
+            np.where(probability[:, -1] > probability[at], np.inf, np.sqrt(q[at] / self.patch_level)),
+            probability,
+            self.names,
         )
 
-    def _reference_error(self, mean: Real, own: list[Real]) -> tuple[Real, Real]:
-        """Error of the scan's metal reference and its covariance, from patches' deviations [patches, materials, d].
+    def _fit_patches(self, residual: Real, material: npt.NDArray, plate: npt.NDArray, dof: int) -> None:
+        """Covariance of placements, and of each material's specimens, from patches' residuals."""
+        width = residual.shape[1]
+        total = self._independent(_covariance(residual, len(residual)))
+        shrink = width / (width + dof)
+        self.spread, placement = fit_spread(residual, material, plate, self._effects, total)
+        placement = self._independent(placement) * self._gain_and_phase
+        placement = (1 - shrink) * placement + shrink * np.diag(np.diag(placement))
+        self.between = _positive(placement - self.within / self.pixels) + 1e-8 * np.eye(width)
+
+    def _effect_of_specimens(self) -> Real:
+        """What specimens' deviations do to the features of each material, [materials, features, 2]."""
+        every = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
+        apart = every.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
+        return self._chosen(apart).swapaxes(1, 2)
+
+    def _scene(self, mean: Real, own: Real, errors: SceneErrors | None, tells: npt.NDArray, none: Real) -> _Scene:
+        """The error that a scan's patches have in common, from their deviations [patches, materials, d].
 
         Which material a patch is, is as uncertain as the last round left it; a patch that is none of them counts for
         nothing. Without patches it is zero, as uncertain as it is from scan to scan.
         """
-        offset, spread = np.zeros(mean.shape[2]), self.scan
-        if len(mean) < 2:
-            return offset, spread
-        information = np.linalg.inv(np.mean(own, axis=0))
+        count, _, width = mean.shape
+        design, prior = np.tile(np.eye(width), (count, 1, 1)), self.scan
+        if errors is not None:
+            design = np.concatenate([design, errors.design], axis=2)
+            both = np.zeros((design.shape[2],) * 2)
+            both[:width, :width], both[width:, width:] = prior, errors.covariance
+            prior = both
+        scene = _Scene(design, np.zeros(len(prior)), prior)
+        at = np.flatnonzero(tells)
+        if at.size < 2:
+            return scene
+        precision, g = np.linalg.inv(prior), design[at]
         for _ in range(_ROUNDS):
-            _, cost = self._costs(self._wrapped(mean - offset), [c + spread for c in own])
-            weight = _probabilities(cost, self.patch_level)[:, :-1]
-            precision = np.linalg.inv(self.scan) + weight.sum() * information
-            told = np.einsum("pk,pkd->d", weight, self._wrapped(mean))
-            before, offset = offset, np.linalg.solve(precision, information @ told)
-            spread = np.linalg.inv(precision)
-            if np.abs(offset - before).max() < 1e-7:
+            _, cost = _costs(mean - scene.shift[:, None], own + scene.spread[:, None])
+            weight = _probabilities(cost, none)[at, :-1]
+            middle, information = _moments(mean[at], own[at], weight)
+            covariance = np.linalg.inv(precision + np.sum(g.mT @ information @ g, axis=0))
+            told = np.sum(g.mT @ (information @ middle[:, :, None]), axis=0)[:, 0]
+            before, value = scene.value, covariance @ told
+            scene = _Scene(design, value, covariance)
+            if np.abs(design @ (value - before)).max() < 1e-7:
                 break
-        return offset, spread
+        return scene
 
-    def _features(self, x: Real) -> Real:
-        h, v, q = by_angle(x)
-        log_h, log_v, angle = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6)), -np.angle(q)
-        columns = {"H": (log_h,), "V": (log_v,), "P": (log_h - log_v, angle), "H+V+P": (log_h, log_v, angle)}
-        chosen = columns[self.channels]
-        self._cyclic = np.tile([c is angle for c in chosen], h.shape[1])
-        return np.stack(chosen, axis=-1).reshape(len(x), -1)
+    def _none(self, x: Real, patch: npt.NDArray[np.intp], covariances: Real) -> Real:
+        """Minus twice the log likelihood of each patch as any other half space, [patch]; see `none_of_these.py`."""
+        h, _, t = by_angle(x)
+        log_h = np.stack([np.log(np.maximum(h[patch == i], 1e-6)).mean(axis=0) for i in range(patch.max() + 1)])
+        middle = np.stack([t[patch == i].mean(axis=0) for i in range(patch.max() + 1)])
+        typical = np.median(covariances, axis=tuple(range(covariances.ndim - 2)))
+        if self.channels != "H+V+P" or not len(self.angles_rad):  # no wave to compare with: as at the threshold
+            return np.full(len(middle), self.patch_level + np.linalg.slogdet(typical)[1] + len(typical) * _LN_2PI)
+        return cost_of_none(log_h, middle, typical, self.angles_rad) - 2 * np.log(NONE / (1 - NONE) * self.names.size)
 
-    def _wrapped(self, d: Real) -> Real:
-        return np.where(self._cyclic, (d + np.pi) % (2 * np.pi) - np.pi, d)
+    def _anchor(self, x: Real, of: npt.NDArray[np.intp]) -> None:
+        """Where each material's features are expanded: its pixels' means."""
+        h, v, t = by_angle(x)
+        logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
+        each = [of == k for k in range(self.names.size)]
+        self._anchor_h, self._anchor_v, self._anchor_t = (
+            np.stack([c[at].mean(axis=0) for at in each]) for c in (*logs, t)
+        )
+        width = len(self._chosen(np.zeros((1, 1, 3)))[0])
+        features = width * h.shape[1]
+        self._same_angle = np.arange(features)[:, None] // width == np.arange(features)[None] // width
+        self.level = np.zeros((self.names.size, features))
+        phase = np.tile({"P": [0, 1], "H+V+P": [0, 0, 1]}.get(self.channels, [0]), h.shape[1])
+        self._gain_and_phase = (phase[:, None] == phase[None]).astype(float)
 
-    def _middle(self, z: Real) -> Real:
-        return np.where(self._cyclic, np.angle(np.exp(1j * z).mean(axis=0)), z.mean(axis=0))
+    def _deviations(self, x: Real) -> Real:
+        """From every material's anchor, [n, materials, features]."""
+        h, v, t = (c[:, None] for c in by_angle(x))
+        log_h = np.log(np.maximum(h, 1e-6)) - self._anchor_h
+        along = (t - self._anchor_t) * np.exp(-1j * np.angle(self._anchor_t)) / softened(self._anchor_t)
+        if self.channels == "V":  # alone, by its own logarithm
+            return np.log(np.maximum(v, 1e-6)) - self._anchor_v
+        return self._chosen(np.stack([log_h, log_h + along.real, -along.imag], axis=-1))
+
+    def _chosen(self, every: Real) -> Real:
+        """The columns of the channels from ln|H|, ln|V|, arg P [..., angles, 3], as [..., features]."""
+        h, v, angle = (every[..., i] for i in range(3))
+        columns = {"H": (h,), "V": (v,), "P": (v - h, angle), "H+V+P": (h, v, angle)}[self.channels]
+        return np.stack(columns, axis=-1).reshape(*every.shape[:-2], -1)
 
     @staticmethod
     def _metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
@@ -182,30 +258,20 @@ class ErrorDiscriminant(Model):
         return np.asarray((np.abs(middle - 1) < METAL_LIKE).all(axis=1), np.bool_)
 
     def _independent(self, covariance: Real) -> Real:
+        """Errors of scans under several angles are independent; what a specimen does under them is not."""
         return np.where(self._same_angle, covariance, 0.0)
 
-    def _deviations(self, x: Real) -> Real:
-        """From every material's mean, [n, materials, features]."""
-        return self._wrapped(self._features(x)[:, None] - self.mean)
+    def _patch_covariances(self, pixels: float) -> Real:
+        """Of the mean of so many pixels about each material's mean, [materials, d, d].
 
-    def _patch_covariance(self, k: int, pixels: float) -> Real:
-        """Of a patch's mean about the material's mean, itself known from so many placements only."""
-        return self.within[k] / pixels + self.between[k] * (1 + 1 / self.placements[k])
-
-    def _pixel_covariances(self) -> list[Real]:
-        return [self._patch_covariance(k, 1.0) + self.scan for k in range(len(self.names))]
-
-    @staticmethod
-    def _costs(d: Real, covariances: list[Real], more: Real | None = None) -> tuple[Real, Real]:
-        """Squared distances and minus twice the log likelihoods (less a constant), [n, materials].
-
-        `more` [n, d, d] comes to the covariance of each of n.
+        The mean is itself known from so many placements and specimens only.
         """
-        own = np.stack(covariances)
-        inverse = np.linalg.inv(own if more is None else own + more[:, None])
-        q = np.einsum("nkd,kde,nke->nk" if more is None else "nkd,nkde,nke->nk", d, inverse, d)
-        log_det = -np.linalg.slogdet(inverse)[1]
-        return q, q + (log_det - log_det.mean(axis=-1, keepdims=True))
+        known = (1 + 1 / self.placements)[:, None, None]
+        differ = self._effects * (self.spread * (1 + 1 / self.plates[:, None]))[:, None]
+        return self.within / pixels + self.between * known + differ @ self._effects.mT
+
+    def _pixel_covariances(self) -> Real:
+        return self._patch_covariances(1.0) + self.scan
 
     def _set_thresholds(self, patches: Real, material: npt.NDArray, pixels: Real, of: npt.NDArray, dof: float) -> None:
         """Squared distances that known materials pass with probability REJECTED.
@@ -218,14 +284,33 @@ class ErrorDiscriminant(Model):
         law = float(width * dof / free * f_distribution.ppf(1 - REJECTED, width, free)) if dof > width else np.inf
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
 
-        def farthest(d: Real, of: npt.NDArray, covariances: list[Real]) -> float:
-            d = self._wrapped(d) * left_out[of]
-            q = np.einsum("nd,nde,ne->n", d, np.linalg.inv(np.stack(covariances))[of], d)
+        def farthest(d: Real, of: npt.NDArray, covariances: Real) -> float:
+            d = d * left_out[of]
+            q = np.einsum("nd,nde,ne->n", d, np.linalg.inv(covariances)[of], d)
             return float(np.quantile(q, 1 - REJECTED))
 
-        patch = [self._patch_covariance(k, self.pixels) + self.scan for k in range(len(self.names))]
-        self.patch_level = max(law, farthest(patches, material, patch))
+        self.patch_level = max(law, farthest(patches, material, self._patch_covariances(self.pixels) + self.scan))
         self.pixel_level = max(law, farthest(pixels, of, self._pixel_covariances()))
+
+
+def _costs(d: Real, covariances: Real) -> tuple[Real, Real]:
+    """Squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials]."""
+    inverse = np.linalg.inv(covariances)
+    q = np.sum(d * (inverse @ d[..., None])[..., 0], axis=-1)
+    return q, q - np.linalg.slogdet(inverse)[1] + d.shape[2] * _LN_2PI
+
+
+def _moments(d: Real, covariances: Real, weight: Real) -> tuple[Real, Real]:
+    """What a patch tells whose material is uncertain: mean deviation [patch, d] and information [patch, d, d].
+
+    As of the normal distribution with the moments of the mixture; less for what is none of the materials.
+    """
+    known = weight.sum(axis=1)
+    share = weight / np.maximum(known, 1e-12)[:, None]
+    middle = np.einsum("pk,pkd->pd", share, d)
+    off = d - middle[:, None]
+    spread = np.einsum("pk,pkde->pde", share, covariances + off[..., :, None] * off[..., None, :])
+    return middle, np.asarray(known[:, None, None] * np.linalg.inv(spread), np.float64)
 
 
 def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, tells: npt.NDArray) -> tuple[Real, Real]:
@@ -252,8 +337,8 @@ def _positive(a: Real) -> Real:
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def _probabilities(cost: Real, level: float) -> Real:
-    """Of every material and, last, of none of them, which is as likely as a material at the threshold."""
-    every = np.concatenate([cost, np.full((len(cost), 1), level)], axis=1)
+def _probabilities(cost: Real, none: Real) -> Real:
+    """Of every material and, last, of none of them, [n, materials + 1]."""
+    every = np.concatenate([cost, none[:, None]], axis=1)
     w = np.exp(-0.5 * (every - every.min(axis=1, keepdims=True)))
     return w / w.sum(axis=1, keepdims=True)

@@ -52,12 +52,26 @@ class Samples:
         float64 [n, 4 * angles].
     names, groups, patches
         Material, group that is left out as a whole (a scan, or a sample), and patch number of each pixel, [n].
+    specimens
+        Which plate of its material each pixel was seen on, str [n]; empty where it is not known: one plate of each
+        material then, seen in all scans. None: not known of any.
+    angles_deg
+        Incidence angles; empty: not known.
     """
 
     x: Real
     names: npt.NDArray
     groups: npt.NDArray
     patches: npt.NDArray
+    specimens: npt.NDArray | None = None
+    angles_deg: tuple[float, ...] = ()
+
+    @property
+    def plates(self) -> npt.NDArray[np.intp]:
+        """A number for each plate that was seen: material and specimen, [n]."""
+        which = np.full(self.names.shape, "") if self.specimens is None else self.specimens
+        pairs = np.stack([np.unique(a, return_inverse=True)[1] for a in (self.names, which)], axis=1)
+        return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), np.intp)
 
     @property
     def groups_of_material(self) -> npt.NDArray[np.int64]:
@@ -78,7 +92,7 @@ class Samples:
         Raises DataError when no pixel is usable.
         """
         rng = np.random.default_rng(seed)
-        x, names, groups, patches = [], [], [], []
+        x, names, groups, patches, specimens = [], [], [], [], []
         for i, e in enumerate(library.entries):
             with np.errstate(divide="ignore", invalid="ignore"):
                 features = feature_matrix(e.h, e.v, e.p)
@@ -88,13 +102,16 @@ class Samples:
             names += [e.name] * at.size
             groups += [e.scan] * at.size
             patches += [i] * at.size
+            specimens += [e.specimen or ""] * at.size
         if not names:
             raise DataError("the library holds no usable pixel", "nothing was trained", "polysight train")
-        return cls(np.concatenate(x), np.array(names), np.array(groups), np.array(patches))
+        labels = (np.array(column) for column in (names, groups, patches, specimens))
+        return cls(np.concatenate(x), *labels, library.angles_deg)
 
     def take(self, at: npt.NDArray) -> Samples:
         """Some of the pixels, by index or by mask."""
-        return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at])
+        which = None if self.specimens is None else self.specimens[at]
+        return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at], which, self.angles_deg)
 
     def joined(self, other: Samples, seed: int = 0) -> Samples:
         """The same samples seen under a second angle, patch by patch.
@@ -110,6 +127,7 @@ class Samples:
         common = np.intersect1d(ours, theirs)
         pairs = zip(common, common, strict=True) if common.size else zip(ours, theirs, strict=False)
         left, right, groups, patches = [], [], [], []
+        angles = self.angles_deg + other.angles_deg if self.angles_deg and other.angles_deg else ()
         for a, b in pairs:
             for name in np.unique(self.names):
                 here = np.unique(self.patches[(self.groups == a) & (self.names == name)])
@@ -124,7 +142,9 @@ class Samples:
         if not groups:
             raise DataError("no material was seen under both angles", "the scans' names differ", "train both angles")
         i, j = np.concatenate(left), np.concatenate(right)
-        return Samples(np.hstack([self.x[i], other.x[j]]), self.names[i], np.array(groups), np.array(patches))
+        which = None if self.specimens is None else self.specimens[i]
+        x = np.hstack([self.x[i], other.x[j]])
+        return Samples(x, self.names[i], np.array(groups), np.array(patches), which, angles)
 
 
 @dataclass(frozen=True)
@@ -139,6 +159,9 @@ class NamedScan:
         Patch numbers, sorted, [patches].
     names, confidence, distance
         The same of each patch, [patches], and how sure: a probability, or the share of its pixels.
+    probabilities, materials
+        Probability of each material and, last, of none of them, [patches, materials + 1]; the materials' names. None:
+        the model gives none.
     """
 
     pixel_names: npt.NDArray
@@ -147,6 +170,31 @@ class NamedScan:
     names: npt.NDArray
     confidence: Real
     distance: Real
+    probabilities: Real | None = None
+    materials: npt.NDArray | None = None
+
+
+@dataclass(frozen=True)
+class SceneErrors:
+    """What a scan's error budget leaves uncertain of its patches' ln|H|, ln|V| and arg P.
+
+    Attributes
+    ----------
+    own
+        float64 [patch, d, d]: covariance of each patch's own part.
+    design
+        float64 [patch, d, q]: what the q errors that all patches have in common (leakage, reference, angle) do to each.
+    covariance
+        float64 [q, q] of those.
+    """
+
+    own: Real
+    design: Real
+    covariance: Real
+
+    def of(self, at: npt.NDArray) -> SceneErrors:
+        """Of some of the patches."""
+        return SceneErrors(self.own[at], self.design[at], self.covariance)
 
 
 class Model(ABC):
@@ -163,12 +211,15 @@ class Model(ABC):
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name of each pixel by nothing but itself, [n], and its distance over the threshold."""
 
-    def by_scan(self, x: Real, patches: npt.NDArray, errors: Real | None = None) -> NamedScan:
+    def by_scan(
+        self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
+    ) -> NamedScan:
         """Names in one scan, whose pixels lie in `patches` [n]; a patch is what most of its pixels are called.
 
-        `errors` [patch, d, d] are covariances of the patches' features, for models that weigh them.
+        `errors` of the patches in the order of their numbers, for models that weigh them. `others`: the share of a
+        patch's pixels that may be of another material than the patch; None: each pixel is judged alone.
         """
-        del errors
+        del errors, others
         return majority(*self.by_pixel(x), patches)
 
 

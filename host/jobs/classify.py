@@ -19,8 +19,8 @@ from polysight.host.materials import (
     Classifier,
     Library,
     MatchedPatch,
+    PatchName,
     SeenPatches,
-    Verdict,
     match_patches,
     read_materials,
 )
@@ -169,7 +169,7 @@ def _without(scan: SeenPatches, refused: Container[int]) -> SeenPatches:
 def _nothing_named(products: Sequence[SavedProducts]) -> dict[str, Any]:
     """What `classify` prints as JSON when one of the scans has no result: its patches without names."""
     scan = next(p for p in products if p.verdict is not None and not p.verdict.usable)
-    nothing = {"name": None, "confidence": None, "votes": {}}
+    nothing = {"name": None, "confidence": None, "votes": {}, "probabilities": {}}
     return {
         "products": str(scan.folder),
         "verdict": None if scan.verdict is None else scan.verdict.to_dict(),
@@ -177,12 +177,13 @@ def _nothing_named(products: Sequence[SavedProducts]) -> dict[str, Any]:
     }
 
 
-def _row(matched: MatchedPatch, verdict: Verdict, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
+def _row(matched: MatchedPatch, verdict: PatchName, pixels: npt.NDArray[np.str_]) -> dict[str, Any]:
     return {
         "label": matched.label,
         "name": verdict.name,
         "confidence": verdict.confidence,
         "votes": verdict.votes,
+        "probabilities": verdict.probabilities,
         "distance": verdict.distance if np.isfinite(verdict.distance) else None,
         "pixels": verdict.pixels,
         "truth": matched.truth,

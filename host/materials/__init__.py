@@ -15,7 +15,7 @@ from polysight.host.materials.classify import (
     UNKNOWN,
     Classifier,
     NamedPatch,
-    Verdict,
+    PatchName,
 )
 from polysight.host.materials.concentration import (
     ConcentrationResult,
@@ -136,6 +136,7 @@ __all__ = [
     "Optics",
     "Patch",
     "PatchEstimate",
+    "PatchName",
     "PatchResult",
     "Permittivity",
     "Plates",
@@ -149,7 +150,6 @@ __all__ = [
     "TrainingScan",
     "TruthPlate",
     "Uncertain",
-    "Verdict",
     "Weights",
     "analyse",
     "axis_mm",

@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.materials.classify import Classifier, NamedPatch, features_of
+from polysight.host.materials.explain import explained
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
-from polysight.host.materials.inversion import Inversion, PatchEstimate, Seen, Uncertain, feature_errors, invert
+from polysight.host.materials.inversion import Inversion, Seen, Uncertain, invert
 from polysight.host.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
@@ -26,6 +27,7 @@ from polysight.host.materials.metal import MetalReference, find_metal, metal_by_
 from polysight.host.materials.metal_evidence import metal_evidence
 from polysight.host.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
 from polysight.host.materials.result import MaterialsResult, PatchResult
+from polysight.host.materials.scene_errors import scene_errors
 from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
 from polysight.host.materials.truth import match_truth
 from polysight.host.polarimetry import (
@@ -44,10 +46,6 @@ from polysight.shared.errors import DataError
 
 FILLED = 0.1
 """|H| relative to metal over an image without edges from which on one material fills it, rather than none."""
-CHI2_95 = 5.99
-"""A material is not named whose permittivity lies outside the patch's 95 % region."""
-SPECIMEN_STD = 0.03
-"""Relative difference of two specimens of a material that such a comparison allows for."""
 ACTIVE = 2.0
 """Standard deviations of gain, or of a real part below 1, beyond which a permittivity is that of no material."""
 
@@ -123,24 +121,11 @@ def _names(
         at = patch.interior
         by_h, by_q = _to_angle(estimate.permittivity, theta_rad + errors[0].theta_error_rad, classifier.angles_deg)
         features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
-    covariances = np.stack([feature_errors(*errors, i, s.std) for i, s in enumerate(measured)])
-    named = classifier.scan(features, covariances)
-    known = classifier.permittivities
-    kept = [
-        n if _compatible(known.get(n.verdict.name), e) else n.unknown()
-        for n, e in zip(named, errors[0].patches, strict=True)
-    ]
-    return dict(zip((patch.label for patch in judged), kept, strict=True))
-
-
-def _compatible(permittivity: complex | None, estimate: PatchEstimate) -> bool:
-    """Whether a material's permittivity lies in the patch's 95 % region, as far as both are known."""
-    if permittivity is None or estimate.permittivity is None or estimate.covariance is None:
-        return True
-    away = estimate.permittivity - permittivity
-    pair = np.array([away.real, away.imag])
-    own = np.diag([(SPECIMEN_STD * abs(permittivity)) ** 2] * 2)
-    return float(pair @ np.linalg.solve(estimate.covariance + own, pair)) < CHI2_95
+    named = classifier.scan(features, scene_errors(*errors, measured))
+    told = (
+        explained(n, e.permittivity, e.covariance, classifier) for n, e in zip(named, errors[0].patches, strict=True)
+    )
+    return dict(zip((patch.label for patch in judged), told, strict=True))
 
 
 def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequence[float]) -> tuple[float, complex]:

@@ -7,7 +7,7 @@ compare with. `Classifier` uses the one that was fitted with the library, or tha
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,17 +16,32 @@ import numpy.typing as npt
 from polysight.host.materials.discriminant import ErrorDiscriminant
 from polysight.host.materials.knn import PaperKnn, Weights
 from polysight.host.materials.library import Library
-from polysight.host.materials.samples import WIDTH, Model, Real, Samples, by_angle, feature_matrix, usable
+from polysight.host.materials.samples import (
+    WIDTH,
+    Model,
+    NamedScan,
+    Real,
+    Samples,
+    SceneErrors,
+    by_angle,
+    feature_matrix,
+    usable,
+)
 from polysight.shared.errors import DataError
 
 PAPER = "weighted KNN (paper)"
 DISCRIMINANT = "discriminant of error sources"
-OWN_SPREAD = "discriminant of error sources, own spread"
 SLOW = "metric learning (NCA) + KNN"
 """Takes seconds to fit, too long for every start of a program: judged, but not chosen."""
-SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT, "own-spread": OWN_SPREAD}
+SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT}
 """What the commands call some of them."""
+EARLIER = {"own-spread": DISCRIMINANT, "discriminant of error sources, own spread": DISCRIMINANT}
+"""What earlier releases and their libraries called models that are one now."""
 UNKNOWN = "unknown"
+INCLUSIONS = 0.05
+"""Share of a patch's pixels that may be of another material than the patch: a pixel's name starts from its patch's."""
+LIKELY = 0.005
+"""Runners-up of less probability are not listed."""
 
 
 class Learnt(Model):
@@ -34,18 +49,18 @@ class Learnt(Model):
 
     def __init__(self, estimator: Any, channels: str) -> None:
         self.estimator, self.channels = estimator, channels
-        self.far = ErrorDiscriminant(channels)
+        self.distributions = ErrorDiscriminant()
 
     def fit(self, samples: Samples) -> Learnt:
         """Learn from labelled pixels."""
         self.estimator.fit(self._columns(samples.x), samples.names)
-        self.far.fit(samples)
+        self.distributions.fit(samples)
         return self
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name of each pixel, and its distance to that material over the threshold."""
         names = self.estimator.predict(self._columns(x))
-        return names, self.far.distance(x, names)
+        return names, self.distributions.distance(x, names)
 
     def _columns(self, x: Real) -> Real:
         chosen = {"H": (0,), "V": (1,), "P": (2, 3), "H+V+P": (0, 1, 2, 3)}[self.channels]
@@ -82,7 +97,6 @@ def _sklearn(channels: str, *names: str) -> Learnt:
 MODELS: dict[str, Callable[[str], Model]] = {
     PAPER: PaperKnn,
     DISCRIMINANT: ErrorDiscriminant,
-    OWN_SPREAD: lambda channels: ErrorDiscriminant(channels, own=0.5),
     SLOW: lambda channels: _sklearn(channels, "scale", "nca", "knn"),
     "linear discriminant": lambda channels: _sklearn(channels, "scale", "lda"),
     "linear discriminant of logarithms": lambda channels: _sklearn(channels, "log", "scale", "lda"),
@@ -91,7 +105,7 @@ MODELS: dict[str, Callable[[str], Model]] = {
 
 
 @dataclass(frozen=True)
-class Verdict:
+class PatchName:
     """What one patch was called.
 
     Attributes
@@ -106,6 +120,10 @@ class Verdict:
         Distance to the material, in units of its threshold: above 1 is unknown.
     pixels
         Usable pixels.
+    probabilities
+        Of each material that is not unlikely, and of "unknown", likeliest first; empty for models that give none.
+    why
+        The reason of the name in one sentence (`explain.py`); empty where permittivities are not known.
     """
 
     name: str
@@ -113,6 +131,13 @@ class Verdict:
     votes: dict[str, float]
     distance: float
     pixels: int
+    probabilities: dict[str, float] = field(default_factory=dict)
+    why: str = ""
+
+    @property
+    def nearest(self) -> str | None:
+        """The likeliest material, also of a patch that is unknown."""
+        return next((name for name in self.probabilities if name != UNKNOWN), None)
 
 
 @dataclass(frozen=True)
@@ -121,11 +146,11 @@ class NamedPatch:
 
     names: npt.NDArray[np.str_]
     distance: Real
-    verdict: Verdict
+    verdict: PatchName
 
     def unknown(self) -> NamedPatch:
         """The same patch, called unknown; its pixels keep their own names."""
-        return replace(self, verdict=replace(self.verdict, name=UNKNOWN))
+        return replace(self, verdict=replace(self.verdict, name=UNKNOWN, distance=max(self.verdict.distance, 1.0)))
 
 
 class Classifier:
@@ -178,20 +203,15 @@ class Classifier:
         for part in parts[1:]:
             samples = samples.joined(Samples.of(part))
         self._model.fit(samples)
+        self.distributions = self._model.distributions
         self._width = max(len(UNKNOWN), *(len(n) for n in library.names))
 
     @property
     def permittivities(self) -> dict[str, complex]:
-        """Name to the mean true permittivity of its library entries, where all are known."""
-        out: dict[str, complex] = {}
-        for name in self.library.names:
-            known = [e.permittivity for e in self.library.entries if e.name == name]
-            values = [complex(p[0], -p[1]) for p in known if p is not None]
-            if values and len(values) == len(known):
-                out[name] = complex(np.mean(values))
-        return out
+        """Name to what the library's patches look like, as half spaces; without metals."""
+        return self.distributions.permittivities
 
-    def scan(self, patches: Sequence[Real], errors: Real | None = None) -> list[NamedPatch]:
+    def scan(self, patches: Sequence[Real], errors: SceneErrors | None = None) -> list[NamedPatch]:
         """Name the patches of one scan, or of several scans of the same patches, together.
 
         Parameters
@@ -200,27 +220,32 @@ class Classifier:
             Features of each patch's pixels, [n, 4 * angles] (:func:`polysight.host.materials.samples.feature_matrix`);
             pixels that are not finite are unknown.
         errors
-            float64 [patch, 3, 3]: covariance of each patch's ln|H|, ln|V| and arg P by the error budget; None, and for
-            several angles: none.
+            What the scan's error budget leaves uncertain of the patches; None: nothing.
         """
-        if errors is not None and len(self.angles_deg) > 1:
-            errors = None
         good = [usable(x) for x in patches]
-        number = np.concatenate([np.full(int(g.sum()), i) for i, g in enumerate(good)] or [np.zeros(0, int)])
-        if number.size == 0:
-            return [self._named(g, None, None, UNKNOWN, 0.0, np.inf) for g in good]
-        found = self._model.by_scan(np.concatenate([x[g] for x, g in zip(patches, good, strict=True)]), number, errors)
-        out = []
-        for i, g in enumerate(good):
-            row = int(np.searchsorted(found.patches, i))
-            if not g.any():
-                out.append(self._named(g, None, None, UNKNOWN, 0.0, np.inf))
-                continue
-            at, far = number == i, float(found.distance[row])
-            name = str(found.names[row]) if far <= 1 else UNKNOWN
-            confidence = float(found.confidence[row])
-            out.append(self._named(g, found.pixel_names[at], found.pixel_distance[at], name, confidence, far))
-        return out
+        some = [i for i, g in enumerate(good) if g.any()]
+        nothing = [self._named(g, None, PatchName(UNKNOWN, 0.0, {}, np.inf, 0)) for g in good]
+        if not some:
+            return nothing
+        number = np.concatenate([np.full(int(good[i].sum()), i) for i in some])
+        x = np.concatenate([patches[i][good[i]] for i in some])
+        found = self._model.by_scan(x, number, None if errors is None else errors.of(np.array(some)), INCLUSIONS)
+        for row, i in enumerate(some):
+            at = number == i
+            pixels = found.pixel_names[at], found.pixel_distance[at]
+            nothing[i] = self._named(good[i], pixels, self._patch_name(found, row))
+        return nothing
+
+    def _patch_name(self, found: NamedScan, row: int) -> PatchName:
+        far, confidence = float(found.distance[row]), float(found.confidence[row])
+        probabilities: dict[str, float] = {}
+        if found.probabilities is not None and found.materials is not None:
+            every = dict(zip([*map(str, found.materials), UNKNOWN], found.probabilities[row].tolist(), strict=True))
+            order = sorted(every, key=lambda name: -every[name])
+            probabilities = {name: round(every[name], 4) for name in order if every[name] >= LIKELY}
+            if far > 1:  # farther from all than one of them should be
+                confidence = max(every[UNKNOWN], 1 - confidence)
+        return PatchName(str(found.names[row]) if far <= 1 else UNKNOWN, confidence, {}, far, 0, probabilities)
 
     def pixels(
         self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike
@@ -243,27 +268,27 @@ class Classifier:
         """
         x = features_of(h, v, p)
         good = usable(x)
-        if not good.any():
-            found = self._named(good, None, None, UNKNOWN, 0.0, np.inf)
-        else:
-            found = self._named(good, *self._model.by_pixel(x[good]), UNKNOWN, 0.0, np.inf)
+        nothing = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
+        found = self._named(good, self._model.by_pixel(x[good]) if good.any() else None, nothing)
         return found.names, found.distance
 
-    def patch(self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Verdict:
+    def patch(self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> PatchName:
         """Name one patch on its own; features as :meth:`pixels`."""
         return self.scan([features_of(h, v, p)])[0].verdict
 
     def _named(
-        self, good: npt.NDArray[np.bool_], names: Any, distance: Any, name: str, confidence: float, far: float
+        self, good: npt.NDArray[np.bool_], pixels: tuple[npt.NDArray, Real] | None, name: PatchName
     ) -> NamedPatch:
+        """A patch with the names and distances of its usable pixels; None: none was named."""
         every = np.full(good.size, UNKNOWN, f"<U{self._width}")
         relative = np.full(good.size, np.inf)
-        if names is not None:
+        if pixels is not None:
+            names, distance = pixels
             every[good], relative[good] = np.where(distance <= 1, names, UNKNOWN), distance
         kinds, count = np.unique(every, return_counts=True)
         order = sorted(zip(kinds, count, strict=True), key=lambda i: (-i[1], i[0]))
         votes = {str(k): c / every.size for k, c in order}
-        return NamedPatch(every, relative, Verdict(name, confidence, votes, far, int(good.sum())))
+        return NamedPatch(every, relative, replace(name, votes=votes, pixels=int(good.sum())))
 
 
 def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
@@ -273,7 +298,7 @@ def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
 
 
 def _model_name(given: str) -> str:
-    name = SHORT.get(given, given)
+    name = EARLIER.get(given) or SHORT.get(given, given)
     if name not in MODELS:
         raise DataError(
             f"no classifier is called {given!r}", "the library was made by another version, or the name is wrong",

@@ -21,6 +21,7 @@ The result is a probability of each material and of none of them (`none_of_these
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,7 @@ from scipy.stats import f as f_distribution
 
 from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle
-from polysight.host.materials.specimens import effect, fit_spread, softened
+from polysight.host.materials.specimens import apparent_permittivity, effect, fit_spread, softened
 
 REJECTED = 0.01
 """Share of the known materials' pixels, and of their patches, that may be called unknown."""
@@ -38,6 +39,7 @@ NONE = 0.02
 METAL_LIKE = 0.25
 """|1/P - 1| of a patch below this: the reference or another metal. It has no error of its own, so it tells of none."""
 _ROUNDS = 30
+_BEYOND = 1.001  # the least distance of what is unknown
 _LN_2PI = float(np.log(2 * np.pi))
 
 
@@ -80,14 +82,18 @@ class ErrorDiscriminant(Model):
     def fit(self, samples: Samples) -> ErrorDiscriminant:
         """Estimate means and covariances."""
         self.names, of = np.unique(samples.names, return_inverse=True)
-        self.angles_rad = np.radians(samples.angles_deg)
+        self.angles_rad = [math.radians(a) for a in samples.angles_deg]
         self._anchor(samples.x, of)
         d = self._deviations(samples.x)[np.arange(of.size), of]
         width = d.shape[1]
         _, patch, count = np.unique(samples.patches, return_inverse=True, return_counts=True)
         first = np.zeros(count.size, np.intp)
         first[patch[::-1]] = np.arange(of.size)[::-1]
-        material, scan, plate = of[first], np.unique(samples.groups, return_inverse=True)[1][first], samples.plates[first]
+        material, scan, plate = (
+            of[first],
+            np.unique(samples.groups, return_inverse=True)[1][first],
+            samples.plates[first],
+        )
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
         tells = ~self._metal_like(samples.x, patch)
         if not tells.any():
@@ -111,6 +117,19 @@ class ErrorDiscriminant(Model):
             (mean - self.level[material])[tells], material[tells], (d - self.level[of])[told], of[told], float(dof)
         )
         return self
+
+    @property
+    def distributions(self) -> ErrorDiscriminant:
+        """The materials' distributions: itself. Other models have one beside, for what is unknown."""
+        return self
+
+    @property
+    def permittivities(self) -> dict[str, complex]:
+        """Name to the half space that looks like the material; without metals, and where angles are not known."""
+        if not len(self.angles_rad):
+            return {}
+        kinds = zip(self.names, self._anchor_t, strict=True)
+        return {str(n): apparent_permittivity(t, self.angles_rad) for n, t in kinds if bool((abs(t - 1) > 0.1).all())}
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name of each pixel on its own, and its distance over the threshold."""
@@ -144,7 +163,7 @@ class ErrorDiscriminant(Model):
         none = self._none(x, patch, own + mine.mean(axis=0))
         scene = self._scene(mean, own + mine[:, None], errors, tells, none)
         q, cost = _costs(mean - scene.shift[:, None], own + (mine + scene.spread)[:, None])
-        probability = _probabilities(cost, none)
+        probability, far = _probabilities(cost, none), np.sqrt(q / self.patch_level)
         at = np.arange(ids.size), cost.argmin(axis=1)
         alone = self._patch_covariances(1.0)[None] + (mine + scene.spread)[:, None]
         pixel_q, pixel_cost = _costs(d - scene.shift[patch][:, None], alone[patch])
@@ -158,7 +177,8 @@ class ErrorDiscriminant(Model):
             ids,
             self.names[at[1]],
             probability[at],
-            np.where(probability[:, -1] > probability[at], np.inf, np.sqrt(q[at] / self.patch_level)),
+            np.where(probability[:, -1] > probability[at], np.maximum(far[at], _BEYOND), far[at]),
+            far,
             probability,
             self.names,
         )

@@ -360,30 +360,3 @@ def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real
             both = by[i] * np.conj(by[j])
             total += both.real * (block[0, 0] + block[1, 1]) + both.imag * (block[0, 1] - block[1, 0])
     return np.sqrt(np.maximum(total, 0.0) / 2)
-
-
-def feature_errors(found: Inversion, prior: Uncertain, i: int, std: float) -> Real:
-    """Covariance of ln|H|, ln|V| and arg P of a patch by the error budget, float64 [3, 3].
-
-    Leakage and metal reference as the inversion left them; the patch's brightness, common to both channels; and the
-    standard deviation `std` of its own V / H.
-    To first order in leakage about the solution: with s = r_s and t = r_p / r_s, h' = h - da p - ... (Eq. 8 and 9).
-    """
-    t = found.patches[i].inverse_ratio
-    c = found.nuisance_covariance[:6, :6]
-    # d ln h' = da (1 - t), d ln v' = db (1 - 1 / t), d ln q = rho: p leaks into H, s into V, metal stays at 1.
-    own_t = t if abs(t) > 0.02 else 0.02 * np.exp(1j * np.angle(t))
-    by_h, by_v = np.array([1 - t, 0, 0]), np.array([0, 1 - 1 / own_t, 1])
-    scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
-
-    def both(by: Complex) -> tuple[Real, Real]:
-        """Real and imaginary part of sum(by * (x + j y)) by the six real parameters."""
-        real = np.stack([(by * scale).real, -(by * scale).imag], axis=1).ravel()
-        imag = np.stack([(by * scale).imag, (by * scale).real], axis=1).ravel()
-        return real, imag
-
-    (h, h_angle), (v, v_angle) = both(by_h), both(by_v)
-    rows = np.stack([h, v, h_angle - v_angle])
-    dull = found.brightness_std**2 * np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    own = (std / abs(own_t)) ** 2 * np.diag([0.0, 1.0, 1.0])
-    return rows @ c @ rows.T + dull + own

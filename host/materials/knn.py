@@ -10,19 +10,23 @@ additive:
   material; materials of nearly the same permittivity differ by 4 to 10 % in P.
 
 The three weights and the measure are fitted by cross-validation on the training data, whole scans left out.
+
+Neighbours cannot tell that a patch is none of the materials: the nearest is always somebody. What is unknown is decided
+by the materials' distributions (`discriminant.py`), as for every model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.samples import Model, Real, Samples, by_angle
+from polysight.host.materials.discriminant import ErrorDiscriminant
+from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle, majority
 from polysight.shared.errors import DataError
 
 Measure = Literal["paper", "inverse", "log"]
@@ -128,7 +132,17 @@ class PaperKnn(Model):
         else:
             self.weights = fit_weights(samples, channels=self.channels).weights
         self.x, self.voters = samples.x, voters(samples.names, self.weights.neighbours)
+        self.distributions = ErrorDiscriminant().fit(samples)
         return self
+
+    def by_scan(
+        self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
+    ) -> NamedScan:
+        """Patches named by most of their pixels' neighbours, or unknown where that material's distribution is far."""
+        found, told = majority(*self.by_pixel(x), patches), self.distributions.by_scan(x, patches, errors, others)
+        row, kind = np.arange(len(found.patches)), np.searchsorted(self.distributions.names, found.names)
+        far = np.zeros(len(row)) if told.distances is None else told.distances[row, kind]
+        return replace(found, distance=np.maximum(found.distance, far))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name of each pixel, and its neighbours' mean distance over the threshold of the material it is named."""

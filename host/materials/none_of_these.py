@@ -1,8 +1,8 @@
 """How likely a patch is when it is none of the library's materials, but any half space.
 
-Before anything is measured such a stranger lies anywhere in permittivity: ln eps' is even between air's and water's, and
-so is the loss on a scale that is logarithmic above `SOFT_LOSS` and linear below. The likelihood of what was measured is
-the integral over all of them, by Laplace's method about the half space that fits best.
+Before anything is measured such a stranger lies anywhere in permittivity: ln eps' is even from nearly air's to beyond
+water's, and so is the loss on a scale that is logarithmic above `SOFT_LOSS` and linear below. The likelihood of what
+was measured is the integral over all of them, by Laplace's method about the half space that fits best.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def cost_of_none(log_h: Real, t: Complex, covariance: Real, angles_rad: Sequence
     angles_rad
         Incidence angles.
     """
-    inverse = np.linalg.inv(covariance)
+    inverse = np.asarray(np.linalg.inv(covariance), np.float64)
     constant = np.linalg.slogdet(covariance)[1] + len(covariance) * np.log(2 * np.pi)
     return np.array([_one(h, q, inverse, angles_rad) + constant for h, q in zip(log_h, t, strict=True)])
 
@@ -53,7 +53,8 @@ def _one(log_h: Real, t: Complex, inverse: Real, angles_rad: Sequence[float]) ->
         cost = float(off @ inverse @ off)
         if cost < best:
             best, curvature = cost, information
-        at = np.clip(at - np.linalg.solve(information, slope.T @ inverse @ off), low, high)
+        step = np.linalg.solve(information, slope.T @ inverse @ off)
+        at = np.asarray(np.clip(at - step, low, high), np.float64)
     return best - 2 * np.log(_PRIOR * 2 * np.pi) + float(np.linalg.slogdet(curvature)[1])
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.classify import NamedPatch, Verdict
+from polysight.host.materials.classify import NamedPatch, PatchName
 from polysight.host.materials.inversion import Inversion, Uncertain, ratio_error
 from polysight.host.materials.measure import Refused, background, ratio_sigma
 from polysight.host.materials.metal import MetalReference
@@ -52,7 +52,7 @@ class PatchResult:
     refused: Refused | None = None
 
     @property
-    def verdict(self) -> Verdict | None:
+    def verdict(self) -> PatchName | None:
         """Its name, how sure, and the pixels' votes; None when it was not named, or nothing is said of it."""
         return None if self.named is None or self.refused is not None else self.named.verdict
 
@@ -180,6 +180,8 @@ def _row(r: PatchResult, metal: MetalReference, incidence_deg: float) -> dict[st
         "name": v.name if v else None,
         "confidence": v.confidence if v else None,
         "votes": v.votes if v else {},
+        "probabilities": v.probabilities if v else {},
+        "why": v.why if v else "",
         "distance": v.distance if v and math.isfinite(v.distance) else None,
         "metal_reference": r.patch.label == metal.label,
         "box_mm": [round(b, 3) for b in r.patch.box_mm],

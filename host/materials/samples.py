@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -105,7 +106,7 @@ class Samples:
             specimens += [e.specimen or ""] * at.size
         if not names:
             raise DataError("the library holds no usable pixel", "nothing was trained", "polysight train")
-        labels = (np.array(column) for column in (names, groups, patches, specimens))
+        labels = np.array(names), np.array(groups), np.array(patches), np.array(specimens)
         return cls(np.concatenate(x), *labels, library.angles_deg)
 
     def take(self, at: npt.NDArray) -> Samples:
@@ -159,6 +160,8 @@ class NamedScan:
         Patch numbers, sorted, [patches].
     names, confidence, distance
         The same of each patch, [patches], and how sure: a probability, or the share of its pixels.
+    distances
+        Distance of each patch to each material over the threshold, [patches, materials]; None: not known.
     probabilities, materials
         Probability of each material and, last, of none of them, [patches, materials + 1]; the materials' names. None:
         the model gives none.
@@ -170,6 +173,7 @@ class NamedScan:
     names: npt.NDArray
     confidence: Real
     distance: Real
+    distances: Real | None = None
     probabilities: Real | None = None
     materials: npt.NDArray | None = None
 
@@ -202,6 +206,8 @@ class Model(ABC):
 
     knows_scans = False
     """Whether `by_scan` makes use of what the patches of a scan have in common."""
+    distributions: Any
+    """The materials' distributions (`discriminant.py`), by which every model knows what is none of them."""
 
     @abstractmethod
     def fit(self, samples: Samples) -> Model:

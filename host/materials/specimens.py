@@ -137,7 +137,7 @@ def fit_spread(
 
 
 def alike(covariance: Real) -> Real:
-    """A covariance of ln|H|, ln|V|, arg P [3 * angles, 3 * angles] with gains of H and V that err alike, apart of phase.
+    """A covariance of ln|H|, ln|V|, arg P, [3 * angles, 3 * angles], with gains of H and V that err alike.
 
     A specimen's deviation changes mostly V, so that V's own gain error can hardly be told from it; H's can.
     """

@@ -10,7 +10,15 @@ from typing import Any
 
 from polysight.host.verdict import read_verdict
 
-_NOTHING: dict[str, Any] = {"name": None, "confidence": None, "permittivity": None, "ratio": None, "votes": {}}
+_NOTHING: dict[str, Any] = {
+    "name": None,
+    "confidence": None,
+    "permittivity": None,
+    "ratio": None,
+    "votes": {},
+    "probabilities": {},
+    "why": "",
+}
 
 
 def withhold(materials: dict[str, Any]) -> dict[str, Any]:

@@ -325,8 +325,8 @@ def _moments(d: Real, covariances: Real, weight: Real) -> tuple[Real, Real]:
 
     As of the normal distribution with the moments of the mixture; less for what is none of the materials.
     """
-    known = weight.sum(axis=1)
-    share = weight / np.maximum(known, 1e-12)[:, None]
+    known, weight = weight.sum(axis=1), weight + 1e-12
+    share = weight / weight.sum(axis=1, keepdims=True)
     middle = np.einsum("pk,pkd->pd", share, d)
     off = d - middle[:, None]
     spread = np.einsum("pk,pkde->pde", share, covariances + off[..., :, None] * off[..., None, :])

@@ -30,11 +30,15 @@ def drawn(seed=0, scans=8, pixels=12, scan=0.02, patch=0.01, pixel=0.03, means=M
     return Samples(x, names, groups, (s * len(means) + m).ravel())
 
 
+def together(one, other):
+    return Samples(*(np.concatenate([getattr(s, k) for s in (one, other)]) for k in ("x", "names", "groups", "patches")))
+
+
 def test_the_sizes_of_the_errors_are_found():
     found = [ErrorDiscriminant().fit(drawn(seed, scans=40)) for seed in range(6)]
     for covariances, size in (
-        ([f.within[0] for f in found], 0.03),
-        ([f.between[0] for f in found], 0.01),
+        ([f.within for f in found], 0.03),
+        ([f.between for f in found], 0.01),
         ([f.scan for f in found], 0.02),
     ):
         mean = np.mean(covariances, axis=0)
@@ -116,8 +120,7 @@ def with_metal(samples, stray):
     x = feature_matrix(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
     patches = samples.patches.max() + 1 + np.repeat(np.arange(scans.size), n)
     metal = Samples(x, np.full(len(x), "metal"), np.repeat(scans, n), patches)
-    both = zip(vars(samples).values(), vars(metal).values(), strict=True)
-    return Samples(*(np.concatenate(pair) for pair in both))
+    return together(samples, metal)
 
 
 def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
@@ -125,7 +128,7 @@ def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
     turned = samples.take(np.arange(len(samples.x))[::-1])
     here, there = ErrorDiscriminant().fit(samples), ErrorDiscriminant().fit(turned)
     np.testing.assert_allclose(here.scan, there.scan, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(here.mean, there.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(here.level, there.level, rtol=1e-9, atol=1e-12)
     assert here.patch_level == pytest.approx(there.patch_level)
 
 
@@ -144,7 +147,7 @@ def test_two_angles_are_independent_and_tell_more():
     one, two = drawn(0, pixel=0.1, patch=0.05), drawn(1, pixel=0.1, patch=0.05)
     both = one.joined(two)
     model = ErrorDiscriminant().fit(both)
-    for covariance in (model.scan, model.between[0], model.within[0]):
+    for covariance in (model.scan, model.between, model.within):
         assert np.abs(covariance[:3, 3:]).max() < 1e-12
     assert score(both, DISCRIMINANT).pixels > score(one, DISCRIMINANT).pixels
 
@@ -154,8 +157,7 @@ def with_lonely(samples, scans=1):
     only = drawn(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
     names = np.full(len(only.x), "lonely")
     more = Samples(only.x, names, only.groups, samples.patches.max() + 1 + only.patches)
-    both = zip(vars(samples).values(), vars(more).values(), strict=True)
-    return Samples(*(np.concatenate(pair) for pair in both))
+    return together(samples, more)
 
 
 @pytest.mark.parametrize("model", [DISCRIMINANT, PAPER])

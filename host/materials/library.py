@@ -49,6 +49,8 @@ class Entry:
         Versions of what made it.
     reference
         What it was divided by, where it was not the metal of its own scan.
+    specimen
+        Which physical piece of the material it shows; None where that is not known.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Entry:
     permittivity: tuple[float, float] | None = None
     versions: dict[str, str] = field(default_factory=dict)
     reference: str | None = None
+    specimen: str | None = None
 
 
 @dataclass(frozen=True)

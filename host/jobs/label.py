@@ -41,7 +41,7 @@ from polysight.host.products import (
 from polysight.host.report import label_figure
 from polysight.shared.errors import ConfigError, DataError
 
-METAL = "metal"
+METAL, REFERENCE = "metal", "the metal reference"
 _LARGEST_MARGIN = 0.3  # of a patch's side
 Ask = Callable[[str], str]
 
@@ -85,7 +85,8 @@ class Edits:
     @property
     def given(self) -> bool:
         """True if anything is changed."""
-        return self != Edits()
+        several = (self.removed, self.renames, self.boxes, self.specimens)
+        return self.from_patches or self.metal is not None or any(several)
 
 
 def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None = None) -> int:
@@ -160,7 +161,7 @@ def found_patches(products: SavedProducts) -> list[FoundPatch]:
         mx, my = (min(margin_mm, _LARGEST_MARGIN * (b - a)) for a, b in ((x0, x1), (y0, y1)))
         sure = f" {100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
         told = f"named {row['name']}{sure}" if row.get("name") else "not named"
-        told = "the metal reference" if row.get("metal_reference") else told
+        told = REFERENCE if row.get("metal_reference") else told
         told = row["box"] if row.get("box") else "not judged" if row.get("refused") else told
         out.append(FoundPatch(int(row["label"]), (x0 + mx, y0 + my, x1 - mx, y1 - my), told))
     return out
@@ -317,7 +318,7 @@ def _listing(
     if found:
         lines += ["patches that were found, a box inside each:"]
         lines += [f"  {f.number:>3}  {format_box(f.box)}  {f.told}" for f in found]
-        first = found[0].number
-        lines.append(f"to name them: polysight label {folder} --from-patches --metal {first} --rename NUMBER=NAME ...")
+        metal = next((f.number for f in found if f.told == REFERENCE), "NUMBER")
+        lines.append(f"to name them: polysight label {folder} --from-patches --metal {metal} --rename NUMBER=NAME ...")
     lines.append(f"to draw one:  polysight label {folder} --box NAME=x0,y0,x1,y1 (mm)")
     return "".join(f"{line}\n" for line in lines)

@@ -76,8 +76,8 @@ def material_columns(products: HasSegments) -> dict[str, list[Any]]:
     """Columns by name, an entry for each patch; None where a number is not known.
 
     Permittivity is `permittivity_real` - j `permittivity_loss`; `permittivity_real_loss_covariance` is of these two,
-    `dominated_by` what most of the error comes from, `refused` why a patch was not judged, `drawn_as` what a person called
-    its box. p_imag and p_phase are those of P = H / V relative to metal; positions count from the image's centre.
+    `dominated_by` what most of the error comes from, `refused` why a patch was not judged, `drawn_as` what its box was
+    called. p_imag and p_phase are those of P = H / V relative to metal; positions count from the image's centre.
     """
     rows = [_row(segment) for segment in products.segments]
     return {name: [row[name] for row in rows] for name in _COLUMNS}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -216,11 +216,32 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path) ->
                     raise ScanError(f"{file}: simulation failed, see above")
                 scans.append(training_scan(folder, config))
     note = "simulated scans of " + ", ".join(s.scan for s in scans) if all(s.simulated for s in scans) else ""
-    library = make_library(scans, note)
+    library = make_library(told_apart(scans), note)
     library.save(out)
     sys.stdout.write("".join(f"{line}\n" for line in _summary(out, library)))
     sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
     return 0
+
+
+def told_apart(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
+    """The scans, each with a name of its own: those of one scene are called alike.
+
+    Raises
+    ------
+    DataError
+        when two are the same scan: it would be judged on what it taught.
+    """
+    out: list[TrainingScan] = []
+    for scan in scans:
+        alike = [s for s in scans[: len(out)] if s.scan == scan.scan]
+        if any(np.array_equal(s.result.h, scan.result.h, equal_nan=True) for s in alike):
+            raise DataError(
+                f"scan {scan.scan} is given twice",
+                "it would be judged on what it taught",
+                "leave one out (a scan folder and its products are one scan)",
+            )
+        out.append(replace(scan, scan=f"{scan.scan} ({len(alike) + 1})") if alike else scan)
+    return out
 
 
 def _summary(out: Path, library: Library) -> list[str]:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from polysight.host.cli.main import main
-from polysight.host.materials import Library
+from polysight.host.jobs.train import training_scan
+from polysight.host.materials import Library, entries_of
 from polysight.simulators.scene import decode_scene, simulate
+from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
 
@@ -19,15 +23,15 @@ PLACES = (-40.0, 10.0), (40.0, -10.0)
 BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")  # 5 mm inside the plates
 
 
-def scene(seed: int, **more) -> dict:
+def scene(seed: int) -> dict[str, Any]:
     copper = {"name": "copper", "centre_mm": PLACES[0], "size_mm": [50.0, 50.0], "metal": True}
     board = {"name": "board", "centre_mm": PLACES[1], "size_mm": [50.0, 50.0], "permittivity": [3.2, 0.4]}
-    return scene_of(copper, board, columns=15, rows=17, seed=seed, disturbances={"leakage_measured": 0.003}, **more)
+    return scene_of(copper, board, columns=15, rows=17, seed=seed, disturbances={"leakage_measured": 0.003})
 
 
 @pytest.fixture(scope="session")
 def scans(tmp_path_factory) -> list[Path]:
-    """Three scans of copper and a board, without truth.json: what a real rig would leave."""
+    """Three scans of copper and a board, without truth.json: what a real rig would leave. All are called alike."""
     folder = tmp_path_factory.mktemp("own")
     made = [simulate(published_rig(), decode_scene(scene(s), "test"), folder / f"s{s}") for s in (1, 2, 3)]
     for scan in made:
@@ -35,44 +39,55 @@ def scans(tmp_path_factory) -> list[Path]:
     return made
 
 
+def drawn() -> list[str]:
+    return [word for box in BOXES for word in ("--box", box)]
+
+
 def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path, capsys):
-    first, second, third = scans
+    (first, second, third), elsewhere, out = scans, tmp_path / "second", tmp_path / "out"
     library = tmp_path / "own.npz"
     assert main(["train", str(first), str(second), "--out", str(library)]) == 3
-    told = capsys.readouterr().err
-    assert f"do: polysight label {first}" in told
-    for scan in (first, second):
-        assert main(["process", str(scan), "--out", str(scan / "products"), "--model", "none"]) == 0
-        drawn = [word for box in BOXES for word in ("--box", box)]
-        assert main(["label", str(scan), *drawn, "--specimen", f"{MINE}=board 7"]) == 0
-    # the first by its scan folder, the second by the folder of its products
-    assert main(["train", str(first), str(second / "products"), "--out", str(library)]) == 0
+    assert f"do: polysight label {first}" in capsys.readouterr().err
+    for scan, images in ((first, first / "products"), (second, elsewhere)):
+        assert main(["image", str(scan), "--out", str(images)]) == 0
+    for folder in (first, elsewhere):  # a scan folder, and products without their rows
+        assert main(["label", str(folder), *drawn(), "--specimen", f"{MINE}=board 7"]) == 0
+    assert main(["train", str(first), str(elsewhere), "--out", str(library)]) == 0
     assert f"  {MINE}: 2 patches in 2 scans" in capsys.readouterr().out
     known = Library.load(library)
     assert known.names == ("copper", MINE)
+    assert known.scans == ("small", "small (2)")
     assert {e.specimen for e in known.entries if e.name == MINE} == {"board 7"}
     assert {e.specimen for e in known.entries if e.name == "copper"} == {None}
     assert known.simulated  # without a truth it is simulated all the same, and says so
+    assert main(["train", str(first), str(first / "products"), "--out", str(library)]) == 3
+    assert "is given twice" in capsys.readouterr().err
 
-    out = tmp_path / "out"
     assert main(["process", str(third), "--out", str(out), "--library", str(library)]) == 0
     segments = json.loads((out / "materials.json").read_text(encoding="utf-8"))["segments"]
-    assert [s["name"] for s in segments if not s["metal_reference"]] == [MINE]
+    mine = [s for s in segments if s["name"] == MINE]
+    assert [np.hypot(*np.subtract(np.reshape(s["box_mm"], (2, 2)).mean(0), PLACES[1])) < 10 for s in mine] == [True]
+    assert {s["name"] for s in segments} <= {MINE, "unknown", None}
+    assert MINE in (out / "report.html").read_text(encoding="utf-8")
     capsys.readouterr()
     assert main(["materials", str(out)]) == 0
     assert MINE in capsys.readouterr().out
-    assert MINE in (out / "report.html").read_text(encoding="utf-8")
     assert main(["export", str(out), "--csv", "--out", str(tmp_path / "csv")]) == 0
     assert MINE in (tmp_path / "csv" / "materials.csv").read_text(encoding="utf-8")
 
 
-def test_a_box_of_a_label_file_is_called_as_it_was_drawn(scans, tmp_path, capsys):
-    labels, out = tmp_path / "labels.json", tmp_path / "out"
+def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
+    scan, out = scans[2], tmp_path / "out"
+    labels = tmp_path / "labels.json"
     boxes = {"reference": [-60, -10, -20, 30], MINE: [20, -30, 60, 10]}
     labels.write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "reference"}), encoding="utf-8")
-    assert main(["process", str(scans[2]), "--out", str(out), "--labels", str(labels)]) == 0
-    capsys.readouterr()
-    assert main(["materials", str(out)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert any("metal reference" in line and "drawn as reference" in line for line in lines)
+    assert main(["process", str(scan), "--out", str(out), "--labels", str(labels)]) == 0
     assert f"drawn as {MINE}" in (out / "report.html").read_text(encoding="utf-8")
+    assert main(["label", str(out), *drawn()]) == 0
+    (scan / "labels.json").write_bytes((out / "labels.json").read_bytes())
+    rows, images = (entries_of(training_scan(folder, RIG_FILE)) for folder in (scan, out))
+    assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
+    for one, other in zip(rows, images, strict=True):
+        assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=0.05)
+        assert np.median(one.h) == pytest.approx(np.median(other.h), rel=0.02)
+        assert abs(np.median(one.p) / np.median(other.p) - 1) < 0.02

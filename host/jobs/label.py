@@ -18,6 +18,7 @@ from polysight.host.materials import (
     Box,
     Labels,
     SegmentSettings,
+    box_mask,
     box_name,
     check_labels,
     clean_name,
@@ -42,6 +43,8 @@ from polysight.host.report import label_figure
 from polysight.shared.errors import ConfigError, DataError
 
 METAL, REFERENCE = "metal", "the metal reference"
+FEW = 16
+"""Pixels of a box that a library takes at most; of fewer it learns speckle."""
 _LARGEST_MARGIN = 0.3  # of a patch's side
 Ask = Callable[[str], str]
 
@@ -147,6 +150,11 @@ def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequen
     sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
+    few = [
+        n for n, b in checked.boxes.items() if (box_mask(b, products.x_m, products.y_m) & products.valid).sum() < FEW
+    ]
+    if few:
+        sys.stdout.write(f"note: fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few\n")
     if checked.metal is None:
         sys.stdout.write("note: no box is metal; train then needs a rig with `polysight calibrate metal`\n")
     sys.stdout.write(f"labels:   {place / LABELS}\npicture:  {place / LABELS_PICTURE}\n")
@@ -251,7 +259,9 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
     sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (called {METAL})\n")
     try:
         for patch in found:
-            name, is_metal = _asked_name(f"patch {patch.number} ({patch.told}): ", boxes, ask, metal is None)
+            name, is_metal = _asked_name(
+                f"patch {patch.number}, {format_box(patch.box)}, {patch.told}: ", boxes, ask, metal is None
+            )
             if name:
                 boxes[name] = patch.box
                 metal = name if is_metal else metal

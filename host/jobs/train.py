@@ -45,6 +45,7 @@ from polysight.host.products import (
     SCAN,
     SavedProducts,
     find_labels,
+    find_products,
     read_products,
     scan_folder_of,
 )
@@ -75,6 +76,7 @@ def training_scan(data: Path, config: Path) -> TrainingScan:
         when the verdict on a labelled scan is that it shows nothing.
     """
     scan = scan_folder_of(data) or data
+    check_told(data)
     if (there := find_labels(data)) is not None:
         path, labels = there
         try:
@@ -82,13 +84,34 @@ def training_scan(data: Path, config: Path) -> TrainingScan:
             return _from_images(saved, labels) if saved is not None else _from_rows(scan, config, labels)
         except DataError as e:
             raise DataError(f"{path}: {e.what}" if str(path) not in e.what else e.what, e.why, e.remedy) from None
-    if (scan / TRUTH).exists():
-        return _from_truth(scan, config)
-    raise DataError(
-        f"{data}: neither {LABELS} nor {TRUTH} is in it",
-        "what lies where in this scan is not told",
-        f"polysight label {data}; then train again",
-    )
+    return _from_truth(scan, config)
+
+
+def check_told(data: Path) -> None:
+    """Refuse a scan whose materials are not told, or whose boxes cannot be used, before any row is read.
+
+    Raises
+    ------
+    DataError
+        as :func:`training_scan` does, as far as the saved image tells.
+    """
+    scan = scan_folder_of(data) or data
+    if not data.is_dir():
+        raise DataError(f"{data}: no such folder", "the path is wrong", "give scan folders, or folders of products")
+    if (there := find_labels(data)) is None:
+        if (scan / TRUTH).exists():
+            return
+        raise DataError(
+            f"{data}: neither {LABELS} nor {TRUTH} is in it",
+            "what lies where in this scan is not told",
+            f"polysight label {data}; then train again",
+        )
+    if (saved := find_products(data)) is not None:
+        path, labels = there
+        try:
+            check_labels(labels, saved.x_m, saved.y_m)
+        except DataError as e:
+            raise DataError(f"{path}: {e.what}", e.why, e.remedy) from None
 
 
 def _saved_alone(data: Path, scan: Path) -> SavedProducts | None:
@@ -205,6 +228,8 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path) ->
         raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
     if not out.parent.is_dir():
         raise ConfigError(f"{out}: no such folder {out.parent}", "the library would be lost", "make it first")
+    for folder in data:
+        check_told(folder)
     if files:
         check_scenes(files, config)
     scans = [training_scan(folder, config) for folder in data]

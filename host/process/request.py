@@ -19,6 +19,7 @@ from polysight.host.materials import (
     Labels,
     Library,
     Segmentation,
+    check_labels,
 )
 from polysight.host.polarimetry import Incidence, PlaneReference
 from polysight.shared.config import Instrument
@@ -105,12 +106,14 @@ class Options:
     def drawn(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> DrawnBoxes:
         """The boxes drawn by hand on an image; empty without them.
 
-        `x_m`, `y_m` are the image's axes. Raises DataError when a box holds no pixel.
+        `x_m`, `y_m` are the image's axes. Raises DataError when a box holds no pixel, or nothing could be learnt of
+        boxes that a person drew.
         """
         if self.labels is None:
             return DrawnBoxes()
-        patches, names = self.labels.patches(x_m, y_m)
-        metal = next((label for label, name in names.items() if self.labels.is_metal(name)), None)
+        labels = check_labels(self.labels, x_m, y_m) if self.labels.by_hand else self.labels
+        patches, names = labels.patches(x_m, y_m)
+        metal = next((label for label, name in names.items() if labels.is_metal(name)), None)
         return DrawnBoxes(patches, names, metal if self.reference is None and self.metal_box_mm is None else None)
 
     def unnamed(self, rig: Instrument) -> str:

@@ -19,8 +19,12 @@ _BY_HAND = b'"by_hand": true'
 
 def scan_folder_of(folder: Path) -> Path | None:
     """The scan folder that this is, or whose products these are; None for products that lie elsewhere."""
-    place = folder.resolve()
-    return next((f for f, at in ((folder, place), (folder.parent, place.parent)) if is_source(at)), None)
+    if is_source(folder):
+        return folder
+    above = folder.resolve().parent
+    if not is_source(above):
+        return None
+    return folder.parent if folder.parent.resolve() == above else above  # of `.` the parent is `.` again
 
 
 def label_place(folder: Path) -> Path:

@@ -150,9 +150,8 @@ def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequen
     sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
-    few = [
-        n for n, b in checked.boxes.items() if (box_mask(b, products.x_m, products.y_m) & products.valid).sum() < FEW
-    ]
+    masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
+    few = [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]
     if few:
         sys.stdout.write(f"note: fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few\n")
     if checked.metal is None:
@@ -259,9 +258,8 @@ def asked(found: Sequence[FoundPatch], ask: Ask) -> Labels:
     sys.stdout.write(f"name each patch; Enter leaves it out, m is the metal reference (called {METAL})\n")
     try:
         for patch in found:
-            name, is_metal = _asked_name(
-                f"patch {patch.number}, {format_box(patch.box)}, {patch.told}: ", boxes, ask, metal is None
-            )
+            question = f"patch {patch.number}, {format_box(patch.box)}, {patch.told}: "
+            name, is_metal = _asked_name(question, boxes, ask, metal is None)
             if name:
                 boxes[name] = patch.box
                 metal = name if is_metal else metal

@@ -276,7 +276,9 @@ def _summary(out: Path, library: Library) -> list[str]:
         mine = [e for e in library.entries if e.name == name]
         pieces = len({e.specimen for e in mine if e.specimen is not None})
         told = f", {pieces} pieces told apart" if pieces > 1 else ""
-        lines.append(f"  {name}: {len(mine)} patches in {len({e.scan for e in mine})} scans{told}")
+        scans = len({e.scan for e in mine})
+        patches = "1 patch" if len(mine) == 1 else f"{len(mine)} patches"
+        lines.append(f"  {name}: {patches} in {scans} scan{'s' * (scans > 1)}{told}")
     for one, other in combinations(library.names, 2):
         if one.casefold() == other.casefold():
             lines.append(f"note: {one} and {other} are two materials here; if they are one: polysight label --rename")

@@ -17,6 +17,7 @@ from polysight.host.materials import (
     pack_labels,
     read_labels,
 )
+from polysight.host.process import Options
 from polysight.shared.errors import DataError
 
 X_M = Y_M = np.linspace(-0.049, 0.049, 50)  # 50 pixels of 2 mm: -50 to 50 mm
@@ -117,6 +118,14 @@ def test_keys_of_another_form_are_refused(tmp_path, more):
     path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}, **more}))
     with pytest.raises(DataError, match=f"labels.json: {next(iter(more))} = "):
         read_labels(path)
+
+
+def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
+    overlapping = Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
+    with pytest.raises(DataError, match="overlap"):
+        Options(labels=overlapping).drawn(X_M, Y_M)
+    drawn = Options(labels=Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)).drawn(X_M, Y_M)
+    assert (drawn.metal, drawn.names) == (1, {1: "tin", 2: "oak"})
 
 
 def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):

@@ -12,6 +12,7 @@ import pytest
 from polysight.host.cli.main import main
 from polysight.host.jobs.train import training_scan
 from polysight.host.materials import Library, entries_of
+from polysight.shared.errors import DataError
 from polysight.simulators.scene import decode_scene, simulate
 from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
@@ -91,3 +92,18 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
         assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=0.05)
         assert np.median(one.h) == pytest.approx(np.median(other.h), rel=0.02)
         assert abs(np.median(one.p) / np.median(other.p) - 1) < 0.02
+
+
+def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
+    spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
+    scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
+    told = [(e.name, e.specimen, e.permittivity is None) for e in entries_of(training_scan(scan, RIG_FILE))]
+    assert told == [("copper", "small/1", True), ("board", "small/2", False)]
+    boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
+    (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
+    told = [(e.name, e.specimen) for e in entries_of(training_scan(scan, RIG_FILE))]
+    assert told == [("tin", None), (MINE, "left")]
+    boxes = {"tin": [-60, -10, 30, 30], MINE: [20, -30, 60, 10]}
+    (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
+    with pytest.raises(DataError, match=f"labels.json: the boxes of tin and {MINE} overlap by 10.0 x 20.0 mm"):
+        training_scan(scan, RIG_FILE)

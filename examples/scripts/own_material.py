@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from polysight.host.jobs.process import train
+from polysight.host.jobs.train import train
 from polysight.host.materials import Library
 from polysight.host.polarimetry import fresnel
 from polysight.host.products.files import read_products

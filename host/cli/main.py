@@ -23,6 +23,7 @@ FAMILIES = {
     "scan": ("scan", "resume", "validate", "preview", "drop-raw"),
     "process": ("process", "image", "focus", "sync-report"),
     "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export"),
+    "label": ("label",),
     "calibrate": ("calibrate", "leakage"),
 }
 """Module of this package to the commands that it adds, in the order of the help."""

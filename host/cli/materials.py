@@ -203,7 +203,7 @@ def _train(args: argparse.Namespace) -> int:
         from polysight.papers.sensys2026.dataset import train_authors
 
         return train_authors(args.authors, args.config, args.out)
-    from polysight.host.jobs.process import train
+    from polysight.host.jobs.train import train
 
     scenes = None if args.simulate is None else packaged(args.simulate)
     return train(scenes, args.data, args.config, args.out)
@@ -213,11 +213,13 @@ def _add_train(add: Add) -> None:
     sub = add(
         "train",
         _train,
-        "make the classifier's reference library from scans of known plates",
+        "make the classifier's reference library from labelled scans, or from simulated ones",
         "polysight train --simulate examples/library --out library.npz",
     )
     add_config_option(sub, shipped=True)
-    sub.add_argument("data", type=Path, nargs="*", metavar="DATA", help="scan folders with truth.json")
+    sub.add_argument(
+        "data", type=Path, nargs="*", metavar="DATA", help="scans that polysight label names, or simulated ones"
+    )
     sub.add_argument(
         "--simulate", type=Path, default=None, metavar="DIR", help="simulate every scene in DIR and use it"
     )

@@ -115,8 +115,8 @@ def add_material_options(sub: argparse.ArgumentParser) -> None:
         type=Path,
         default=None,
         metavar="FILE",
-        help="boxes drawn by hand, instead of patches that are found: labels.json of earlier products, edited, or the"
-        " authors' label file; a box named metal or copper is the reference",
+        help="boxes drawn by hand, instead of patches that are found: labels.json of polysight label, or the authors'"
+        " label file; the box told to be metal, or named so, is the reference",
     )
     add_model_option(sub, none=True)
 

@@ -1,6 +1,6 @@
 """What the commands do: each function takes a typed request or plain values and returns an exit status.
 
-Entered by module, so that a command loads no more than it needs: `process` (images, materials, training), `batch` and
-its worker, `live_scan`, `demo`, `materials` (on saved products), `calibrate`, `cards`, `look` (validate, inspect),
-`drop_raw`. They print for people or, with `as_json`, for programs; libraries below them never do.
+Entered by module, so that a command loads no more than it needs: `process` (images, materials), `label` and `train`,
+`batch` and its worker, `live_scan`, `demo`, `materials` (on saved products), `calibrate`, `cards`, `look` (validate,
+inspect), `drop_raw`. They print for people or, with `as_json`, for programs; libraries below them never do.
 """

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.cells import cell_len
 
 from polysight.host.imaging import sub_bands
 from polysight.host.jobs.print_verdict import print_verdict
@@ -151,7 +152,7 @@ def _layer_row(fit: LayerFit) -> dict[str, Any]:
 
 
 def _line(row: Mapping[str, Any]) -> str:
-    head = f"{row['label']:>3}  {row['name'] or '':24s}"
+    head = f"{row['label']:>3}  {_padded(row['name'] or '')}"
     single = row["single_interface"]
     if row.get("refused"):
         return f"{head} not judged: {refused_text(row)}\n"
@@ -240,12 +241,18 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
 
 def _patch_line(row: dict[str, Any]) -> str:
     name = row["name"] or ("metal reference" if row.get("metal_reference") else "not named")
+    drawn = f"   drawn as {row['box']}" if row.get("box") else ""
     if row.get("refused"):
-        return f"{row['label']:>3}  {'not judged':24s} {refused_text(row)}\n"
+        return f"{row['label']:>3}  {'not judged':24s} {refused_text(row)}{drawn}\n"
     sure = f"{100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
     e = row.get("permittivity")
     told = _estimate(e) if e is not None else "metal-like" if row.get("metal_like") else "-"
-    return f"{row['label']:>3}  {name:24s} {sure:>5s}  {told}".rstrip() + "\n"
+    return f"{row['label']:>3}  {_padded(name)} {sure:>5s}  {told}{drawn}".rstrip() + "\n"
+
+
+def _padded(name: str, width: int = 24) -> str:
+    """A name as wide as a column of a terminal; Chinese characters take two places each."""
+    return name + " " * max(0, width - cell_len(name))
 
 
 def report(folder: Path) -> int:

@@ -1,11 +1,8 @@
-"""Commands that process data which is already there: process, image, train."""
+"""Commands that process data which is already there: process, image, focus, sync-report."""
 
 from __future__ import annotations
 
-import json
 import sys
-import tempfile
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,17 +13,9 @@ from rich.progress import track
 
 from polysight.host.calibration import of_scan
 from polysight.host.imaging import ChannelImages, Focus, PlaneEstimate, focus_sweep
-from polysight.host.jobs.demo import check_scenes, run_simulator
 from polysight.host.materials import (
-    TRUTH,
-    KnownScene,
-    MetalChoice,
-    TrainingScan,
     TruthPlate,
-    make_library,
-    patches_from_plates,
     read_labels,
-    read_truth,
     truth_beside,
 )
 from polysight.host.pipeline import Pipeline
@@ -34,16 +23,14 @@ from polysight.host.polarimetry import PlaneReference, plane_reference
 from polysight.host.process import Options, ProcessRequest, Products, coverage_lines, save_images
 from polysight.host.products import IMAGE, check_products_folder, making_products, write_json
 from polysight.host.report import focus_figure
-from polysight.host.store import Source, open_source, raw_source, versions
+from polysight.host.store import Source, open_source, raw_source
 from polysight.shared.config import Instrument
-from polysight.shared.errors import ConfigError, DataError, ScanError, advice
+from polysight.shared.errors import DataError, advice
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
-EDGE_MM = 9.0
-"""Rim of a known plate that is not used for training: about the resolution in x."""
 
 
-def _all_rows(
+def all_rows(
     source: Source, data: Path, depth_m: float = 0.0, bands: int = 1, options: Options | None = None
 ) -> Pipeline:
     """A pipeline with all rows of a source, with a progress bar. What `options` cannot use is refused first."""
@@ -66,7 +53,7 @@ def _all_rows(
 
 def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, ChannelImages]:
     """A recorded scan of any layout, processed up to its images. Raises PolysightError."""
-    pipeline = _all_rows(open_source(data, config), data, bands=bands)
+    pipeline = all_rows(open_source(data, config), data, bands=bands)
     return pipeline, pipeline.form_images()
 
 
@@ -183,7 +170,7 @@ def process(request: ProcessRequest) -> int:
     source = open_source(data, None if request.config is None else Path(request.config))
     plates = truth_of(data)
     check_products_folder(out, source.scan_id)
-    pipeline = _all_rows(source, data, bands=options.bands, options=options)
+    pipeline = all_rows(source, data, bands=options.bands, options=options)
     products = make_products(pipeline, out, options, plates)
     sys.stdout.write(products.summary())
     return products.exit_status
@@ -193,7 +180,7 @@ def image(data: Path, out: Path, config: Path | None) -> int:
     """image.npz and quality.json only; returns the exit status. Raises PolysightError."""
     source = open_source(data, config)
     check_products_folder(out, source.scan_id)
-    pipeline = _all_rows(source, data)
+    pipeline = all_rows(source, data)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
@@ -206,7 +193,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     """Find the object plane's distance and tilt by sharpness; focus.json and focus.png. Raises PolysightError."""
     source = open_source(data, config)
     out.mkdir(parents=True, exist_ok=True)
-    pipeline = _all_rows(source, data, depth_mm / 1e3)
+    pipeline = all_rows(source, data, depth_mm / 1e3)
     builder = pipeline.images
     images = pipeline.form_images()
     pipeline.place_plane(images, move=False)
@@ -273,58 +260,4 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
             words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples)
             report.add(synchronise_row(words, valid, setup))
     sys.stdout.write(write_sync_report(out, reports, source.scan_id, source.simulated))
-    return 0
-
-
-def _training_scan(data: Path, config: Path) -> TrainingScan:
-    source = open_source(data, config)
-    plates = read_truth(data / TRUTH) if (data / TRUTH).exists() else ()
-    pipeline = _all_rows(source, data)
-    if not plates:
-        raise DataError(f"{data}: no {TRUTH}", "its plates are not known", "give scans made by polysight simulate")
-    metal = next((t for t in plates if t.metal), None)
-    if metal is None:
-        raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
-    images = pipeline.form_images()
-    known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
-    found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
-    return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names)
-
-
-def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path) -> int:
-    """Make a library from scans with known plates, or from scenes that are simulated first.
-
-    Raises
-    ------
-    PolysightError
-        when a file is wrong, found out before anything is simulated; or a scan cannot be learnt from.
-    """
-    data, files = list(data), [] if scenes is None else sorted(scenes.glob("*.toml"))
-    if not data and scenes is None:
-        raise ConfigError(
-            "no scans to learn from",
-            "neither DATA nor --simulate was given",
-            "polysight train --simulate examples/library --out FILE",
-        )
-    if scenes is not None and not files:
-        raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
-    if not out.parent.is_dir():
-        raise ConfigError(f"{out}: no such folder {out.parent}", "the library would be lost", "make it first")
-    if files:
-        check_scenes(files, config)
-    scans = [_training_scan(folder, config) for folder in data]
-    if files:
-        with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
-            for file in files:
-                folder = Path(temporary) / file.stem
-                if run_simulator(["simulate", str(file), "--config", str(config), "--out", str(folder)]):
-                    raise ScanError(f"{file}: simulation failed, see above")
-                scans.append(_training_scan(folder, config))
-    note = "simulated scans of " + ", ".join(s.scan for s in scans) if all(s.simulated for s in scans) else ""
-    library = make_library(scans, note)
-    library.save(out)
-    sys.stdout.write(
-        f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(scans)} scans\n"
-    )
-    sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
     return 0

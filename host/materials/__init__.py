@@ -3,7 +3,7 @@
 `analyse` takes an `ImagePair`, the `Optics`, which metal is the reference (`MetalChoice`) and what is known of the
 scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patches by a `Library` of labelled patches;
 `make_library` and `fit_library` make one. `fit_layer` fits thin layers, `fit_concentration` solutions. What is shared
-between scans is in `patch_files`; `published` reads the published data set's material and label files.
+between scans is in `patch_files`, boxes with names in `labels`; `published` reads the published data set's files.
 """
 
 from polysight.host.materials.analyse import analyse, image_centre_mm, permittivity_change, pixel_accuracy
@@ -34,6 +34,27 @@ from polysight.host.materials.inversion import (
     ratio_error,
 )
 from polysight.host.materials.knn import Fit, Weights, fit_weights
+from polysight.host.materials.label_checks import (
+    box_name,
+    check_labels,
+    clean_name,
+    image_extent_mm,
+    name_taken,
+    no_box,
+)
+from polysight.host.materials.labels import (
+    METALS,
+    SPECIMEN,
+    Labels,
+    format_box,
+    is_metal,
+    labels_of,
+    material_of,
+    pack_labels,
+    patches_from_labels,
+    patches_from_plates,
+    read_labels,
+)
 from polysight.host.materials.layers import Layer, LayerFit, fit_layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
 from polysight.host.materials.measure import NOT_PASSIVE, Refused
@@ -43,21 +64,14 @@ from polysight.host.materials.patch_files import (
     PATCHES,
     MatchedPatch,
     SeenPatches,
-    labels_of,
     match_patches,
     pack_patches,
-    patches_from_labels,
-    patches_from_plates,
-    read_labels,
     read_patches,
-    write_labels,
 )
 from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, format_permittivity, median_ratio
 from polysight.host.materials.published import (
-    METALS,
     LabelledScan,
     entries_of_boxes,
-    is_metal,
     label_folders,
     read_labelled_scan,
     read_material,
@@ -92,6 +106,7 @@ from polysight.host.materials.truth import (
     TRUTH,
     Plates,
     TruthPlate,
+    drew_specimens,
     match_truth,
     read_truth,
     truth_beside,
@@ -112,6 +127,7 @@ __all__ = [
     "SAME_ANGLE_DEG",
     "SHORT",
     "SIMULATED_LIBRARY",
+    "SPECIMEN",
     "TRUTH",
     "UNKNOWN",
     "UNKNOWN_SCENE",
@@ -124,6 +140,7 @@ __all__ = [
     "Inversion",
     "KnownScene",
     "LabelledScan",
+    "Labels",
     "Layer",
     "LayerFit",
     "Library",
@@ -156,7 +173,11 @@ __all__ = [
     "bands_of_row",
     "best_model",
     "box_mask",
+    "box_name",
+    "check_labels",
+    "clean_name",
     "concentrations",
+    "drew_specimens",
     "entries_of",
     "entries_of_boxes",
     "estimate_permittivity",
@@ -166,8 +187,10 @@ __all__ = [
     "fit_layer",
     "fit_library",
     "fit_weights",
+    "format_box",
     "format_permittivity",
     "image_centre_mm",
+    "image_extent_mm",
     "insides",
     "invert",
     "is_metal",
@@ -176,11 +199,15 @@ __all__ = [
     "make_library",
     "match_patches",
     "match_truth",
+    "material_of",
     "measured_ratio",
     "median_ratio",
     "metal_by_label",
     "metal_evidence",
     "metal_in_box",
+    "name_taken",
+    "no_box",
+    "pack_labels",
     "pack_patches",
     "patches_from_labels",
     "patches_from_plates",
@@ -203,5 +230,4 @@ __all__ = [
     "truth_labels",
     "truth_plates",
     "with_bands",
-    "write_labels",
 ]

@@ -50,7 +50,7 @@ class Entry:
     reference
         What it was divided by, where it was not the metal of its own scan.
     specimen
-        Which plate of its material it was; None: not known, the same in all scans.
+        Which physical piece of the material it shows; None where that is not known.
     """
 
     name: str

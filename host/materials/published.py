@@ -22,14 +22,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from polysight.host.materials.labels import METALS, is_metal, read_labels
 from polysight.host.materials.library import Entry, Library
-from polysight.host.materials.patch_files import read_labels
 from polysight.host.materials.segment import Box
 from polysight.host.polarimetry import calibrate
 from polysight.shared.errors import DataError
 
 Image = npt.NDArray[np.complexfloating]
-METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")
 PIXELS = 120
 """Of a box, at even intervals: the paper's "about 80 to 120" for each material."""
 TURNS = {
@@ -102,11 +101,6 @@ class LabelledScan:
         return max(metals, key=lambda n: self.mask(n).sum(), default=None)
 
 
-def is_metal(name: str) -> bool:
-    """Whether a material's name is that of a metal."""
-    return any(word in METALS for word in re.findall(r"[a-z]+", name.lower()))
-
-
 def read_labelled_scan(folder: Path) -> LabelledScan:
     """Read `labels/<scan>`.
 
@@ -121,7 +115,7 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
         if len(others) != 1:
             raise DataError(f"{file}: no such label file", "the download is not complete", "fetch the scan again")
         file = others[0]
-    boxes = read_labels(file)
+    boxes = dict(read_labels(file).boxes)
     description = str(json.loads(file.read_text(encoding="utf-8")).get("description", ""))
     images = []
     for name in ("sar_h", "sar_v"):

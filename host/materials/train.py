@@ -263,6 +263,8 @@ class TrainingScan:
         Versions of what made it.
     names
         Names of patches by label, when drawn by hand instead of matched to a truth.
+    specimens
+        Which physical piece each patch shows, by label, where that is known.
     """
 
     scan: str
@@ -271,6 +273,7 @@ class TrainingScan:
     seed: int | None = None
     versions: Mapping[str, str] | None = None
     names: Mapping[int, str] | None = None
+    specimens: Mapping[int, str] | None = None
 
 
 def entries_of(scan: TrainingScan, pixels_per_patch: int = 16) -> list[Entry]:
@@ -302,6 +305,7 @@ def entries_of(scan: TrainingScan, pixels_per_patch: int = 16) -> list[Entry]:
                 thickness_mm=patch.truth.thickness_mm if patch.truth else None,
                 permittivity=None if eps is None else (eps.real, -eps.imag),
                 versions=dict(scan.versions or {}),
+                specimen=(scan.specimens or {}).get(patch.patch.label),
             )
         )
     return out
@@ -320,6 +324,6 @@ def make_library(scans: Iterable[TrainingScan], note: str = "", pixels_per_patch
         raise DataError(
             "no patch of known material in these scans",
             "they have no truth.json or labels, or no patch matches them by position",
-            "give scans with truth.json, or label files",
+            "say what lies where: polysight label SCAN",
         )
     return fit_library(Library(tuple(entries), {}, note))

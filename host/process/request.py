@@ -16,10 +16,10 @@ from polysight.host.materials import (
     SIMULATED_LIBRARY,
     Box,
     Classifier,
+    Labels,
     Library,
     Segmentation,
-    is_metal,
-    patches_from_labels,
+    check_labels,
 )
 from polysight.host.polarimetry import Incidence, PlaneReference
 from polysight.shared.config import Instrument
@@ -92,7 +92,7 @@ class Options:
 
     `model` None is the one chosen for the library, "none" no naming at all. `reference` is metal scanned on its own,
     instead of metal in the scene; `bands` above 1 images so many sub-bands, for thin layers; `incidence` is one angle
-    for the image or each pixel's own. `labels` are boxes drawn by hand, in pixels, instead of patches that are found.
+    for the image or each pixel's own. `labels` are boxes drawn by hand, instead of patches that are found.
     """
 
     metal_box_mm: Box | None = None
@@ -101,17 +101,19 @@ class Options:
     reference: PlaneReference | None = None
     bands: int = 1
     incidence: Incidence = "one"
-    labels: Mapping[str, Box] | None = None
+    labels: Labels | None = None
 
     def drawn(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> DrawnBoxes:
         """The boxes drawn by hand on an image; empty without them.
 
-        `x_m`, `y_m` are the image's axes. Raises DataError when a box holds no pixel.
+        `x_m`, `y_m` are the image's axes. Raises DataError when a box holds no pixel, or nothing could be learnt of
+        boxes that a person drew.
         """
         if self.labels is None:
             return DrawnBoxes()
-        patches, names = patches_from_labels(dict(self.labels), x_m, y_m)
-        metal = next((label for label, name in names.items() if is_metal(name)), None)
+        labels = check_labels(self.labels, x_m, y_m) if self.labels.by_hand else self.labels
+        patches, names = labels.patches(x_m, y_m)
+        metal = next((label for label, name in names.items() if labels.is_metal(name)), None)
         return DrawnBoxes(patches, names, metal if self.reference is None and self.metal_box_mm is None else None)
 
     def unnamed(self, rig: Instrument) -> str:

@@ -16,9 +16,9 @@ from polysight.host.materials import (
     MaterialsResult,
     TruthPlate,
     labels_of,
+    pack_labels,
     pack_patches,
     pixel_accuracy,
-    write_labels,
 )
 from polysight.host.polarimetry import ratio
 from polysight.host.process.judge import error_budget, recording_verdict
@@ -125,7 +125,8 @@ def save_materials(
     sigma = found.p_sigma(images.valid)
     write_image(out / IMAGE, c.h, c.v, c.p, images.x_m, images.y_m, images.valid, sigma)
     write_json(out / QUALITY, numbers)
-    write_labels(out / LABELS, labels_of(found), f"patches of scan {scan.scan_id}, in pixels of image.npz")
+    boxes = labels_of(found, f"patches of scan {scan.scan_id}, in pixels of image.npz")
+    write_atomically(out / LABELS, pack_labels(boxes))
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, scan.simulated))
     content = materials_content(scan, findings, unnamed)
     write_json(out / MATERIALS, content)

@@ -33,6 +33,7 @@ from polysight.host.products.files import (
     write_scan_facts,
 )
 from polysight.host.products.folder import RAW_DROPPED, check_products_folder, making_products
+from polysight.host.products.label_files import LABELS_PICTURE, find_labels, label_place, scan_folder_of
 from polysight.host.products.material_table import (
     PermittivitySpread,
     material_columns,
@@ -47,6 +48,7 @@ __all__ = [
     "FINISHED",
     "IMAGE",
     "LABELS",
+    "LABELS_PICTURE",
     "MATERIALS",
     "QUALITY",
     "RAW_DROPPED",
@@ -56,9 +58,11 @@ __all__ = [
     "Rows",
     "SavedProducts",
     "check_products_folder",
+    "find_labels",
     "find_products",
     "full_dataset",
     "image_dataset",
+    "label_place",
     "making_products",
     "material_columns",
     "patch_dataset",
@@ -72,6 +76,7 @@ __all__ = [
     "runs",
     "rx_gains",
     "scan_facts",
+    "scan_folder_of",
     "verdict_attributes",
     "withhold",
     "write_atomically",

@@ -157,9 +157,9 @@ def patch_dataset(done: ProcessedScan) -> xarray.Dataset:
         On dimension `patch`: `name`, `confidence`, `runner_up`, `runner_up_share`, `metal_reference`, `metal_like`,
         `width` and `height` (m), `pixels`, `patch_incidence_deg`, `ratio` and `permittivity` (complex) with their
         standard errors, `permittivity_real_loss_covariance`, `dominated_by` (what most of the error comes from) and
-        `refused` (why a patch was not judged), where the truth is known `true_name` and `true_permittivity`, and with
-        sub-bands `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y` (m, rig frame). Attributes:
-        :func:`provenance`, `library`, `model`.
+        `refused` (why a patch was not judged), of boxes drawn by hand `drawn_as`, where the truth is known `true_name`
+        and `true_permittivity`, and with sub-bands `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y`
+        (m, rig frame). Attributes: :func:`provenance`, `library`, `model`.
 
     Raises
     ------
@@ -220,6 +220,8 @@ def _table(done: ProcessedScan) -> dict[str, Any]:
     rows.append((name, _numbers(c[name]), "1", "covariance of the permittivity's real part and loss"))
     rows.append(("dominated_by", _text(c["dominated_by"]), "", "what most of the permittivity's error comes from"))
     rows.append(("refused", _text(c["refused"]), "", "why the patch was not judged, and what to do"))
+    if any(c["drawn_as"]):
+        rows.append(("drawn_as", _text(c["drawn_as"]), "", "what a person called the box of the patch"))
     if any(c["true_name"]):
         truth = _complex(c["true_permittivity_real"], c["true_permittivity_loss"], -1)
         rows.append(("true_name", _text(c["true_name"]), "", "material of the simulated scene"))

@@ -16,11 +16,21 @@ from pathlib import Path
 from typing import Any
 
 from polysight.host.materials import PATCHES
-from polysight.host.products.files import FINISHED, IMAGE, LABELS, MATERIALS, QUALITY, SCAN, SavedProducts
+from polysight.host.products.files import (
+    FINISHED,
+    IMAGE,
+    LABELS,
+    MATERIALS,
+    QUALITY,
+    SCAN,
+    SavedProducts,
+    write_atomically,
+)
+from polysight.host.products.label_files import LABELS_PICTURE, kept_files
 from polysight.host.store import sync_folder
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 
-PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, "report.html", "figures")
+PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, "report.html", "figures")
 RAW_DROPPED = "raw_dropped"
 """Key of quality.json: whose raw rows were dropped, because these products are kept of them."""
 _HERE = -100  # AT_FDCWD of renameat2(2)
@@ -67,7 +77,8 @@ def check_products_folder(out: Path, scan_id: str) -> None:
 def making_products(out: Path, scan_id: str) -> Iterator[Path]:
     """A new folder to write products into, which takes the place of `out` when the block ends without an error.
 
-    Ended otherwise, `out` is as it was. Hidden files in it that are not ours are kept.
+    Ended otherwise, `out` is as it was. Hidden files in it that are not ours are kept, and boxes that a person drew
+    for this scan.
 
     Raises
     ------
@@ -94,6 +105,8 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
     keep = False
     try:
         yield new
+        for name, content in kept_files(place, scan_id).items():
+            write_atomically(new / name, content)
         try:
             _take_place(new, place, old)
         except OSError as e:

@@ -15,7 +15,7 @@ _COLUMNS = (
     "height_mm", "pixels", "incidence_deg", "permittivity_real", "permittivity_real_standard_error",
     "permittivity_loss", "permittivity_loss_standard_error", "permittivity_real_loss_covariance", "dominated_by",
     "refused", "p_real", "p_imag", "p_abs_db", "p_phase_deg", "inverse_p_standard_error", "true_name",
-    "true_permittivity_real", "true_permittivity_loss",
+    "true_permittivity_real", "true_permittivity_loss", "drawn_as",
 )  # fmt: skip
 
 
@@ -76,8 +76,8 @@ def material_columns(products: HasSegments) -> dict[str, list[Any]]:
     """Columns by name, an entry for each patch; None where a number is not known.
 
     Permittivity is `permittivity_real` - j `permittivity_loss`; `permittivity_real_loss_covariance` is of these two,
-    `dominated_by` what most of the error comes from, `refused` why a patch was not judged. p_imag and p_phase are those
-    of P = H / V relative to metal; positions count from the image's centre.
+    `dominated_by` what most of the error comes from, `refused` why a patch was not judged, `drawn_as` what its box was
+    called. p_imag and p_phase are those of P = H / V relative to metal; positions count from the image's centre.
     """
     rows = [_row(segment) for segment in products.segments]
     return {name: [row[name] for row in rows] for name in _COLUMNS}
@@ -116,6 +116,7 @@ def _row(s: dict[str, Any]) -> dict[str, Any]:
         "true_name": truth.get("name"),
         "true_permittivity_real": true.get("real"),
         "true_permittivity_loss": _minus(true.get("imag")),
+        "drawn_as": s.get("box"),
     }
 
 

@@ -9,6 +9,7 @@ from polysight.host.report.exports import export
 from polysight.host.report.figures import banner_png, draw_channel, draw_overview, figures
 from polysight.host.report.focus_figure import focus_figure
 from polysight.host.report.fonts import figure_label, font_families
+from polysight.host.report.label_figure import label_figure
 from polysight.host.report.report import write_report
 from polysight.host.report.style import PALETTE, extent_mm, png
 from polysight.host.report.sync_report import QUANTITIES, SyncReport, write_sync_report
@@ -33,6 +34,7 @@ __all__ = [
     "figures",
     "focus_figure",
     "font_families",
+    "label_figure",
     "manifest_sentence",
     "png",
     "recorded_sentence",

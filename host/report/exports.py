@@ -54,7 +54,7 @@ _PLANES = {
     "p_sigma": "standard deviation of p: root of the mean variance of its real and imaginary part",
     "valid": "whether the scan illuminates the pixel",
 }
-_TEXT = ("name", "true_name", "dominated_by", "refused")
+_TEXT = ("name", "true_name", "dominated_by", "refused", "drawn_as")
 _UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
 
 

@@ -134,6 +134,7 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
         "size": f"{x1 - x0:.0f} × {y1 - y0:.0f}",
         "colour": patch_colour(r, colours),
         "metal_reference": is_metal and bool(r.get("name")),
+        "drawn_as": str(r.get("box") or ""),
         "refused": r.get("refused") or {},
         "why_refused": refused_text(r),
         "truth": str(truth["name"]) if truth else "",

@@ -145,7 +145,7 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
             "care",
             f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {what}",
             "what is said of a patch holds for one flat plate",
-            "move the plates apart, or draw their boxes (--labels)",
+            "move the plates apart, or draw their boxes (polysight label; process --labels)",
             2.0,
         )
         for what, labels in by_reason.items()

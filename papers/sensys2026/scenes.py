@@ -14,7 +14,7 @@ import numpy.typing as npt
 import tomli_w
 
 from polysight.host.jobs.demo import run_simulator
-from polysight.host.jobs.process import EDGE_MM
+from polysight.host.jobs.train import EDGE_MM
 from polysight.host.materials import (
     TRUTH,
     KnownScene,

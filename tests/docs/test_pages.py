@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 
+import numpy as np
+
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
-from polysight.host.materials.truth import truth_plates
+from polysight.host.materials import check_labels, read_labels
 from polysight.host.radar.usb import PRODUCT, VENDOR
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import EXPLANATIONS, PiFault
@@ -61,9 +62,10 @@ def test_what_the_installation_writes_is_what_the_programs_want():
     assert rig["pi"]["key_dir"] in text
 
 
-def test_the_hand_written_truth_is_understood():
-    (block,) = [b for b in read_page(ROOT / "docs/how-to/add-a-material.md").blocks if b.language == "json"]
-    metal, material = truth_plates(json.loads(block.text))
-    assert (metal.metal, material.metal) == (True, False)
-    assert material.permittivity == 3.1 - 0.05j
-    assert metal.centre_mm == (-60.0, 0.0)
+def test_the_label_file_that_is_shown_can_be_learnt_from(tmp_path):
+    (block,) = [b for b in read_page(ROOT / "docs/spec/labels.md").blocks if b.language == "json"]
+    (tmp_path / "labels.json").write_text(block.text, encoding="utf-8")
+    axis_m = np.linspace(-0.1, 0.1, 101)
+    found = check_labels(read_labels(tmp_path / "labels.json"), axis_m, axis_m)
+    assert [found.specimen(name) for name in found.boxes] == [None, "board 7", "2"]
+    assert (found.metal, found.by_hand) == ("copper", True)

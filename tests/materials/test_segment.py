@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import (
+    Labels,
     SegmentSettings,
     find_metal,
     metal_by_label,
     metal_in_box,
+    pack_labels,
     patches_from_labels,
     read_labels,
     segment,
     truth_labels,
-    write_labels,
 )
 from polysight.host.materials.segment import box_mask
 from polysight.host.materials.truth import match_truth
@@ -163,8 +164,8 @@ def test_metal_by_box_and_label(synthetic):
 def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
     scene = synthetic(0)
     boxes = {"acrylic": (10.0, 20.0, 30.0, 35.0), "copper": (60.0, 60.0, 80.0, 82.0)}
-    write_labels(tmp_path / "l.json", boxes, "by hand")
-    assert read_labels(tmp_path / "l.json") == boxes
+    (tmp_path / "l.json").write_bytes(pack_labels(Labels(boxes)))
+    assert read_labels(tmp_path / "l.json").boxes == boxes
     found, names = patches_from_labels(boxes, scene.x_m, scene.y_m)
     assert names == {1: "acrylic", 2: "copper"}
     assert found.patches[0].pixels == 20 * 15

@@ -3,7 +3,7 @@
 import numpy as np
 
 from polysight.host.materials.analyse import ImagePair, KnownScene, MetalChoice, Optics, analyse, smooth_inside
-from polysight.host.materials.patch_files import patches_from_labels, patches_from_plates
+from polysight.host.materials.labels import patches_from_labels, patches_from_plates
 from polysight.host.materials.truth import TruthPlate
 from polysight.host.polarimetry import fresnel
 

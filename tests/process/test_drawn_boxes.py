@@ -7,8 +7,8 @@ import pytest
 
 from polysight.host.materials import Classifier, Library
 from polysight.host.materials.analyse import KnownScene, MetalChoice
+from polysight.host.materials.labels import labels_of, pack_labels, read_labels
 from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.materials.patch_files import labels_of, read_labels, write_labels
 from polysight.host.process.request import Options
 
 pytestmark = pytest.mark.xdist_group("host_sim")
@@ -31,9 +31,9 @@ def again(scan, path, plates=()):
 
 def test_labels_of_products_given_back_find_the_same_materials(imaged, found, tmp_path):
     scan = imaged("nine-materials")
-    write_labels(tmp_path / "labels.json", labels_of(found))
+    (tmp_path / "labels.json").write_bytes(pack_labels(labels_of(found)))
     boxes = read_labels(tmp_path / "labels.json")
-    assert len(boxes) == len(found.patches) == 9
+    assert len(boxes.boxes) == len(found.patches) == 9
     second, names = again(scan, tmp_path / "labels.json", scan.plates)
     assert names[second.metal.label] == "metal"
     assert [p.truth.name for p in second.patches] == [p.truth.name for p in found.patches]

@@ -23,7 +23,7 @@ PATCH = {
 METAL = {
     "label": 5, "name": None, "confidence": None, "metal_reference": True, "metal_like": False,
     "box_mm": [-8.0, 2.0, -4.0, 4.0], "outline_mm": [], "pixels": 9, "interior_pixels": 7, "incidence_deg": 55.0,
-    "ratio": None, "inverse_ratio_std": None, "permittivity": None, "truth": None,
+    "ratio": None, "inverse_ratio_std": None, "permittivity": None, "truth": None, "box": "copper foil",
     "refused": {"what": "noise", "why": "nothing reflects", "do": "look at the image"},
 }  # fmt: skip
 EXPECTED = {
@@ -53,6 +53,7 @@ EXPECTED = {
     "true_name": ["vinyl", None],
     "true_permittivity_real": [3.75, None],
     "true_permittivity_loss": [0.5, None],
+    "drawn_as": [None, "copper foil"],
 }
 
 

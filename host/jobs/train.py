@@ -1,0 +1,285 @@
+"""`polysight train`: a reference library from scans whose materials are known.
+
+What lies where is told by a person (`labels.json` of `polysight label`), or by the truth of a simulated scan. Labels
+win. Rows are processed as `polysight process` does; where they are gone, the saved images serve.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from polysight.host.jobs.demo import check_scenes, run_simulator
+from polysight.host.jobs.process import all_rows
+from polysight.host.materials import (
+    TRUTH,
+    ImagePair,
+    KnownScene,
+    Labels,
+    Library,
+    MaterialsResult,
+    MetalChoice,
+    Optics,
+    TrainingScan,
+    analyse,
+    check_labels,
+    drew_specimens,
+    make_library,
+    material_of,
+    patches_from_plates,
+    read_truth,
+)
+from polysight.host.polarimetry import incidence_choice
+from polysight.host.process import Options
+from polysight.host.products import (
+    IMAGE,
+    LABELS,
+    RAW_DROPPED,
+    SCAN,
+    SavedProducts,
+    find_labels,
+    find_products,
+    read_products,
+    scan_folder_of,
+)
+from polysight.host.store import open_source, versions
+from polysight.shared.config import Instrument
+from polysight.shared.errors import ConfigError, DataError, ScanError
+from polysight.shared.tables import decode
+
+EDGE_MM = 9.0
+"""Rim of a known plate that is not used for training: about the resolution in x."""
+
+
+def training_scan(data: Path, config: Path) -> TrainingScan:
+    """A scan for the library, with the names that a person or the truth gives its patches.
+
+    Parameters
+    ----------
+    data
+        A scan folder of any layout, or a folder of products.
+    config
+        Rig file for layouts that bring none.
+
+    Raises
+    ------
+    DataError
+        when nothing says what lies where, no metal is told, or the labels cannot be used.
+    NoResult
+        when the verdict on a labelled scan is that it shows nothing.
+    """
+    scan = scan_folder_of(data) or data
+    check_told(data)
+    if (there := find_labels(data)) is not None:
+        path, labels = there
+        try:
+            saved = _saved_alone(data, scan)
+            return _from_images(saved, labels) if saved is not None else _from_rows(scan, config, labels)
+        except DataError as e:
+            raise DataError(f"{path}: {e.what}" if str(path) not in e.what else e.what, e.why, e.remedy) from None
+    return _from_truth(scan, config)
+
+
+def check_told(data: Path) -> None:
+    """Refuse a scan whose materials are not told, or whose boxes cannot be used, before any row is read.
+
+    Raises
+    ------
+    DataError
+        as :func:`training_scan` does, as far as the saved image tells.
+    """
+    scan = scan_folder_of(data) or data
+    if not data.is_dir():
+        raise DataError(f"{data}: no such folder", "the path is wrong", "give scan folders, or folders of products")
+    if (there := find_labels(data)) is None:
+        if (scan / TRUTH).exists():
+            return
+        raise DataError(
+            f"{data}: neither {LABELS} nor {TRUTH} is in it",
+            "what lies where in this scan is not told",
+            f"polysight label {data}; then train again",
+        )
+    if (saved := find_products(data)) is not None:
+        path, labels = there
+        try:
+            check_labels(labels, saved.x_m, saved.y_m)
+        except DataError as e:
+            raise DataError(f"{path}: {e.what}", e.why, e.remedy) from None
+
+
+def _saved_alone(data: Path, scan: Path) -> SavedProducts | None:
+    """The products, where the rows they were made from are not there; None where they are. Raises DataError."""
+    if scan_folder_of(data) is None:
+        return read_products(data)
+    if (scan / "products" / IMAGE).exists():
+        saved = SavedProducts(scan / "products")
+        return saved if saved.quality.get(RAW_DROPPED) else None
+    return None
+
+
+def _from_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
+    """A labelled scan, imaged again from its rows as `polysight process --labels` does it."""
+    source = open_source(data, config)
+    pipeline = all_rows(source, data)
+    images = pipeline.form_images()
+    checked = check_labels(labels, images.x_m, images.y_m, images.valid)
+    options = Options(labels=checked, model="none")
+    if checked.metal is None and pipeline.metal_plane(options) is None:
+        raise _no_metal(data)
+    findings = pipeline.examine(images, options)
+    if not findings.verdict.usable:
+        raise findings.verdict.error("no library was written")
+    return _labelled(source.scan_id, findings.found, source.simulated, checked)
+
+
+def _from_images(saved: SavedProducts, labels: Labels) -> TrainingScan:
+    """A labelled scan of which the images alone are there."""
+    if saved.verdict is not None and not saved.verdict.usable:
+        raise saved.verdict.error("no library was written")
+    checked = check_labels(labels, saved.x_m, saved.y_m, saved.valid)
+    segmentation, names = checked.patches(saved.x_m, saved.y_m)
+    metal = next((label for label, name in names.items() if name == checked.metal), None)
+    if metal is None:
+        raise _no_metal(saved.folder)
+    pair = ImagePair(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
+    found = analyse(pair, _optics_of(saved), MetalChoice(label=metal), KnownScene(segmentation))
+    return _labelled(saved.scan_id, found, saved.simulated is not False, checked)
+
+
+def _optics_of(saved: SavedProducts) -> Optics:
+    """Angle and leakage of saved images; leakage that the products say is removed is none any more."""
+    path = saved.folder / SCAN
+    if "instrument" not in saved.scan:
+        raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
+    rig = decode(saved.scan["instrument"], Instrument, f"{path}: instrument")
+    optics = Optics.of(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
+    budget = saved.materials.get("error_budget") or {}
+    if not budget:
+        return optics
+    angle, leakage = budget["incidence"], budget["leakage"]
+    return replace(
+        optics,
+        theta_rad=float(np.radians(angle["deg"])),
+        theta_std_rad=float(np.radians(angle["std_deg"])),
+        leakage=(0j, 0j),
+        leakage_std=float(np.max(leakage["std"])),
+        leakage_measured=True,
+    )
+
+
+def _labelled(scan: str, found: MaterialsResult, simulated: bool, labels: Labels) -> TrainingScan:
+    """Names and specimens of the patches, in the order of the boxes."""
+    boxes = dict(enumerate(labels.boxes, 1))
+    for patch in found.patches:
+        if patch.patch.label in boxes and not (patch.patch.interior & (found.p != 0)).any():
+            sys.stderr.write(f"note: {scan}: the box of {boxes[patch.patch.label]} holds no pixel that can be used\n")
+    names = {label: material_of(box) for label, box in boxes.items()}
+    specimens = {label: piece for label, box in boxes.items() if (piece := labels.specimen(box)) is not None}
+    return TrainingScan(scan, found, simulated, versions=versions(), names=names, specimens=specimens)
+
+
+def _from_truth(data: Path, config: Path) -> TrainingScan:
+    """A simulated scan whose plates are known."""
+    source = open_source(data, config)
+    plates = read_truth(data / TRUTH)
+    metal = next((t for t in plates if t.metal), None)
+    if metal is None:
+        raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
+    pipeline = all_rows(source, data)
+    images = pipeline.form_images()
+    known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
+    found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
+    drawn = drew_specimens(data / TRUTH)
+    specimens = {n: f"{source.scan_id}/{n}" for n in names} if drawn else {}
+    return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names, specimens=specimens)
+
+
+def _no_metal(folder: Path) -> DataError:
+    return DataError(
+        f"{folder}: no box is metal",
+        "all that is learnt of a material is relative to metal",
+        f"polysight label {folder} --metal NAME, or measure the rig with `polysight calibrate metal`",
+    )
+
+
+def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path) -> int:
+    """Make a library from labelled scans, from scans with known plates, or from scenes that are simulated first.
+
+    Raises
+    ------
+    PolysightError
+        when a file is wrong, found out before anything is simulated; or a scan cannot be learnt from.
+    """
+    data, files = list(data), [] if scenes is None else sorted(scenes.glob("*.toml"))
+    if not data and scenes is None:
+        raise ConfigError(
+            "no scans to learn from",
+            "neither DATA nor --simulate was given",
+            "polysight train SCAN... --out FILE; polysight label SCAN says what lies where",
+        )
+    if scenes is not None and not files:
+        raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
+    if not out.parent.is_dir():
+        raise ConfigError(f"{out}: no such folder {out.parent}", "the library would be lost", "make it first")
+    for folder in data:
+        check_told(folder)
+    if files:
+        check_scenes(files, config)
+    scans = [training_scan(folder, config) for folder in data]
+    if files:
+        with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
+            for file in files:
+                folder = Path(temporary) / file.stem
+                if run_simulator(["simulate", str(file), "--config", str(config), "--out", str(folder)]):
+                    raise ScanError(f"{file}: simulation failed, see above")
+                scans.append(training_scan(folder, config))
+    note = "simulated scans of " + ", ".join(s.scan for s in scans) if all(s.simulated for s in scans) else ""
+    library = make_library(told_apart(scans), note)
+    library.save(out)
+    sys.stdout.write("".join(f"{line}\n" for line in _summary(out, library)))
+    sys.stdout.write(f"{json.dumps(library.fit, indent=1)}\n")
+    return 0
+
+
+def told_apart(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
+    """The scans, each with a name of its own: those of one scene are called alike.
+
+    Raises
+    ------
+    DataError
+        when two are the same scan: it would be judged on what it taught.
+    """
+    out: list[TrainingScan] = []
+    for scan in scans:
+        alike = [s for s in scans[: len(out)] if s.scan == scan.scan]
+        if any(np.array_equal(s.result.h, scan.result.h, equal_nan=True) for s in alike):
+            raise DataError(
+                f"scan {scan.scan} is given twice",
+                "it would be judged on what it taught",
+                "leave one out (a scan folder and its products are one scan)",
+            )
+        out.append(replace(scan, scan=f"{scan.scan} ({len(alike) + 1})") if alike else scan)
+    return out
+
+
+def _summary(out: Path, library: Library) -> list[str]:
+    """What a library holds, by material; names that differ in nothing but small and capital letters are pointed out."""
+    lines = [f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"]
+    for name in library.names:
+        mine = [e for e in library.entries if e.name == name]
+        pieces = len({e.specimen for e in mine if e.specimen is not None})
+        told = f", {pieces} pieces told apart" if pieces > 1 else ""
+        scans = len({e.scan for e in mine})
+        patches = "1 patch" if len(mine) == 1 else f"{len(mine)} patches"
+        lines.append(f"  {name}: {patches} in {scans} scan{'s' * (scans > 1)}{told}")
+    for one, other in combinations(library.names, 2):
+        if one.casefold() == other.casefold():
+            lines.append(f"note: {one} and {other} are two materials here; if they are one: polysight label --rename")
+    return lines

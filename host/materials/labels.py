@@ -1,0 +1,228 @@
+"""Label files (`labels.json`): boxes with names, which of them is metal, and which specimen each is.
+
+`polysight label` writes what a person drew, in millimetres; `polysight process` writes a box inside each patch that it
+found, in pixels, named by the classifier. Both are read here, and so are the published data set's files.
+`Labels.patches` makes patches of them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.host.materials.result import MaterialsResult
+from polysight.host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
+from polysight.host.materials.truth import TruthPlate
+from polysight.shared.errors import DataError
+
+METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")
+SPECIMEN = "#"
+"""Separates a box's material from its specimen: `oak#2` is a second piece of oak."""
+
+
+def is_metal(name: str) -> bool:
+    """Whether a material's name is that of a metal."""
+    return any(word in METALS for word in re.findall(r"[a-z]+", name.lower()))
+
+
+def material_of(name: str) -> str:
+    """The material of a box called material or material#specimen."""
+    return name.partition(SPECIMEN)[0]
+
+
+def format_box(box: Box) -> str:
+    """A box in words: `x -22.5 to 22.5, y 0.0 to 45.0 mm`."""
+    x0, y0, x1, y1 = (b + 0.0 for b in box)
+    return f"x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f} mm"
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Boxes with names.
+
+    Attributes
+    ----------
+    boxes
+        Name to (x0, y0, x1, y1): millimetres from the image centre, or pixel indices (end left out).
+    unit
+        Which of both.
+    metal
+        Name of the box that is the metal reference; None: the first whose name is that of a metal.
+    specimens
+        Name of a box to the physical piece that lies there, for those that are told.
+    by_hand
+        Whether a person drew and named them; boxes of `polysight process` have the classifier's names.
+    description
+        Free text.
+    """
+
+    boxes: Mapping[str, Box]
+    unit: Literal["mm", "pixel"] = "pixel"
+    metal: str | None = None
+    specimens: Mapping[str, str] = field(default_factory=dict)
+    by_hand: bool = False
+    description: str = ""
+
+    def is_metal(self, name: str) -> bool:
+        """Whether this box is the metal reference, or may be where the file does not tell."""
+        return name == self.metal if self.metal is not None else is_metal(material_of(name))
+
+    def specimen(self, name: str) -> str | None:
+        """Which piece lies in a box: as told, or what follows `#` in its name; None where nothing says."""
+        return self.specimens.get(name) or name.partition(SPECIMEN)[2] or None
+
+    def in_mm(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Labels:
+        """The same with boxes in millimetres from the centre of an image with these axes."""
+        if self.unit == "mm":
+            return self
+        x, y = axis_mm(x_m), axis_mm(y_m)
+        dx, dy = float(x[1] - x[0]), float(y[1] - y[0])
+
+        def converted(box: Box) -> Box:
+            x0, x1 = (float(x[0]) + (at - 0.5) * dx for at in (box[0], box[2]))
+            y0, y1 = (float(y[0]) + (at - 0.5) * dy for at in (box[1], box[3]))
+            return x0, y0, x1, y1
+
+        return replace(self, boxes={n: converted(b) for n, b in self.boxes.items()}, unit="mm")
+
+    def patches(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[Segmentation, dict[int, str]]:
+        """Patches of the boxes, and the box name of each; see :func:`patches_from_labels`."""
+        return patches_from_labels(dict(self.boxes), x_m, y_m, unit=self.unit)
+
+
+def read_labels(path: Path) -> Labels:
+    """Read a label file. Names and boxes are as they stand there: :func:`check_labels` judges them.
+
+    Raises
+    ------
+    DataError
+        when the file is absent, not JSON, an entry is not four numbers, or a key has another form.
+    """
+    remedy = "correct it, or draw the boxes again: polysight label SCAN"
+    try:
+        raw: Any = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such label file", "the path is wrong", "polysight label SCAN makes one") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as e:
+        raise DataError(f"{path}: not a label file: {e}", "a label file is JSON with a key `labels`", remedy) from None
+    boxes = raw.get("labels") if isinstance(raw, dict) else None
+    if not isinstance(boxes, dict):
+        raise DataError(f"{path}: has no `labels`", "expected {name: [x0, y0, x1, y1]} under that key", remedy)
+    out: dict[str, Box] = {}
+    for name, box in boxes.items():
+        if not (isinstance(box, list) and len(box) == 4 and all(_is_number(b) for b in box)):
+            raise DataError(f"{path}: labels.{name} = {box!r}", "expected four numbers [x0, y0, x1, y1]", remedy)
+        out[str(name)] = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
+    unit, metal, specimens = raw.get("unit", "pixel"), raw.get("metal"), raw.get("specimens") or {}
+    if unit not in ("mm", "pixel"):
+        raise DataError(f"{path}: unit = {unit!r}", 'expected "mm" or "pixel"', remedy)
+    if not (metal is None or (isinstance(metal, str) and metal in out)):
+        raise DataError(f"{path}: metal = {metal!r}", f"expected the name of a box: {', '.join(out)}", remedy)
+    if not (isinstance(specimens, dict) and all(n in out and isinstance(s, str) for n, s in specimens.items())):
+        raise DataError(f"{path}: specimens = {specimens!r}", "expected {name of a box: which piece it is}", remedy)
+    by_hand, text = raw.get("by_hand") is True, raw.get("description")
+    return Labels(out, unit, metal, specimens, by_hand, text if isinstance(text, str) else "")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def pack_labels(labels: Labels) -> bytes:
+    """Content of a label file that :func:`read_labels` reads back."""
+    content: dict[str, Any] = {
+        "description": labels.description,
+        "unit": labels.unit,
+        "by_hand": labels.by_hand,
+        "labels": {n: [round(b, 3) for b in box] for n, box in labels.boxes.items()},
+        "metal": labels.metal,
+        "specimens": dict(labels.specimens),
+    }
+    return (json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+
+
+def labels_of(found: MaterialsResult, description: str = "") -> Labels:
+    """Boxes around the insides of a result's patches, in pixels, called what each was drawn or named; all differ."""
+    out: dict[str, Box] = {}
+    for r in found.patches:
+        named = r.verdict.name if r.verdict is not None else None
+        name = found.boxes.get(r.patch.label) or ("metal" if r.patch.label == found.metal.label else named or "patch")
+        inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
+        rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+        key = name if name not in out else f"{name} ({r.patch.label})"
+        out[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
+    return Labels(out, description=description)
+
+
+def patches_from_plates(
+    plates: Sequence[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float
+) -> tuple[Segmentation, dict[int, str]]:
+    """Patches where plates are known to be, and the name of each label; several plates may have the same name.
+
+    Parameters as of :func:`patches_from_labels`. Raises DataError when a plate holds no pixel.
+    """
+    boxes = {f"{plate.name} ({n})": plate.box_mm for n, plate in enumerate(plates, 1)}
+    found, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
+    return found, {n: plate.name for n, plate in enumerate(plates, 1)}
+
+
+def patches_from_labels(
+    boxes: dict[str, Box],
+    x_m: npt.ArrayLike,
+    y_m: npt.ArrayLike,
+    unit: Literal["pixel", "mm"] = "pixel",
+    flip_y: bool = False,
+    margin_mm: float = 0.0,
+) -> tuple[Segmentation, dict[int, str]]:
+    """Patches from boxes drawn by hand.
+
+    Parameters
+    ----------
+    boxes
+        Name to (x0, y0, x1, y1): pixel indices (end left out), or millimetres from the image centre.
+    x_m, y_m
+        Pixel centres in metres.
+    unit
+        Unit of the boxes.
+    flip_y
+        Pixel rows count from the top (largest y).
+    margin_mm
+        Kept free inside the box; hand-drawn boxes usually lie inside the material already.
+
+    Returns
+    -------
+    segmentation, names
+        and the name of each label.
+
+    Raises
+    ------
+    DataError
+        when a box holds no pixel.
+    """
+    x, y = axis_mm(x_m), axis_mm(y_m)
+    labels = np.zeros((y.size, x.size), np.int32)
+    patches: list[Patch] = []
+    names: dict[int, str] = {}
+    for name, box in boxes.items():
+        if unit == "mm":
+            mask = box_mask(box, x_m, y_m)
+        else:
+            x0, y0, x1, y1 = (round(b) for b in box)
+            if flip_y:
+                y0, y1 = y.size - y1, y.size - y0
+            mask = np.zeros(labels.shape, bool)
+            mask[max(y0, 0) : max(y1, 0), max(x0, 0) : max(x1, 0)] = True
+        if not mask.any():
+            raise DataError(f"label {name}: box {box} holds no pixel", f"the image has {x.size} x {y.size} pixels")
+        n = len(patches) + 1
+        patches.append(make_patch(n, mask, x_m, y_m, margin_mm))
+        labels[mask] = n
+        names[n] = name
+    return Segmentation(labels, tuple(patches), float("nan")), names

@@ -1,0 +1,160 @@
+"""`polysight label`: boxes from options and from answers, what is written, and what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.host.jobs.label import Edits, label
+from polysight.host.materials import read_labels
+from polysight.host.products import find_labels, making_products, write_json
+from tests.support.products import judged_products
+
+NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
+
+
+@pytest.fixture
+def products(tmp_path):
+    """Products of a scan with three patches: the metal reference, one named PET, one not judged."""
+    return judged_products(tmp_path / "out", "good")
+
+
+def boxes(folder):
+    return read_labels(folder / "labels.json")
+
+
+def answering(*answers):
+    """Answers to questions, and the questions that were asked."""
+    left, questions = list(answers), []
+
+    def ask(question):
+        questions.append(question)
+        if not left:
+            raise EOFError
+        return left.pop(0)
+
+    return ask, questions
+
+
+def test_patches_get_names_by_their_numbers(products, capsys):
+    assert main(["label", str(products), *NAMED]) == 0
+    told = capsys.readouterr().out
+    found = boxes(products)
+    assert list(found.boxes) == ["copper", "\u6a61\u6728"]
+    assert (found.unit, found.metal, found.by_hand) == ("mm", "copper", True)
+    assert found.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))  # 9 mm inside the patch
+    assert "left out, without a name: 3" in told
+    assert "\u6a61\u6728" in told
+    assert (products / "labels.png").read_bytes().startswith(b"\x89PNG")
+    assert find_labels(products)[1] == found
+
+
+def test_boxes_are_drawn_moved_renamed_and_removed(products):
+    where = str(products)
+    assert main(["label", where, "--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet"]) == 0
+    assert main(["label", where, "--rename", "sheet=tin plate", "--specimen", "oak=board 7"]) == 0
+    assert main(["label", where, "--box", "oak#left=20,0,30,10"]) == 0
+    found = boxes(products)
+    assert list(found.boxes) == ["tin plate", "oak", "oak#left"]
+    assert found.metal == "tin plate"
+    assert [found.specimen(n) for n in found.boxes] == [None, "board 7", "left"]
+    assert main(["label", where, "--remove", "oak", "--box", "oak=0,-20,10,-5"]) == 0
+    assert boxes(products).boxes["oak"] == (0, -20, 10, -5)
+    assert boxes(products).specimen("oak") is None
+
+
+def test_a_patch_told_to_be_metal_is_called_so(products):
+    assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "2=oak"]) == 0
+    assert (list(boxes(products).boxes), boxes(products).metal) == (["metal", "oak"], "metal")
+    assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "1=x", "--rename", "2=oak"]) == 0
+    assert boxes(products).metal == "x"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--box", "oak=0,0,100,10"], "outside the image"),
+        (["--box", "oak=0,0,10,10", "--box", "glass=5,5,15,15"], "overlap by 5.0 x 5.0 mm"),
+        (["--box", "oak=nan,0,10,10"], "holds nothing"),
+        (["--box", "oak=0,0,10,10", "--box", "oak=20,0,30,10"], "the name oak is there twice"),
+        (["--from-patches", "--rename", "1=oak", "--rename", "2=oak"], "the name oak is there twice"),
+        (["--box", "oak=0,0,10,10", "--box", "glass=20,0,30,10"], "the metal reference is not told"),
+        (["--box", "oak=0,0,10,10", "--metal", "copper"], "no box is called copper"),
+        (["--rename", "1=oak"], "no box is called 1"),
+        (["--remove", "oak"], "no box is called oak"),
+        (["--box", "a\nb=0,0,10,10"], "control characters"),
+        (["--from-patches"], "no box is left"),
+        (["--box", "oak=0,0,10,10", "--list"], "--list with other options"),
+    ],
+)
+def test_what_nothing_could_be_learnt_from_is_refused_and_nothing_is_written(products, capsys, words, said):
+    assert main(["label", str(products), *words]) in (2, 3)
+    told = capsys.readouterr().err
+    assert said in told
+    assert "\n  why: " in told
+    assert "\n  do: " in told
+    assert not (products / "labels.json").exists()
+
+
+def test_a_folder_without_an_image_is_to_be_processed_first(tmp_path, capsys):
+    assert main(["label", str(tmp_path), "--list"]) == 3
+    assert f"polysight process {tmp_path}" in capsys.readouterr().err
+
+
+def test_a_person_is_asked_for_each_patch(products, capsys):
+    ask, questions = answering("m", "PET", "pet", "PET", "2")
+    assert label(products, Edits(), ask=ask) == 0
+    assert list(boxes(products).boxes) == ["metal", "PET", "PET#2"]
+    assert boxes(products).metal == "metal"
+    assert "named PET 80 %" in questions[1]
+    assert "is there twice" in capsys.readouterr().out  # pet beside PET
+    before = (products / "labels.json").read_bytes()
+    ask, questions = answering("no")
+    assert main_error(products, ask) == "nothing was changed"
+    ask, questions = answering("yes", "copper")
+    assert "the answers ended" in main_error(products, ask)
+    assert (products / "labels.json").read_bytes() == before
+
+
+def main_error(products, ask):
+    from polysight.shared.errors import PolysightError
+
+    with pytest.raises(PolysightError) as e:
+        label(products, Edits(), ask=ask)
+    return e.value.what
+
+
+def test_without_a_terminal_patches_are_listed(products, capsys):
+    assert main(["label", str(products)]) == 0  # pytest's stdin is no terminal
+    told = capsys.readouterr().out
+    assert "x -41.0 to -29.0, y -11.0 to 11.0 mm  the metal reference" in told
+    assert "--from-patches" in told
+    assert not (products / "labels.json").exists()
+
+
+def test_labels_of_a_scan_folder_lie_beside_its_rows(tmp_path):
+    scan = tmp_path / "scan"
+    judged_products(scan / "products", "good")
+    (scan / "manifest.jsonl").write_text("")
+    for given in (scan, scan / "products"):
+        assert main(["label", str(given), *NAMED]) == 0
+        assert find_labels(given)[0].resolve() == (scan / "labels.json").resolve()
+    assert not (scan / "products" / "labels.json").exists()
+
+
+@pytest.mark.parametrize(("scan_id", "kept"), [("one", True), ("another", False)])
+def test_boxes_by_hand_outlive_products_of_the_same_scan_alone(products, scan_id, kept):
+    write_json(products / "scan.json", {"scan_id": "one", "simulated": True})
+    assert main(["label", str(products), *NAMED]) == 0
+    drawn = boxes(products)
+    with making_products(products, scan_id) as new:
+        (new / "labels.json").write_text(json.dumps({"labels": {"patch": [0, 0, 3, 3]}}))
+    assert (boxes(products) == drawn) == kept
+    assert (products / "labels.png").exists() == kept
+
+
+def test_the_classifiers_names_are_no_labels(products):
+    (products / "labels.json").write_text(json.dumps({"labels": {"metal": [0, 0, 3, 3]}}))
+    assert find_labels(products) is None

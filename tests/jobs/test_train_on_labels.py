@@ -1,0 +1,109 @@
+"""A user's own material, end to end: scans without a truth are labelled, taught, and the name comes back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.host.jobs.train import training_scan
+from polysight.host.materials import Library, entries_of
+from polysight.shared.errors import DataError
+from polysight.simulators.scene import decode_scene, simulate
+from tests.support.paths import RIG_FILE
+from tests.support.rigs import published_rig
+from tests.support.scenes import scene_of
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("labelled")]
+MINE = "h\u00e4rtes \u6a61\u6728"
+PLACES = (-40.0, 10.0), (40.0, -10.0)
+BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")  # 5 mm inside the plates
+
+
+def scene(seed: int) -> dict[str, Any]:
+    copper = {"name": "copper", "centre_mm": PLACES[0], "size_mm": [50.0, 50.0], "metal": True}
+    board = {"name": "board", "centre_mm": PLACES[1], "size_mm": [50.0, 50.0], "permittivity": [3.2, 0.4]}
+    return scene_of(copper, board, columns=15, rows=17, seed=seed, disturbances={"leakage_measured": 0.003})
+
+
+@pytest.fixture(scope="session")
+def scans(tmp_path_factory) -> list[Path]:
+    """Three scans of copper and a board, without truth.json: what a real rig would leave. All are called alike."""
+    folder = tmp_path_factory.mktemp("own")
+    made = [simulate(published_rig(), decode_scene(scene(s), "test"), folder / f"s{s}") for s in (1, 2, 3)]
+    for scan in made:
+        (scan / "truth.json").unlink()
+    return made
+
+
+def drawn() -> list[str]:
+    return [word for box in BOXES for word in ("--box", box)]
+
+
+def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path, capsys):
+    (first, second, third), elsewhere, out = scans, tmp_path / "second", tmp_path / "out"
+    library = tmp_path / "own.npz"
+    assert main(["train", str(first), str(second), "--out", str(library)]) == 3
+    assert f"do: polysight label {first}" in capsys.readouterr().err
+    for scan, images in ((first, first / "products"), (second, elsewhere)):
+        assert main(["image", str(scan), "--out", str(images)]) == 0
+    for folder in (first, elsewhere):  # a scan folder, and products without their rows
+        assert main(["label", str(folder), *drawn(), "--specimen", f"{MINE}=board 7"]) == 0
+    assert main(["train", str(first), str(elsewhere), "--out", str(library)]) == 0
+    assert f"  {MINE}: 2 patches in 2 scans" in capsys.readouterr().out
+    known = Library.load(library)
+    assert known.names == ("copper", MINE)
+    assert known.scans == ("small", "small (2)")
+    assert {e.specimen for e in known.entries if e.name == MINE} == {"board 7"}
+    assert {e.specimen for e in known.entries if e.name == "copper"} == {None}
+    assert known.simulated  # without a truth it is simulated all the same, and says so
+    assert main(["train", str(first), str(first / "products"), "--out", str(library)]) == 3
+    assert "is given twice" in capsys.readouterr().err
+
+    assert main(["process", str(third), "--out", str(out), "--library", str(library)]) == 0
+    segments = json.loads((out / "materials.json").read_text(encoding="utf-8"))["segments"]
+    mine = [s for s in segments if s["name"] == MINE]
+    assert [np.hypot(*np.subtract(np.reshape(s["box_mm"], (2, 2)).mean(0), PLACES[1])) < 10 for s in mine] == [True]
+    assert {s["name"] for s in segments} <= {MINE, "unknown", None}
+    assert MINE in (out / "report.html").read_text(encoding="utf-8")
+    capsys.readouterr()
+    assert main(["materials", str(out)]) == 0
+    assert MINE in capsys.readouterr().out
+    assert main(["export", str(out), "--csv", "--out", str(tmp_path / "csv")]) == 0
+    assert MINE in (tmp_path / "csv" / "materials.csv").read_text(encoding="utf-8")
+
+
+def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
+    scan, out = scans[2], tmp_path / "out"
+    labels = tmp_path / "labels.json"
+    boxes = {"reference": [-60, -10, -20, 30], MINE: [20, -30, 60, 10]}
+    labels.write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "reference"}), encoding="utf-8")
+    assert main(["process", str(scan), "--out", str(out), "--labels", str(labels)]) == 0
+    assert f"drawn as {MINE}" in (out / "report.html").read_text(encoding="utf-8")
+    assert main(["label", str(out), *drawn()]) == 0
+    (scan / "labels.json").write_bytes((out / "labels.json").read_bytes())
+    rows, images = (entries_of(training_scan(folder, RIG_FILE)) for folder in (scan, out))
+    assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
+    for one, other in zip(rows, images, strict=True):
+        assert one.incidence_deg == pytest.approx(other.incidence_deg, abs=0.05)
+        assert np.median(one.h) == pytest.approx(np.median(other.h), rel=0.02)
+        assert abs(np.median(one.p) / np.median(other.p) - 1) < 0.02
+
+
+def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
+    spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
+    scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
+    told = [(e.name, e.specimen, e.permittivity is None) for e in entries_of(training_scan(scan, RIG_FILE))]
+    assert told == [("copper", "small/1", True), ("board", "small/2", False)]
+    boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
+    (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
+    told = [(e.name, e.specimen) for e in entries_of(training_scan(scan, RIG_FILE))]
+    assert told == [("tin", None), (MINE, "left")]
+    boxes = {"tin": [-60, -10, 30, 30], MINE: [20, -30, 60, 10]}
+    (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
+    with pytest.raises(DataError, match=f"labels.json: the boxes of tin and {MINE} overlap by 10.0 x 20.0 mm"):
+        training_scan(scan, RIG_FILE)

@@ -1,0 +1,141 @@
+"""Boxes with names: which are refused, and what a label file holds."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from polysight.host.materials import (
+    Entry,
+    Labels,
+    Library,
+    box_name,
+    check_labels,
+    clean_name,
+    pack_labels,
+    read_labels,
+)
+from polysight.host.process import Options
+from polysight.shared.errors import DataError
+
+X_M = Y_M = np.linspace(-0.049, 0.049, 50)  # 50 pixels of 2 mm: -50 to 50 mm
+COPPER, OAK = (-40.0, -10.0, -10.0, 10.0), (10.0, -10.0, 40.0, 10.0)
+NAN = float("nan")
+
+
+def checked(boxes, **more):
+    return check_labels(Labels(boxes, "mm", **more), X_M, Y_M)
+
+
+@pytest.mark.parametrize(
+    ("boxes", "more", "said"),
+    [
+        ({"copper": COPPER, "oak": (10, -10, 50.5, 10)}, {}, ("0.5 mm outside", "-50.0 to 50.0")),
+        ({"copper": COPPER, "oak": (200, 200, 240, 240)}, {}, ("outside the image", "-50.0 to 50.0")),
+        ({"copper": COPPER, "oak": (-15, -10, 40, 10)}, {}, ("copper and oak overlap by 5.0 x 20.0 mm",)),
+        ({"copper": COPPER, "oak": (10, 10, 40, 10)}, {}, ("box of oak", "holds nothing")),
+        ({"copper": COPPER, "oak": (40, -10, 10, 10)}, {}, ("box of oak", "x0 must be below x1")),
+        ({"copper": COPPER, "oak": (NAN, -10, 10, 10)}, {}, ("box of oak, nan",)),
+        ({"copper": COPPER, "oak": (10, -10, float("inf"), 10)}, {}, ("box of oak", "inf")),
+        ({"copper": COPPER, "oak": (10.2, 0.2, 10.4, 0.4)}, {}, ("holds no pixel",)),
+        ({"oak": OAK, "Oak": COPPER}, {}, ("the name Oak is there twice (as oak)", "#2")),
+        ({"oak": OAK, "glass": COPPER}, {}, ("metal reference is not told", "--metal")),
+        ({"brass": OAK, "copper": COPPER}, {}, ("brass and copper may all be it",)),
+        ({"oak": OAK, "copper": COPPER}, {"metal": "silver"}, ("no box is called silver", "oak, copper")),
+        ({"copper": COPPER, "a\x07b": OAK}, {}, ("control characters", r"'a\x07b'")),
+        ({"copper": COPPER, "n" * 300: OAK}, {}, ("300 characters, 80 are possible",)),
+        ({"copper": COPPER, " ": OAK}, {}, ("it is empty",)),
+        ({"copper": COPPER, "Unknown": OAK}, {}, ("the classifier uses this word",)),
+        ({"copper": COPPER, "17": OAK}, {}, ("the number of a patch",)),
+        ({"copper": COPPER, "oak#": OAK}, {}, ("specimen '' cannot be used",)),
+    ],
+)
+def test_boxes_that_nothing_could_be_learnt_from_are_refused(boxes, more, said):
+    with pytest.raises(DataError) as e:
+        checked(boxes, **more)
+    assert e.value.what
+    assert e.value.why
+    assert e.value.remedy
+    assert all(part in str(e.value) for part in said)
+
+
+def test_boxes_may_touch_and_reach_the_edge_of_the_image():
+    found = checked({"copper": (-50.0, -50.0, 0.0, 50.0), "oak": (0.0, -50.0, 50.0, 50.0)})
+    assert (found.metal, list(found.boxes)) == ("copper", ["copper", "oak"])
+    segmentation, names = found.patches(X_M, Y_M)
+    assert [p.pixels for p in segmentation.patches] == [1250, 1250]
+    assert names == {1: "copper", 2: "oak"}
+
+
+def test_a_box_where_nothing_was_scanned_is_refused():
+    valid = np.ones((50, 50), bool)
+    valid[:, 25:] = False
+    with pytest.raises(DataError, match="box of oak"):
+        check_labels(Labels({"copper": COPPER, "oak": OAK}, "mm"), X_M, Y_M, valid)
+
+
+def test_one_box_needs_no_metal_and_a_second_piece_has_a_name_of_its_own():
+    assert checked({"oak": OAK}).metal is None
+    found = checked({"copper": COPPER, "oak": (10, -10, 20, 10), "oak#2": (30, -10, 40, 10)}, specimens={"oak": "1"})
+    assert [found.specimen(name) for name in found.boxes] == [None, "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("  ha\u0308rtes  Holz\n", "h\u00e4rtes Holz"),
+        ("\u6a61\u6728", "\u6a61\u6728"),
+        ("cerise\u0301 #2", "ceris\u00e9#2"),
+        ("n = 1.5", "n = 1.5"),
+    ],
+)
+def test_names_of_any_script_are_kept_in_one_form(text, name):
+    assert box_name(text) == name
+    assert clean_name(name.partition("#")[0]) == name.partition("#")[0]
+
+
+def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
+    path = tmp_path / "labels.json"
+    given = checked({"copper": COPPER, "\u6a61\u6728": OAK}, specimens={"\u6a61\u6728": "board 7"})
+    path.write_bytes(pack_labels(given))
+    assert read_labels(path) == given
+    assert "\u6a61\u6728" in path.read_text(encoding="utf-8")
+    path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}}))  # as earlier releases wrote them
+    old = read_labels(path)
+    assert (old.unit, old.by_hand, old.metal) == ("pixel", False, None)
+    assert old.is_metal("copper")
+    assert old.in_mm(X_M, Y_M).boxes["copper"] == pytest.approx(COPPER)
+    assert old.patches(X_M, Y_M)[0].patches[0].mask.sum() == old.in_mm(X_M, Y_M).patches(X_M, Y_M)[0].labels.sum()
+
+
+@pytest.mark.parametrize(
+    "more", [{"unit": "inch"}, {"metal": "silver"}, {"specimens": {"silver": "1"}}, {"specimens": [1]}, {"metal": 3}]
+)
+def test_keys_of_another_form_are_refused(tmp_path, more):
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}, **more}))
+    with pytest.raises(DataError, match=f"labels.json: {next(iter(more))} = "):
+        read_labels(path)
+
+
+def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
+    overlapping = Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
+    with pytest.raises(DataError, match="overlap"):
+        Options(labels=overlapping).drawn(X_M, Y_M)
+    drawn = Options(labels=Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)).drawn(X_M, Y_M)
+    assert (drawn.metal, drawn.names) == (1, {1: "tin", 2: "oak"})
+
+
+def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
+    one = np.ones(3, np.float32)
+    entry = Entry("oak", "a", one, one, np.ones(3, np.complex64), 55.0, simulated=False, specimen="board 7")
+    Library((entry,)).save(tmp_path / "l.npz")
+    assert Library.load(tmp_path / "l.npz").entries[0].specimen == "board 7"
+    with np.load(tmp_path / "l.npz") as z:
+        content = dict(z)
+    meta = json.loads(content["meta"].tobytes())
+    del meta["entries"][0]["specimen"]
+    np.savez(tmp_path / "old.npz", **(content | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}))
+    assert Library.load(tmp_path / "old.npz").entries[0].specimen is None

@@ -59,7 +59,7 @@ reproduce: $(VENV)/installed  ## the paper's tables and figures from simulation,
 	$(BIN)/polysight reproduce --out $(OUT)/reproduce
 
 library: $(VENV)/installed  ## make the simulated reference library of the classifier again
-	$(BIN)/polysight train --simulate examples/library --out host/materials/simulated-library.npz
+	$(BIN)/polysight train --simulate examples/library --times 2 --out host/materials/simulated-library.npz
 
 docs: $(VENV)/installed  ## make the API reference (OUT=out), check all links, run every command that README and docs show
 	$(BIN)/python -m docs.reference --out $(OUT)/docs

@@ -9,6 +9,8 @@ import sys
 import time
 from pathlib import Path
 
+import msgspec
+
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError, PolysightError, os_error
 from polysight.shared.raster import check_burst_fits
@@ -27,6 +29,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=None, help="instead of the scene's seed")
     parser.add_argument("--columns", action="store_true", help="authors' layout: taken column by column")
     parser.add_argument("--absent", action="store_true", help="authors' layout: lost packets are absent, not zeros")
+    parser.add_argument(
+        "--specimens", type=int, default=0, metavar="N", help="the N-th other set of specimens (scene seed + 1000 N)"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON line instead of words")
 
 
@@ -36,6 +41,8 @@ def _simulate(args: argparse.Namespace) -> int:
         given = "--columns" if args.columns else "--absent"
         raise ConfigError(f"{given} with --layout own", "the published data has such scans", "add --layout authors")
     rig, scene = load_instrument(args.config), load_scene(args.scene)
+    if args.specimens:
+        scene = msgspec.structs.replace(scene, seed=scene.seed + 1000 * args.specimens)
     began = time.perf_counter()
 
     def show(done: int, rows: int) -> None:

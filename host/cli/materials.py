@@ -206,7 +206,7 @@ def _train(args: argparse.Namespace) -> int:
     from polysight.host.jobs.train import train
 
     scenes = None if args.simulate is None else packaged(args.simulate)
-    return train(scenes, args.data, args.config, args.out)
+    return train(scenes, args.data, args.config, args.out, args.times)
 
 
 def _add_train(add: Add) -> None:
@@ -222,6 +222,9 @@ def _add_train(add: Add) -> None:
     )
     sub.add_argument(
         "--simulate", type=Path, default=None, metavar="DIR", help="simulate every scene in DIR and use it"
+    )
+    sub.add_argument(
+        "--times", type=count, default=1, metavar="N", help="simulate each scene N times, each with other specimens"
     )
     sub.add_argument(
         "--authors", type=Path, default=None, metavar="DIR", help="the published data set: its materials/ and labels/"

@@ -7,11 +7,12 @@ win. Rows are processed as `polysight process` does; where they are gone, the sa
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
@@ -209,8 +210,10 @@ def _no_metal(folder: Path) -> DataError:
     )
 
 
-def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path) -> int:
+def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, times: int = 1) -> int:
     """Make a library from labelled scans, from scans with known plates, or from scenes that are simulated first.
+
+    Each scene is simulated so many `times`, each time with other specimens and other noise.
 
     Raises
     ------
@@ -235,11 +238,13 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path) ->
     scans = [training_scan(folder, config) for folder in data]
     if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
-            for file in files:
-                folder = Path(temporary) / file.stem
-                if run_simulator(["simulate", str(file), "--config", str(config), "--out", str(folder)]):
+            for file, again in product(files, range(times)):
+                folder = Path(temporary) / f"{file.stem}-{again}"
+                command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
+                if run_simulator([*command, "--specimens", str(again)]):
                     raise ScanError(f"{file}: simulation failed, see above")
                 scans.append(training_scan(folder, config))
+                shutil.rmtree(folder)
     note = "simulated scans of " + ", ".join(s.scan for s in scans) if all(s.simulated for s in scans) else ""
     library = make_library(told_apart(scans), note)
     library.save(out)

@@ -75,6 +75,22 @@ class Samples:
         return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), np.intp)
 
     @property
+    def independent(self) -> npt.NDArray:
+        """Groups that share no specimen, [n]: scans, those that saw one labelled plate together taken as one.
+
+        Where that leaves no two, the scans: then specimens that are judged were learnt, too.
+        """
+        if self.specimens is None or not (self.specimens != "").any():
+            return self.groups
+        joined = {g: g for g in np.unique(self.groups).tolist()}
+        known = self.specimens != ""
+        for plate in np.unique(self.plates[known]):
+            seen = {joined[g] for g in np.unique(self.groups[known & (self.plates == plate)]).tolist()}
+            joined = {g: min(seen) if to in seen else to for g, to in joined.items()}
+        out = np.array([joined[g] for g in self.groups.tolist()])
+        return out if np.unique(out).size > 1 else self.groups
+
+    @property
     def groups_of_material(self) -> npt.NDArray[np.int64]:
         """In how many groups each pixel's material is, [n]."""
         names, of = np.unique(self.names, return_inverse=True)

@@ -1,7 +1,8 @@
 """Reference libraries made from scans, their classifiers fitted, and models judged on data they have not seen.
 
-`make_library` collects the patches of known material from processed scans; `fit_library` chooses the model and fits it,
-for each incidence angle and for all together.
+`make_library` collects the patches of known material from processed scans; `fit_library` judges the models on them, for
+each incidence angle and for all together. What names is always the discriminant, the one model that gives probabilities
+and knows what is none of the materials; the others are judged beside it. Nothing is chosen, so no figure flatters.
 
 To judge a model (`score`), whole groups are left out (scans, or physical samples): pixels of one patch share their
 speckle, their placement and their metal reference, so that a split by pixel measures how well a patch knows itself.
@@ -20,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.classify import MODELS, PAPER, SLOW
+from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER, SLOW
 from polysight.host.materials.knn import fit_weights
 from polysight.host.materials.library import Entry, Library
 from polysight.host.materials.result import MaterialsResult
@@ -60,6 +61,8 @@ class Score:
         Materials, sorted.
     not_judged
         Those of them that no training pixels were left for; the shares above are of the others.
+    calibration
+        Expected calibration error of the patches that were named (:func:`calibration_error`).
     """
 
     model: str
@@ -74,6 +77,20 @@ class Score:
     patch_confusion: Real
     names: tuple[str, ...]
     not_judged: tuple[str, ...] = ()
+    calibration: float = float("nan")
+
+
+def calibration_error(confidence: npt.NDArray, right: npt.NDArray, bins: int = 10) -> float:
+    """Expected calibration error: |mean confidence - share right| in bins of confidence, weighted by their size.
+
+    Guo et al., On Calibration of Modern Neural Networks, ICML 2017. Not a number without any.
+    """
+    if not len(confidence):
+        return float("nan")
+    at = np.clip((np.asarray(confidence) * bins).astype(int), 0, bins - 1)
+    count = np.bincount(at, minlength=bins)
+    off = np.bincount(at, confidence, bins) - np.bincount(at, right, bins)
+    return float(np.abs(off).sum() / count.sum())
 
 
 def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
@@ -88,7 +105,7 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
     """
     from sklearn.model_selection import GroupKFold, StratifiedKFold
 
-    groups = np.unique(samples.groups)
+    groups = np.unique(samples.independent)
     if by_pixel:
         smallest = int(np.unique(samples.names, return_counts=True)[1].min())
         kept = StratifiedKFold(max(2, min(folds, smallest)), shuffle=True, random_state=0)
@@ -109,7 +126,7 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
         )
     if held.min() <= -(-groups.size // folds):
         folds = groups.size
-    yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, samples.groups)
+    yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, samples.independent)
 
 
 def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool = False, folds: int = FOLDS) -> Score:
@@ -133,6 +150,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     """
     alone, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
     unknown, learnt = np.zeros((2, samples.names.size), bool)
+    sure = np.zeros(samples.names.size)
     for train, test in splits(samples, by_pixel, folds):
         learnt[test] = np.isin(samples.names[test], samples.names[train])
         fitted = MODELS[model](channels)
@@ -148,15 +166,17 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
                 found = majority(alone[at], far, samples.patches[at])
             row = np.searchsorted(found.patches, samples.patches[at])
             in_scan[at], of_patch[at], unknown[at] = found.pixel_names, found.names[row], (found.distance > 1)[row]
+            sure[at] = found.confidence[row]
     names = np.unique(samples.names)
     tables = [_confusion(samples.names[learnt], found[learnt], names) for found in (alone, in_scan, of_patch)]
     judged = np.isin(names, samples.names[learnt])
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
+    named = first[~unknown[first]]
     return Score(
         model,
         channels,
-        OPTIMISTIC if by_pixel else f"whole scans left out, {np.unique(samples.groups).size} scans",
+        OPTIMISTIC if by_pixel else f"whole scans left out, {np.unique(samples.independent).size} scans",
         *(float(np.mean(np.diag(t)[judged])) for t in tables),
         patches=float(np.mean((of_patch == samples.names)[first])),
         unknown=float(np.mean(unknown[first])),
@@ -164,6 +184,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
         patch_confusion=tables[2],
         names=tuple(str(n) for n in names),
         not_judged=tuple(str(n) for n in names[~judged]),
+        calibration=calibration_error(sure[named], (of_patch == samples.names)[named]),
     )
 
 
@@ -223,25 +244,25 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
 
     The scores are of materials that two scans or more hold; `not_judged` names the others.
     """
-    model, scores = best_model(samples)
-    weighted = fit_weights(samples)
-    chosen = next(s for s in scores if s.model == model)
-    judged = {s.model: {"pixels": s.pixels, "patches": s.patches} for s in scores}
-    for name in {model, PAPER}:
+    scores = {model: score(samples, model) for model in MODELS if model != SLOW}
+    weighted, told = fit_weights(samples), scores[DISCRIMINANT]
+    judged = {s.model: {"pixels": s.pixels, "patches": s.patches} for s in scores.values()}
+    for name in (DISCRIMINANT, PAPER):
         judged[name]["pixels_split_by_pixel"] = score(samples, name, by_pixel=True).pixels
     return {
-        "model": model,
+        "model": DISCRIMINANT,
         "weights": weighted.weights.to_dict(),
         "thresholds": weighted.thresholds,
         "by_channel": weighted.by_channel,
-        "split": chosen.split,
-        "pixel_accuracy": chosen.pixels,
-        "patch_accuracy": chosen.patches,
-        "known_called_unknown": chosen.unknown,
-        "pixel_accuracy_in_scan": chosen.in_scan,
+        "split": told.split,
+        "pixel_accuracy": told.pixels,
+        "patch_accuracy": told.patches,
+        "known_called_unknown": told.unknown,
+        "pixel_accuracy_in_scan": told.in_scan,
+        "calibration_error": told.calibration,
         "judged": judged,
-        "materials": len(chosen.names),
-        "not_judged": list(chosen.not_judged),
+        "materials": len(told.names),
+        "not_judged": list(told.not_judged),
     }
 
 

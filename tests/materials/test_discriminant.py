@@ -31,7 +31,9 @@ def drawn(seed=0, scans=8, pixels=12, scan=0.02, patch=0.01, pixel=0.03, means=M
 
 
 def together(one, other):
-    return Samples(*(np.concatenate([getattr(s, k) for s in (one, other)]) for k in ("x", "names", "groups", "patches")))
+    return Samples(
+        *(np.concatenate([getattr(s, k) for s in (one, other)]) for k in ("x", "names", "groups", "patches"))
+    )
 
 
 def test_the_sizes_of_the_errors_are_found():

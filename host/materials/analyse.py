@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.classify import Classifier, NamedPatch, features_of
+from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, features_of
 from polysight.host.materials.explain import explained
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
 from polysight.host.materials.inversion import Inversion, Seen, Uncertain, invert
@@ -101,7 +101,8 @@ def analyse(
         PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
         for p in found.patches
     )
-    return MaterialsResult(calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior)
+    library = () if classifier is None else classifier.library.names
+    return MaterialsResult(calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, library=library)
 
 
 def _names(
@@ -237,8 +238,13 @@ def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
 
 
 def pixel_accuracy(result: MaterialsResult) -> float | None:
-    """Share of interior pixels named right over all patches of known truth; None where there are none."""
-    pairs = [(r.names, r.truth.name) for r in result.patches if r.names is not None and r.truth is not None]
+    """Share of interior pixels named right over all patches of known truth; None where there are none.
+
+    Patches rightly called unknown, because the library does not hold their material, do not count.
+    """
+    judged = [r for r in result.patches if r.verdict is not None and r.truth is not None]
+    judged = [r for r in judged if r.verdict.name != UNKNOWN or r.truth.name in result.library]
+    pairs = [(r.names, r.truth.name) for r in judged if r.names is not None]
     total = sum(names.size for names, _ in pairs)
     return sum(int((names == name).sum()) for names, name in pairs) / total if total else None
 

@@ -88,6 +88,8 @@ class MaterialsResult:
         asked for.
     boxes
         Patch number to the name of the box drawn by hand; empty when the patches were found.
+    library
+        Names of the materials that patches were compared with; empty when nothing was named.
     withheld
         Whether the verdict is `no result`: rows hold no name, no ratio and no permittivity then.
     """
@@ -104,6 +106,7 @@ class MaterialsResult:
     prior: Uncertain
     bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
     boxes: dict[int, str] = field(default_factory=dict)
+    library: tuple[str, ...] = ()
     withheld: bool = False
 
     def rows(self) -> list[dict[str, Any]]:
@@ -133,6 +136,8 @@ class MaterialsResult:
 
     def _row(self, r: PatchResult) -> dict[str, Any]:
         row = _row(r, self.metal, self.incidence_deg(r.patch))
+        if row["truth"] is not None:
+            row["truth"]["in_library"] = row["truth"]["name"] in self.library
         if self.withheld:
             return row | {"amplitude_h": None}
         level = np.abs(self.h[r.patch.interior])

@@ -12,6 +12,7 @@ import tomli_w
 from polysight.host.imaging import ChannelImages, PlaneEstimate
 from polysight.host.materials import (
     PATCHES,
+    UNKNOWN,
     Classifier,
     MaterialsResult,
     TruthPlate,
@@ -211,7 +212,10 @@ def _lines(scan: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tu
     known = [r for r in rows if r["truth"] is not None and r["name"] is not None and not r["metal_reference"]]
     if not known:
         return (head,)
+    strange = [r for r in known if r["name"] == UNKNOWN and not r["truth"]["in_library"]]  # neither right nor wrong
+    known = [r for r in known if r not in strange]
     right = sum(r["name"] == r["truth"]["name"] for r in known)
     accuracy = pixel_accuracy(found)
     share = "" if accuracy is None else f", {100 * accuracy:.1f} % of their pixels"
-    return head, f"{right} of {len(known)} plates named right{share}"
+    aside = f"; {len(strange)} not in the library, and told so" if strange else ""
+    return head, f"{right} of {len(known)} plates named right{share}{aside}"

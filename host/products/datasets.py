@@ -201,8 +201,8 @@ def _table(done: ProcessedScan) -> dict[str, Any]:
     rows: list[tuple[str, Any, str, str]] = [
         ("name", _text(c["name"]), "", "material; empty where it was not named"),
         ("confidence", _numbers(c["confidence"]), "1", "confidence in the name, 0 to 1"),
-        ("runner_up", _text([name for name, _ in second]), "", "second most frequent material of the pixels"),
-        ("runner_up_share", _numbers([share for _, share in second]), "1", "share of the pixels named runner_up"),
+        ("runner_up", _text([name for name, _ in second]), "", "next likeliest material"),
+        ("runner_up_share", _numbers([share for _, share in second]), "1", "probability of runner_up"),
         ("metal_reference", np.array(c["metal_reference"], bool), "1", "True where the patch is the metal reference"),
         ("metal_like", np.array(c["metal_like"], bool), "1", "True where P is too close to metal for a permittivity"),
         ("width", _numbers(c["width_mm"]) / 1e3, "m", "extent along x"),
@@ -230,8 +230,9 @@ def _table(done: ProcessedScan) -> dict[str, Any]:
 
 
 def _runner_up(segment: dict[str, Any]) -> tuple[str | None, float | None]:
-    """The name with the most pixels beside the patch's own, and its share."""
-    others = {name: share for name, share in (segment.get("votes") or {}).items() if name != segment.get("name")}
+    """The likeliest material beside the patch's own and its probability; without those, by the share of its pixels."""
+    every = segment.get("probabilities") or segment.get("votes") or {}
+    others = {name: share for name, share in every.items() if name != segment.get("name")}
     return max(others.items(), key=lambda item: item[1], default=(None, None))
 
 

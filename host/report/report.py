@@ -10,6 +10,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup, escape
 
+from polysight.host.materials import UNKNOWN
 from polysight.host.products import permittivity_spread, refused_text, write_atomically
 from polysight.host.report.context import ReportContext
 from polysight.host.report.figures import FIGURES, figures
@@ -138,7 +139,9 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
         "refused": r.get("refused") or {},
         "why_refused": refused_text(r),
         "truth": str(truth["name"]) if truth else "",
+        "strange": bool(truth) and r.get("name") == UNKNOWN and not truth.get("in_library", True),
         "right": truth is not None and (truth["name"] == r.get("name") or (is_metal and bool(truth.get("metal")))),
+        "why": str(r.get("why") or ""),
         "votes": DASH if r.get("confidence") is None else f"{100 * r['confidence']:.0f} %",
         "real": "metal-like" if r.get("metal_like") else DASH,
         "loss": DASH,

@@ -180,7 +180,9 @@ def key_numbers(ctx: ReportContext, rows: list[dict[str, Any]]) -> list[dict[str
 
     if ctx.truth and any(m.get("name") for m in ctx.materials):  # of what nobody named nothing is wrong
         right = sum(r["right"] for r in rows)
-        add(f"{right} of {len(ctx.truth)}", "plates named right")
+        strange = sum(r["strange"] for r in rows)
+        aside = f", {strange} told apart as not in the library" if strange else ""
+        add(f"{right} of {len(ctx.truth) - strange}", f"plates named right{aside}")
     elif rows:
         add(str(len(rows)), "patches found")
     if ctx.pixel_accuracy is not None:

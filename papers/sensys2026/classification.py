@@ -20,6 +20,7 @@ from polysight.host.polarimetry import fresnel
 from polysight.host.report import INK, PALETTE
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, percent
 from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups
+from polysight.papers.sensys2026.specimen_spread import spread_table
 from polysight.papers.sensys2026.table2 import Published, published
 
 SECOND_ANGLE_DEG = 55.0
@@ -226,6 +227,7 @@ def fig18(run: Run) -> Item:
         (
             Table("Share of pixels named right, mean over materials", head, tuple(s.row() for s in scores)),
             chance(run.quick),
+            spread_table(run.quick),
             unknowns(run.quick),
             sensitivity(),
         ),

@@ -51,11 +51,15 @@ def groups() -> dict[str, Group]:
 
 @dataclass(frozen=True)
 class Errors:
-    """Relative amplitude error and phase error of a pixel, and the share of their variance that a patch shares."""
+    """Relative amplitude error and phase error of a pixel, and the share of their variance that a patch shares.
+
+    `spread`: relative standard deviations of real part and loss between specimens; each scan has its own.
+    """
 
     amplitude: float
     phase_rad: float
     shared: float = 0.5
+    spread: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,8 @@ class Pixels:
             names[material.ravel()],
             np.array([f"scan {i + 1}" for i in scan.ravel()]),
             (scan * len(self.materials) + material).ravel(),
+            np.array([f"specimen {i + 1}" for i in scan.ravel()]),
+            (self.angle_deg,),
         )
 
     def library(self) -> Library:
@@ -91,11 +97,20 @@ class Pixels:
                 simulated=True,
                 thickness_mm=m.thickness_mm,
                 permittivity=(m.permittivity.real, -m.permittivity.imag),
+                specimen=f"specimen {i + 1}",
             )
             for i in range(self.h.shape[0])
             for j, m in enumerate(self.materials)
         ]
         return Library(tuple(entries), {}, "simulated pixels of patches")
+
+
+def specimens(materials: tuple[Published, ...], spread: tuple[float, float], z: npt.NDArray[np.float64]) -> Complex:
+    """Permittivities of specimens at z [2, ..., materials] standard deviations: normal real part, log-normal loss."""
+    eps = np.array([m.permittivity for m in materials], np.complex128)
+    width = np.sqrt(np.log1p(spread[1] ** 2))
+    real = np.maximum(eps.real * (1 + spread[0] * z[0]), 1.0)
+    return np.asarray(real + 1j * eps.imag * np.exp(width * z[1] - width**2 / 2), np.complex128)
 
 
 def draw(
@@ -117,9 +132,10 @@ def draw(
             patch = common * rng.standard_normal(one) + own * rng.standard_normal((*one[:2], pixels))
             parts.append((std * patch, std * common * rng.standard_normal((scans, 1, 1))))
         (a, a_ref), (b, b_ref) = parts
-        return r[None, :, None] * (1 + a) / (1 + a_ref) * np.exp(1j * (b - b_ref))
+        return np.broadcast_to(r, one[:2])[..., None] * (1 + a) / (1 + a_ref) * np.exp(1j * (b - b_ref))
 
-    eps = np.array([m.permittivity for m in materials])
+    own_rng = np.random.default_rng([seed, 1])  # the same specimens under every angle
+    eps = specimens(materials, errors.spread, own_rng.standard_normal((2, scans, len(materials))))
     r_s, r_p = fresnel(eps, np.radians(angle_deg))
     return Pixels(materials, angle_deg, channel(-r_s), channel(-r_p))
 

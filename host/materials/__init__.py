@@ -34,7 +34,9 @@ from polysight.host.materials.inversion import (
     ratio_error,
 )
 from polysight.host.materials.knn import Fit, Weights, fit_weights
-from polysight.host.materials.layers import Layer, LayerFit, fit_layer
+from polysight.host.materials.layer_fit import LayerFit, fit_layer
+from polysight.host.materials.layer_rows import LAYER_FORMS, fit_row, incidence_std_rad, layer_content, parse_layer
+from polysight.host.materials.layers import METAL, Layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
 from polysight.host.materials.measure import NOT_PASSIVE, Refused
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
@@ -104,6 +106,8 @@ __all__ = [
     "CHANNELS",
     "DISCRIMINANT",
     "FOUND",
+    "LAYER_FORMS",
+    "METAL",
     "METALS",
     "MODELS",
     "NOT_PASSIVE",
@@ -165,14 +169,17 @@ __all__ = [
     "fit_concentration",
     "fit_layer",
     "fit_library",
+    "fit_row",
     "fit_weights",
     "format_permittivity",
     "image_centre_mm",
+    "incidence_std_rad",
     "insides",
     "invert",
     "is_metal",
     "label_folders",
     "labels_of",
+    "layer_content",
     "make_library",
     "match_patches",
     "match_truth",
@@ -182,6 +189,7 @@ __all__ = [
     "metal_evidence",
     "metal_in_box",
     "pack_patches",
+    "parse_layer",
     "patches_from_labels",
     "patches_from_plates",
     "permittivity_change",

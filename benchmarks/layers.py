@@ -1,0 +1,212 @@
+"""Layers of unknown thickness: are permittivity and thickness right, told ambiguous, or wrong and not told?
+
+Every scene holds metal and five stacks, drawn anew: sheets in air and sheets on metal of 0.5 to 5 mm, permittivity 2 to
+7, loss tangent up to 0.1, and liquids behind a wall of glass of known thickness. Each scene has its own leakage,
+plane distance and plates' heights; its samples are as perfect synchronisation leaves them (`synced_cube`). The program
+images it in sub-bands and fits each stack, the sheets' thickness free in a stated range. All is simulated, by
+simulators that share nothing with the host's optics; what it says of a real rig is an expectation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes
+from polysight.data import packaged
+from polysight.host.materials import METAL, Layer, LayerFit, bands_of_row, fit_layer, match_truth, truth_plates
+from polysight.host.pipeline import Pipeline
+from polysight.host.process import Options
+from polysight.shared.config import load_instrument
+from polysight.simulators.scene import decode_scene
+from polysight.simulators.scene.scene_file import Plate, Scene
+from polysight.simulators.scene.simulated_scan import truth
+
+RANGE_M = (0.3e-3, 6e-3)
+"""Where the thickness of a sheet is looked for."""
+BANDS = 4
+SIDE_MM = 46.0
+GLASS = (5.5, 0.05)
+CONDUCTOR = (1.0, 1e9)
+"""Permittivity of metal behind a sheet: of a good conductor, reflects -1 to one part in 1e4."""
+KINDS = ("sheet in air", "sheet on metal", "liquid behind a wall")
+ENOUGH = 0.05
+
+
+@dataclass(frozen=True)
+class Case:
+    """One stack and what was found of it. Lengths in mm; permittivities as (eps', eps'')."""
+
+    scene: int
+    kind: str
+    permittivity: tuple[float, float]
+    thickness_mm: float
+    found: tuple[float, float] | None = None
+    found_mm: float | None = None
+    error: float = float("nan")
+    thickness_error: float = 0.0
+    distance2: float = float("nan")
+    relative_std: float = float("nan")
+    ambiguous: bool = True
+    rivals: int = 0
+    chi2: float = float("nan")
+    unexplained: bool = False
+
+    @property
+    def right(self) -> bool:
+        """Whether permittivity and thickness are within 5 %."""
+        return self.error < ENOUGH and self.thickness_error < ENOUGH
+
+
+def draw_scene(seed: int) -> Scene:
+    """Metal and five stacks on the places of a coverage scene."""
+    rng = np.random.default_rng([20261123, seed])
+    leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
+    metal, plates = int(rng.integers(len(PLACES))), []
+    kinds = iter(rng.permutation([KINDS[0]] * 2 + [KINDS[1]] * 2 + [KINDS[2]]).tolist())
+    for i, (x, y) in enumerate(PLACES):
+        place = {
+            "centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [SIDE_MM, SIDE_MM],
+            "height_mm": rng.uniform(-0.3, 0.3), "rough_mm": rng.uniform(0, 0.1),
+        }  # fmt: skip
+        if i == metal:
+            plates.append({**place, "name": "metal", "metal": True, "rough_mm": 0.0})
+            continue
+        kind, real = next(kinds), rng.uniform(2, 7)
+        sheet = {"permittivity": [real, real * rng.uniform(0, 0.1)], "thickness_mm": rng.uniform(0.5, 5)}
+        layers = [sheet]
+        if kind == KINDS[1]:
+            layers = [sheet, {"permittivity": list(CONDUCTOR)}]
+        elif kind == KINDS[2]:
+            wall = {"permittivity": list(GLASS), "thickness_mm": rng.uniform(1, 3.5)}
+            layers = [wall, {"permittivity": [rng.uniform(3, 15), rng.uniform(2, 20)]}]
+        plates.append({**place, "name": f"{kind} {i}", "layers": layers})
+    return decode_scene(
+        {
+            "name": f"layers {seed}", "seed": 2000 + seed, "grid": GRID, "object_distance_mm": 499.0,
+            "image": {"columns": 116, "rows": 90}, "plane_shift_mm": rng.uniform(-5, 5), "plates": plates,
+            "disturbances": {
+                "leakage_h": [leak[0].real, leak[0].imag], "leakage_v": [leak[1].real, leak[1].imag],
+                "leakage_measured": 0.003, "direct_loss_db": rng.uniform(-6, 12),
+            },
+        },
+        "drawn",
+    )  # fmt: skip
+
+
+def rows_of(seed: int) -> tuple[Scene, dict[str, dict[str, Any]], float]:
+    """One scene, simulated and processed: a row of materials.json for each plate found; the angle's deviation, rad."""
+    rig, scene = load_instrument(packaged(Path("instrument.toml"))), draw_scene(seed)
+    source = Cubes(rig, scene)
+    pipeline = Pipeline(source, bands=BANDS)
+    for row in source.rows():
+        pipeline.add_row(row)
+    (x, y) = next(p.centre_mm for p in scene.plates if p.metal)
+    box = (x - SIDE_MM / 2, y - SIDE_MM / 2, x + SIDE_MM / 2, y + SIDE_MM / 2)
+    findings = pipeline.examine(pipeline.form_images(), Options(model="none", metal_box_mm=box, bands=BANDS))
+    found = findings.found
+    plates = match_truth([r.patch for r in found.patches], truth_plates(truth(source.instrument, scene, scene.seed)))
+    rows = {plates[row["label"]].name: row for row in found.rows() if row["label"] in plates}
+    return scene, rows, found.prior.theta_std_rad
+
+
+def asked(plate: Plate) -> tuple[list[Layer], tuple[float, float] | None]:
+    """The stack as a user would give it, and the range of its thickness."""
+    if plate.name.startswith(KINDS[2]):
+        wall = plate.layers[0]
+        return [Layer("glass", wall.epsilon, (wall.thickness_mm or 0.0) / 1e3), Layer("liquid")], None
+    behind = [Layer("metal", METAL)] if plate.name.startswith(KINDS[1]) else []
+    return [Layer("sheet"), *behind], RANGE_M
+
+
+def judged(seed: int, plate: Plate, fit: LayerFit | None) -> Case:
+    """The fit of one plate beside its truth."""
+    kind = next(k for k in KINDS if plate.name.startswith(k))
+    layer = plate.layers[1] if kind == KINDS[2] else plate.layers[0]
+    true, size_mm = layer.permittivity, layer.thickness_mm or 0.0
+    if fit is None or fit.covariance is None:
+        return Case(seed, kind, true, size_mm)
+    away = np.array([fit.permittivity.real - true[0], -fit.permittivity.imag - true[1]])
+    found_mm = 1e3 * (fit.thickness_m or 0.0)
+    return Case(
+        seed, kind, true, size_mm, (fit.permittivity.real, -fit.permittivity.imag), found_mm,
+        float(np.hypot(*away) / np.hypot(*true)), abs(found_mm / size_mm - 1) if size_mm else 0.0,
+        float(away @ np.linalg.solve(fit.covariance[:2, :2], away)), fit.relative_std, fit.ambiguous, len(fit.rivals),
+        fit.chi2 / fit.freedom, any("does not explain" in w for w in fit.warnings()),
+    )  # fmt: skip
+
+
+def cases(seed: int) -> list[Case]:
+    """All stacks of one scene."""
+    scene, rows, theta_std_rad = rows_of(seed)
+    chirp, out = load_instrument(packaged(Path("instrument.toml"))).chirp, []
+    for plate in scene.plates:
+        if plate.metal:
+            continue
+        row, fit = rows.get(plate.name), None
+        data = None if row is None else bands_of_row(row, chirp, BANDS, theta_std_rad=theta_std_rad)
+        if row is not None and data is not None:
+            stack, limits = asked(plate)
+            fit = fit_layer(data, stack, float(np.radians(row["incidence_deg"])), limits)
+        out.append(judged(seed, plate, fit))
+    return out
+
+
+def table(rows: list[Case], what: str) -> dict[str, float]:
+    """Print and return the shares of one kind of stack."""
+    fits = [r for r in rows if r.found is not None]
+    sure = [r for r in fits if not r.ambiguous]
+    if not fits:
+        return {}
+    d = np.array([r.distance2 for r in sure])
+    entry = {
+        "cases": float(len(rows)), "not fitted": float(len(rows) - len(fits)),
+        "right": float(np.mean([r.right for r in fits])), "ambiguous": float(np.mean([r.ambiguous for r in fits])),
+        "rivals": float(np.mean([r.rivals > 0 for r in fits])),
+        "wrong, not told": float(sum(not r.right for r in sure)),
+        "in_68": float(np.mean(d < CHI2_68)) if sure else float("nan"),
+        "in_95": float(np.mean(d < CHI2_95)) if sure else float("nan"),
+        "median_std": float(np.median([r.relative_std for r in fits])),
+        "median_error": float(np.median([max(r.error, r.thickness_error) for r in fits])),
+        "unexplained": float(np.mean([r.unexplained for r in fits])),
+    }  # fmt: skip
+    told = {key: 100 * entry[key] for key in entry}
+    print(
+        f"{what:22s} {len(rows):4d} cases ({len(rows) - len(fits)} not fitted)   within 5 %: {told['right']:5.1f} %"
+        f"   told ambiguous: {told['ambiguous']:5.1f} % ({told['rivals']:.1f} % with rivals)"
+        f"   wrong and not told: {entry['wrong, not told']:.0f} of {len(sure)}\n{'':22s} regions of the others: 68 %"
+        f" {told['in_68']:5.1f}, 95 % {told['in_95']:5.1f}   median error {told['median_error']:.1f} %, stated"
+        f" {told['median_std']:.1f} %, not explained {told['unexplained']:.1f} %",
+        flush=True,
+    )
+    return entry
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this benchmark."""
+    parser.add_argument("--cases", type=int, default=200, help="sheets and liquids, five a scene (default: 200)")
+    parser.add_argument("--first", type=int, default=0, help="number of the first scene (default: 0)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
+    parser.add_argument("--json", type=Path, default=None, help="write every case here")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the table; 1 when more than 2 % of the fits not told ambiguous are beyond 5 %."""
+    scenes = range(args.first, args.first + -(-args.cases // 5))
+    print(f"simulated sheets and liquids, {BANDS} sub-bands; thickness free from {1e3 * RANGE_M[0]:g} to"
+          f" {1e3 * RANGE_M[1]:g} mm")  # fmt: skip
+    with ProcessPoolExecutor(args.jobs) as pool:
+        rows = [case for one in pool.map(cases, scenes) for case in one]
+    out = {kind: table([r for r in rows if r.kind == kind], kind) for kind in KINDS}
+    out["all"] = table(rows, "all")
+    if args.json is not None:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(json.dumps({"summary": out, "cases": [asdict(r) for r in rows]}, indent=1) + "\n")
+    sure = sum(not r.ambiguous for r in rows)
+    return int(out["all"].get("wrong, not told", 0.0) > 0.02 * sure)

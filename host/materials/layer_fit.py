@@ -176,9 +176,9 @@ def _differ(a: LayerFit, b: LayerFit) -> bool:
     loss = abs(a.permittivity.imag - b.permittivity.imag)
     thick = abs((a.thickness_m or 0.0) - (b.thickness_m or 0.0))
     return bool(
-        real > 3 * min(a.std_real, b.std_real) + 1e-3 * abs(b.permittivity)
-        or loss > 3 * min(a.std_loss, b.std_loss) + 1e-3 * abs(b.permittivity)
-        or thick > 3 * min(a.std_thickness_m, b.std_thickness_m) + 1e-3 * (b.thickness_m or 0.0)
+        real > 2 * min(a.std_real, b.std_real) + 1e-3 * abs(b.permittivity)
+        or loss > 2 * min(a.std_loss, b.std_loss) + 1e-3 * abs(b.permittivity)
+        or thick > 2 * min(a.std_thickness_m, b.std_thickness_m) + 1e-3 * (b.thickness_m or 0.0)
     )
 
 
@@ -308,11 +308,11 @@ class _Model:
     def fit(self, one: _Solution, drawn: bool) -> LayerFit:
         """A solution with its error bars; by draws from the posterior where `drawn` and the valley is bent."""
         n = self.unknowns
-        covariance = np.linalg.pinv(one.jacobian.T @ one.jacobian)
+        covariance = np.asarray(np.linalg.pinv(one.jacobian.T @ one.jacobian), np.float64)
         own = self._drawn(one, covariance) if drawn else covariance[:n, :n]
         wider = max(1.0, one.chi2 / self.freedom) if self.freedom > 0 else 1.0
         units = np.array([1.0, 1.0, 1e-3])[:n]
-        own = wider * own * np.outer(units, units)
+        own = np.asarray(wider * own * np.outer(units, units), np.float64)
         std = np.sqrt(np.maximum(np.diag(own), 0.0))
         ends = zip(("the real part", "the loss", "the thickness"), one.active, (True, False, True), strict=False)
         return LayerFit(
@@ -336,18 +336,18 @@ class _Model:
         to_z = self._straight(x)
         spread = to_z @ covariance @ to_z.T
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
+        # A wide proposal (Student's t of five degrees); farther than _REACH lies another valley: a rival, no error bar.
         rng, freedom = np.random.default_rng(0), 5.0
-        draws = stats.multivariate_t.rvs(np.zeros(x.size), 1.3 * spread, freedom, _DRAWS, rng).reshape(-1, x.size)
-        at = self._from_straight(x, draws)
-        # Farther away lies another valley, which is a rival and no part of this one's error bar.
-        near = np.sum(np.linalg.solve(spread, draws.T).T * draws, axis=-1) < _REACH**2
-        inside = near & np.all((at >= self.lower) & (at <= self.upper), axis=-1)
+        unit = rng.standard_normal((_DRAWS, x.size)) / np.sqrt(rng.chisquare(freedom, (_DRAWS, 1)) / freedom)
+        unit = 1.15 * unit[np.sum(unit**2, axis=1) < (_REACH / 1.15) ** 2]
+        at = self._from_straight(x, unit @ np.linalg.cholesky(spread).T)
+        inside = np.all((at >= self.lower) & (at <= self.upper), axis=-1)
         linear = covariance[:n, :n]
         if not np.any(inside):
             return linear
-        at, draws = at[inside], draws[inside]
+        at, unit = at[inside], unit[inside]
         log = -0.5 * np.sum(self.residuals(at) ** 2, axis=-1)
-        log -= stats.multivariate_t.logpdf(draws, np.zeros(x.size), 1.3 * spread, freedom)
+        log += (freedom + x.size) / 2 * np.log1p(np.sum((unit / 1.15) ** 2, axis=1) / freedom)
         weight = np.exp(log - log.max())
         weight /= weight.sum()
         away = (at - x)[:, :n]

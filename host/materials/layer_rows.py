@@ -33,7 +33,7 @@ def parse_layer(text: str) -> Layer:
     real, loss, *thickness = (float(part) for part in rest)
     if not (np.isfinite(real) and np.isfinite(loss)):
         raise ValueError(text)
-    return Layer(name, complex(real, -loss), *(_metres(mm) for mm in thickness))
+    return Layer(name, complex(real, -loss), _metres(thickness[0]) if thickness else None)
 
 
 def _unknown(name: str, size: str = "") -> Layer:

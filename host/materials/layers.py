@@ -119,7 +119,7 @@ class Bands:
         if self.amplitude_h is None or self.sigma_h is None:
             return ratios
         shared = self.common_h * self.amplitude_h
-        return linalg.block_diag(ratios, np.diag(self.sigma_h**2) + np.outer(shared, shared)).astype(np.float64)
+        return np.asarray(linalg.block_diag(ratios, np.diag(self.sigma_h**2) + np.outer(shared, shared)), np.float64)
 
 
 @dataclass(frozen=True)

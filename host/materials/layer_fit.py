@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -296,7 +297,7 @@ class _Model:
             np.clip(start, self.lower + 1e-9 * width, self.upper - 1e-9 * width),
             bounds=(self.lower, self.upper),
             x_scale="jac",
-            jac=self._slopes,
+            jac=cast("Any", self._slopes),  # scipy-stubs know a name only
             xtol=precision,
             ftol=precision,
             gtol=precision,

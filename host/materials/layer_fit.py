@@ -247,6 +247,8 @@ class _Model:
         theta = self.theta_rad + (self.bands.theta_std_rad * wide[..., -1] if self.turned else 0.0)
         spectrum = self.bands.spectrum.thinned(thin) if thin > 1 else self.bands.spectrum
         q, h = average(eps, thick, spectrum, theta)
+        if self.turned:
+            q = q * np.exp(1j * self.bands.phase_per_angle * self.bands.theta_std_rad * x[..., -1:])
         miss = q - self.bands.inverse_ratio
         parts = np.stack([miss.real, miss.imag], axis=-1).reshape(*miss.shape[:-1], -1)
         if self.bands.amplitude_h is not None:

@@ -85,6 +85,9 @@ class Bands:
         Relative standard deviation of a factor of |H| that all bands share; `sigma_h` is beside it.
     theta_std_rad
         Standard deviation of the incidence angle.
+    phase_per_angle
+        How far V / H turns, in radians per radian by which the angle is larger than it was taken for: a plane that is
+        nearer than images were focused on.
     """
 
     spectrum: Spectrum
@@ -95,6 +98,7 @@ class Bands:
     covariance: Real | None = None
     common_h: float = 0.0
     theta_std_rad: float = 0.0
+    phase_per_angle: float = 0.0
 
     def __post_init__(self) -> None:
         k = self.inverse_ratio.shape

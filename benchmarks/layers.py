@@ -1,12 +1,12 @@
 """Layers of unknown thickness: are permittivity and thickness right, told ambiguous, or wrong and not told?
 
-Every scene holds six stacks, drawn anew: sheets in air and sheets on metal of 0.5 to 5 mm, permittivity 2 to 7, loss
-tangent up to 0.1, and liquids behind a wall of glass of known thickness. Each scene has its own plane distance, heights
-and roughness; each rig (five scenes) its own leakage, measured to 0.003, and one scan of a metal plate on its own: half
-spaces that would show metal in the scene to be metal are not there. Samples are as perfect synchronisation leaves them
-(`synced_cube`). The program images a scene in sub-bands and fits each stack, the sheets' thickness free in a stated
-range. All is simulated, by simulators that share nothing with the host's optics; what it says of a real rig is an
-expectation.
+Every scene holds five sheets and a liquid, drawn anew: sheets in air and sheets on metal of 0.5 to 5 mm, permittivity 2
+to 7, loss tangent up to 0.1; liquids behind a wall of glass of known thickness. Each scene has its own plane distance,
+heights and roughness. Each rig (five scenes) has its own leakage, measured to 0.003, and one scan of a metal plate on
+its own: no half spaces are there that would show a plate in the scene to be metal. Samples are as perfect
+synchronisation leaves them (`synced_cube`). The program images a scene in sub-bands and fits each stack, the thickness
+of sheets free in a stated range. All is simulated, by simulators that share nothing with the host's optics; what it
+says of a real rig is an expectation.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def draw_scene(seed: int) -> Scene:
     own, rng = np.random.default_rng([20261123, seed // A_RIG]), np.random.default_rng([20261124, seed])
     leak = [complex(0.1 * own.random() * np.exp(2j * np.pi * own.random())) for _ in range(2)]
     plates: list[dict[str, Any]] = []
-    kinds = iter(rng.permutation(np.repeat(KINDS, 2)).tolist())
+    kinds = iter(rng.permutation([*KINDS[:2] * 2, KINDS[2], KINDS[seed % 2]]).tolist())
     for i, (x, y) in enumerate(PLACES):
         place = {
             "centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [SIDE_MM, SIDE_MM],
@@ -192,7 +192,7 @@ def table(rows: list[Case], what: str) -> dict[str, float]:
     d = np.array([r.distance2 for r in sure])
     entry = {
         "cases": float(len(rows)), "not fitted": float(len(rows) - len(fits)),
-        "right": float(np.mean([r.right for r in fits])), "right or told": float(np.mean([r.right or r.told for r in fits])), "ambiguous": float(np.mean([r.told for r in fits])),
+        "right": float(np.mean([r.right for r in fits])), "ambiguous": float(np.mean([r.told for r in fits])),
         "rivals": float(np.mean([r.rivals > 0 for r in fits])),
         "wrong, not told": float(sum(not r.right for r in sure)),
         "in_68, no rivals": float(np.mean(everywhere < CHI2_68)) if everywhere.size else float("nan"),
@@ -218,7 +218,9 @@ def table(rows: list[Case], what: str) -> dict[str, float]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this benchmark."""
-    parser.add_argument("--cases", type=int, default=204, help="stacks, six a scene (default: 204)")
+    parser.add_argument(
+        "--cases", type=int, default=240, help="stacks, five sheets and a liquid a scene (default: 240)"
+    )
     parser.add_argument("--first", type=int, default=0, help="number of the first scene (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
     parser.add_argument("--json", type=Path, default=None, help="write every case here")

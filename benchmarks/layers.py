@@ -46,17 +46,19 @@ CONDUCTOR = (1.0, 1e9)
 """Permittivity of metal behind a sheet: of a good conductor, reflects -1 to one part in 1e4."""
 KINDS = ("sheet in air", "sheet on metal", "liquid behind a wall")
 ENOUGH = 0.05
-AMPLITUDES = (0.1, 0.04)
-"""How far |H| is trusted: as the command's default, and as flat smooth plates deserve."""
+Setting = tuple[float, float | None]
+SETTINGS: tuple[Setting, ...] = ((0.1, None), (0.04, None), (0.1, 0.2))
+"""How far |H| is trusted (the command's default; as flat smooth plates deserve), and how far from the truth the range
+of the thickness reaches (None: `RANGE_M`)."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One stack and what was found of it, with |H| trusted so far. Lengths in mm; permittivities as (eps', eps'')."""
+    """One stack and what was found of it, by one of `SETTINGS`. Lengths in mm; permittivities as (eps', eps'')."""
 
     scene: int
     kind: str
-    trusted: float
+    setting: Setting
     permittivity: tuple[float, float]
     thickness_mm: float
     found: tuple[float, float] | None = None
@@ -141,26 +143,28 @@ def rows_of(seed: int, rig: Instrument, scene: Scene, metal: PlaneReference) -> 
     return rows, found.prior.theta_std_rad
 
 
-def asked(plate: Plate) -> list[Layer]:
-    """The stack as a user would give it."""
+def asked(plate: Plate, within: float | None = None) -> list[Layer]:
+    """The stack as a user would give it, the thickness of a sheet free or within a share of the truth."""
     if plate.name.startswith(KINDS[2]):
         wall = plate.layers[0]
         return [Layer("glass", wall.epsilon, (wall.thickness_mm or 0.0) / 1e3), Layer("liquid")]
     behind = [Layer("metal", METAL)] if plate.name.startswith(KINDS[1]) else []
-    return [Layer("sheet", thickness_range_m=RANGE_M), *behind]
+    size = (plate.layers[0].thickness_mm or 0.0) / 1e3
+    limits = RANGE_M if within is None else ((1 - within) * size, (1 + within) * size)
+    return [Layer("sheet", thickness_range_m=limits), *behind]
 
 
-def judged(seed: int, plate: Plate, fit: LayerFit | None, trusted: float) -> Case:
+def judged(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> Case:
     """The fit of one plate beside its truth."""
     kind = next(k for k in KINDS if plate.name.startswith(k))
     layer = plate.layers[1] if kind == KINDS[2] else plate.layers[0]
     true, size_mm = layer.permittivity, layer.thickness_mm or 0.0
     if fit is None or fit.covariance is None:
-        return Case(seed, kind, trusted, true, size_mm)
+        return Case(seed, kind, setting, true, size_mm)
     away = np.array([fit.permittivity.real - true[0], -fit.permittivity.imag - true[1]])
     found_mm = 1e3 * (fit.thickness_m or 0.0)
     return Case(
-        seed, kind, trusted, true, size_mm, (fit.permittivity.real, -fit.permittivity.imag), found_mm,
+        seed, kind, setting, true, size_mm, (fit.permittivity.real, -fit.permittivity.imag), found_mm,
         float(np.hypot(*away) / np.hypot(*true)), abs(found_mm / size_mm - 1) if size_mm else 0.0,
         float(away @ np.linalg.solve(fit.covariance[:2, :2], away)), fit.relative_std, fit.ambiguous, len(fit.rivals),
         fit.chi2 / fit.freedom, any("does not explain" in w for w in fit.warnings()),
@@ -175,10 +179,11 @@ def cases(seeds: Sequence[int]) -> list[Case]:
         scene = draw_scene(seed)
         rows, theta_std_rad = rows_of(seed, rig, scene, metal)
         for plate in scene.plates:
-            row, stack = rows.get(plate.name), asked(plate)
-            for trusted in AMPLITUDES:
+            row = rows.get(plate.name)
+            for trusted, within in SETTINGS:
+                stack = asked(plate, within)
                 fit = None if row is None else fit_row(row, rig.chirp, stack, BANDS, trusted, theta_std_rad)
-                out.append(judged(seed, plate, fit, trusted))
+                out.append(judged(seed, plate, fit, (trusted, within)))
     return out
 
 
@@ -230,16 +235,16 @@ def run(args: argparse.Namespace) -> int:
     """Print the table; 1 when more than 5 % of the fits not told ambiguous are beyond 5 %."""
     scenes = range(args.first, args.first + -(-args.cases // len(PLACES)))
     rigs = [list(one) for _, one in itertools.groupby(scenes, lambda seed: seed // A_RIG)]
-    print(f"simulated sheets and liquids, {BANDS} sub-bands; thickness free from {1e3 * RANGE_M[0]:g} to"
-          f" {1e3 * RANGE_M[1]:g} mm")  # fmt: skip
+    print(f"simulated sheets and liquids, {BANDS} sub-bands")
     with ProcessPoolExecutor(args.jobs) as pool:
         rows = [case for one in pool.map(cases, rigs) for case in one]
     out: dict[str, dict[str, float]] = {}
-    for trusted in AMPLITUDES:
-        print(f"|H| trusted to {100 * trusted:g} %")
-        same = [r for r in rows if r.trusted == trusted]
+    for setting in SETTINGS:
+        near = f"{1e3 * RANGE_M[0]:g} to {1e3 * RANGE_M[1]:g} mm" if setting[1] is None else f"+-{100 * setting[1]:g} %"
+        print(f"|H| trusted to {100 * setting[0]:g} %, thickness looked for in {near}")
+        same = [r for r in rows if r.setting == setting]
         for kind in (*KINDS, "all"):
-            out[f"{kind}, {trusted:g}"] = table([r for r in same if kind in (r.kind, "all")], kind)
+            out[f"{kind}, {setting}"] = table([r for r in same if kind in (r.kind, "all")], kind)
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps({"summary": out, "cases": [asdict(r) for r in rows]}, indent=1) + "\n")

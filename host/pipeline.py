@@ -24,8 +24,9 @@ class Pipeline:
         rig = self.calibration.rig(source.instrument)
         self.rig = store.mirrored(rig) if source.mirrored else rig  # of the images: x from TX to RX
         self.synchroniser = sync.RowSynchroniser(source, rig, self.calibration.high_passes(rig))
-        self.images = imaging.ImageBuilder(rig, live=live, depth_m=max(depth_m, imaging.PLANE_REACH_M))
-        self.sub_bands, self.plane = imaging.SubBandImages(rig, bands), imaging.UNKNOWN_PLANE
+        depth_m = max(depth_m, imaging.PLANE_REACH_M)
+        self.images = imaging.ImageBuilder(rig, live=live, depth_m=depth_m)
+        self.sub_bands, self.plane = imaging.SubBandImages(rig, bands, depth_m), imaging.UNKNOWN_PLANE
         self.quality = process.Quality(rig, source)
 
     def add_row(self, row: int) -> dict[str, sync.SyncedRow]:
@@ -85,9 +86,9 @@ class Pipeline:
             found = materials.analyse(materials.ImagePair.of(images), optics, metal, known, classifier)
             self.quality.note_materials(found, angles, images.valid, metal.plane)
         with self.quality.timed("sub-bands"):
-            return materials.with_bands(
-                found, self.sub_bands.bands, self.sub_bands.finish(self.source.mirrored), optics, metal.plane
-            )
+            moved = self.plane.offset_m if self.plane.worth_moving else 0.0
+            parts = self.sub_bands.finish(self.source.mirrored, moved)
+            return materials.with_bands(found, self.sub_bands.bands, parts, optics, metal.plane)
 
     def examine(
         self, images: imaging.ChannelImages, options: process.Options, plates: materials.Plates = ()

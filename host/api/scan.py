@@ -298,6 +298,17 @@ class Scan:
         names = ("name", "confidence", "runner_up", "runner_up_share", "metal_reference", "pixels")
         return self._columns(*names, *_PERMITTIVITY, "true_name")
 
+    def layers(self, *stack: str, bands: int | None = None, amplitude_percent: float = 10.0) -> xarray.Dataset:
+        """Permittivity and thickness of the one unknown layer of a stack, on dimension `patch`, with standard errors.
+
+        `stack` is typed as for `polysight permittivity --layer`: `scan.layers("sheet,?,0.5-3", "plate,metal")`. `bands`
+        are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
+        trusted. `ambiguous` and `notes` tell what the data leave open. Raises as :meth:`image`, and ConfigError.
+        """
+        from polysight.host.api.layers import layer_dataset
+
+        return layer_dataset(self._processed(True), self.rig.chirp, stack, bands, amplitude_percent)
+
     def plot(self, *, metal_referenced: bool = True) -> Figure:
         """Figure of |H|, |V|, |P| (dB), and of the materials' names if metal-referenced; axes in mm.
 

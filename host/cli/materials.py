@@ -38,9 +38,7 @@ def _permittivity(args: argparse.Namespace) -> int:
             "add the layers (--layer), or leave it out",
         )
     amplitude = 10.0 if args.amplitude is None else args.amplitude
-    return permittivity(
-        args.products, args.config, args.layer, args.segment, args.json, args.bands or 1, amplitude / 100
-    )
+    return permittivity(args.products, args.config, args.layer, args.segment, args.json, args.bands, amplitude / 100)
 
 
 def _concentration(args: argparse.Namespace) -> int:
@@ -56,14 +54,12 @@ def _classify(args: argparse.Namespace) -> int:
 
 
 def _layer(text: str) -> Layer:
-    from polysight.host.jobs.materials import parse_layer
+    from polysight.host.materials import LAYER_FORMS, parse_layer
 
     try:
         return parse_layer(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is neither NAME,REAL,LOSS,MM (known; without MM a half space) nor NAME,?,MM (the unknown one)"
-        ) from None
+        raise argparse.ArgumentTypeError(f"{text!r} is no layer: write {LAYER_FORMS}") from None
 
 
 def _value(text: str) -> tuple[str, float]:
@@ -116,7 +112,8 @@ def _add_permittivity(add: Add) -> None:
         "permittivity",
         _permittivity,
         "permittivity of the patches of a processed scan, also of a thin sheet or of a liquid behind a wall",
-        "polysight permittivity out/one --segment 3 --layer glass,5.5,0.05,3 --layer liquid,?",
+        "polysight permittivity out/one --segment 3 --layer glass,5.5,0.05,3 --layer liquid,?\n"
+        "  polysight permittivity out/one --layer sheet,?,0.5-3 --layer plate,metal",
     )
     sub.add_argument(
         "products", type=Path, metavar="PRODUCTS", help="folder that polysight process wrote, or a scan folder"
@@ -128,14 +125,16 @@ def _add_permittivity(add: Add) -> None:
         action="append",
         default=[],
         metavar="LAYER",
-        help="layers in the order the wave meets them: NAME,REAL,LOSS,MM for a known one, NAME,?,MM for the unknown"
-        " one; without MM the last one has no back (default: one interface)",
+        help="layers in the order the wave meets them: NAME,REAL,LOSS,MM or NAME,metal for a known one, NAME,?,MM for"
+        " the unknown one; NAME,?,A-B fits its thickness too, from A to B mm, NAME,?,? any thickness; without MM the"
+        " last one has no back (default: one interface)",
     )
     sub.add_argument(
         "--bands",
         type=count,
         metavar="K",
-        help="with --layer: use K sub-bands of the sweep, as processed with --bands K (default: the whole sweep)",
+        help="with --layer: use K sub-bands of the sweep, as processed with --bands K (default: the whole sweep; all"
+        " sub-bands where a thickness is fitted)",
     )
     sub.add_argument(
         "--amplitude",

@@ -211,20 +211,25 @@ class SubBandImages:
         The scan's rig file.
     count
         Sub-bands; 1: none, the image of the whole sweep is enough.
+    depth_m
+        As of the image of the whole sweep.
     """
 
-    def __init__(self, rig: Instrument, count: int) -> None:
+    def __init__(self, rig: Instrument, count: int, depth_m: float = 0.0) -> None:
         self.bands = sub_bands(rig.chirp, count) if count > 1 else ()
-        self.builders = tuple(ImageBuilder(_part(rig, band)) for band in self.bands)
+        self.builders = tuple(ImageBuilder(_part(rig, band), depth_m=depth_m) for band in self.bands)
 
     def add_row(self, board_name: str, row_index: int, row: SyncedRow) -> None:
         """Take in one synchronised row of one board; a row taken again replaces the earlier take."""
         for builder in self.builders:
             builder.add_row(board_name, row_index, row)
 
-    def finish(self, transposed: bool = False) -> tuple[ChannelImages, ...]:
-        """The images of every sub-band from the rows so far, lowest frequency first; x and y swapped on demand."""
-        made = (builder.finish() for builder in self.builders)
+    def finish(self, transposed: bool = False, offset_m: float = 0.0) -> tuple[ChannelImages, ...]:
+        """The images of every sub-band from the rows so far, lowest frequency first; x and y swapped on demand.
+
+        `offset_m`: on a plane that lies so much farther than the rig file's, as the image of the whole sweep.
+        """
+        made = (builder.finish(offset_m) for builder in self.builders)
         return tuple(images.transposed() if transposed else images for images in made)
 
 

@@ -10,7 +10,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,12 @@ from polysight.host.jobs.print_verdict import print_verdict
 from polysight.host.materials import (
     AMPLITUDE_ERROR,
     Layer,
-    LayerFit,
     Library,
-    bands_of_row,
     fit_concentration,
-    fit_layer,
+    fit_row,
     format_permittivity,
+    incidence_std_rad,
+    layer_content,
     read_materials,
 )
 from polysight.host.products import (
@@ -42,25 +42,8 @@ from polysight.host.products import (
 from polysight.shared.config import Chirp, load_instrument
 from polysight.shared.errors import ConfigError, DataError
 
-LAST = "?"
 _SAME_FREQUENCY = 1e-6  # relative: far above rounding, far below any other chirp
 REPORT = "report.html"
-
-
-def parse_layer(text: str) -> Layer:
-    """`name,eps',eps'',mm` of a known layer, `name,?,mm` of the unknown one; without mm a half space.
-
-    Raises ValueError when it has another form.
-    """
-    parts = [p.strip() for p in text.split(",")]
-    unknown = len(parts) in (2, 3) and parts[1] == LAST
-    numbers = [float(p) for p in parts[2 if unknown else 1 :]]
-    if not unknown and len(numbers) not in (2, 3):
-        raise ValueError(text)
-    thickness = numbers[-1] / 1e3 if len(numbers) == (1 if unknown else 3) else None
-    if thickness is not None and thickness <= 0:
-        raise ValueError(text)
-    return Layer(parts[0], None if unknown else complex(numbers[0], -numbers[1]), thickness)
 
 
 def _chirp(products: SavedProducts, config: Path | None) -> Chirp:
@@ -95,7 +78,7 @@ def permittivity(
     stack: Sequence[Layer],
     segment: int | None,
     as_json: bool,
-    bands: int = 1,
+    bands: int | None = None,
     amplitude_error: float = AMPLITUDE_ERROR,
 ) -> int:
     """Permittivity of patches, as one interface or as the unknown layer of a stack; returns the exit status.
@@ -104,7 +87,8 @@ def permittivity(
 
     `folder` holds the products, or is the scan folder that holds them. The chirp is the one they were made with, as
     their scan.json says; `config` replaces it. With `bands` above 1 the stack is fitted to so many sub-bands of the
-    sweep, which the products must hold. `amplitude_error` is how far |H| may be trusted, relative; 0 leaves it out.
+    sweep, which the products must hold; None takes those they hold where a thickness is fitted, else the whole sweep.
+    `amplitude_error` is how far |H| may be trusted, relative; 0 leaves it out.
 
     Raises
     ------
@@ -128,13 +112,12 @@ def permittivity(
         found = None
         if chirp is not None and not row.get("metal_reference"):
             _check_bands(row, chirp, str(config or products.folder / SCAN))
-            data = bands_of_row(row, chirp, bands, amplitude_error)
-            found = fit_layer(data, stack, float(np.radians(row["incidence_deg"]))) if data else None
+            found = fit_row(row, chirp, stack, bands, amplitude_error, incidence_std_rad(products.materials))
         out.append({"label": row["label"], "name": row["name"], "single_interface": row["permittivity"]})
         if row.get("refused"):
             out[-1]["refused"] = row["refused"]
         if found is not None:
-            out[-1]["layer"] = _layer_row(found)
+            out[-1]["layer"] = layer_content(found)
     if as_json:
         sys.stdout.write(json.dumps(out, indent=1) + "\n")
         return print_verdict(products, to_terminal=False)
@@ -144,28 +127,28 @@ def permittivity(
     return status
 
 
-def _layer_row(fit: LayerFit) -> dict[str, Any]:
-    flat = asdict(replace(fit, rivals=()))
-    flat["permittivity"] = [fit.permittivity.real, -fit.permittivity.imag]
-    flat["rivals"] = [[r.permittivity.real, -r.permittivity.imag] for r in fit.rivals]
-    return flat | {"warnings": fit.warnings()}
-
-
 def _line(row: Mapping[str, Any]) -> str:
     head = f"{row['label']:>3}  {_padded(row['name'] or '')}"
     single = row["single_interface"]
     if row.get("refused"):
-        return f"{head} not judged: {refused_text(row)}\n"
-    if single is None:
-        return f"{head} metal-like: no permittivity\n"
-    text = f"{head} one interface {_estimate(single)}"
-    layer = row.get("layer")
-    if layer is not None:
-        real, loss = layer["permittivity"]
-        text += f"   in the stack {format_permittivity(complex(real, -loss), width=6):15s}"
-        text += f"  +- {layer['std_real']:.2f}, {layer['std_loss']:.2f}"
-        text += "".join(f"\n     note: {w}" for w in layer["warnings"])
-    return text.rstrip() + "\n"
+        text = f"{head} not judged: {refused_text(row)}"
+    elif single is None:
+        text = f"{head} metal-like: no permittivity"
+    else:
+        text = f"{head} one interface {_estimate(single)}"
+    return (text + _in_the_stack(row.get("layer"))).rstrip() + "\n"
+
+
+def _in_the_stack(layer: Mapping[str, Any] | None) -> str:
+    """The fit of a layer behind the single interface, which sheets often have none of; a note a line."""
+    if layer is None:
+        return ""
+    real, loss = layer["permittivity"]
+    text = f"   in the stack {format_permittivity(complex(real, -loss), width=6):15s}"
+    text += f"  +- {layer['std_real']:.2f}, {layer['std_loss']:.2f}"
+    if layer["thickness_std_mm"] is not None:
+        text += f"   thickness {layer['thickness_mm']:.3f} +- {layer['thickness_std_mm']:.3f} mm"
+    return text + "".join(f"\n     note: {w}" for w in layer["warnings"])
 
 
 def _estimate(permittivity: Mapping[str, Any]) -> str:

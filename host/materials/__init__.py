@@ -55,7 +55,9 @@ from polysight.host.materials.labels import (
     patches_from_plates,
     read_labels,
 )
-from polysight.host.materials.layers import Layer, LayerFit, fit_layer
+from polysight.host.materials.layer_fit import LayerFit, fit_layer
+from polysight.host.materials.layer_rows import LAYER_FORMS, fit_row, incidence_std_rad, layer_content, parse_layer
+from polysight.host.materials.layers import METAL, Layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
 from polysight.host.materials.measure import NOT_PASSIVE, Refused
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
@@ -120,6 +122,8 @@ __all__ = [
     "CHANNELS",
     "DISCRIMINANT",
     "FOUND",
+    "LAYER_FORMS",
+    "METAL",
     "METALS",
     "MODELS",
     "NOT_PASSIVE",
@@ -188,16 +192,19 @@ __all__ = [
     "fit_concentration",
     "fit_layer",
     "fit_library",
+    "fit_row",
     "fit_weights",
     "format_box",
     "format_permittivity",
     "image_centre_mm",
     "image_extent_mm",
+    "incidence_std_rad",
     "insides",
     "invert",
     "is_metal",
     "label_folders",
     "labels_of",
+    "layer_content",
     "make_library",
     "match_patches",
     "match_truth",
@@ -211,6 +218,7 @@ __all__ = [
     "no_box",
     "pack_labels",
     "pack_patches",
+    "parse_layer",
     "patches_from_labels",
     "patches_from_plates",
     "permittivity_change",

@@ -344,19 +344,20 @@ def _drawn(t: complex, theta: float, covariance: Real, unit: float, theta_std: f
     return (parts @ parts.T / parts.shape[1]).astype(np.float64)
 
 
-def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real:
-    """Standard deviation of 1 / P that leakage and reference leave at any t, root of the mean of both parts' variance.
+def ratio_slopes(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real:
+    """Errors of 1 / P at any t [...] by leakage and metal reference as the inversion left them, float64 [..., 2, 6].
 
+    Times its transpose it is their covariance; of several t side by side, that between them too.
     d t = -(1 - t) (b + a t) - t rho to first order.
     """
     t = np.asarray(t, np.complex128)
-    c = estimate.nuisance_covariance
-    by = np.stack([-(1 - t) * t, -(1 - t), -t])
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
-    total = np.zeros(t.shape)
-    for i in range(3):
-        for j in range(3):
-            block = c[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] * scale[i] * scale[j]
-            both = by[i] * np.conj(by[j])
-            total += both.real * (block[0, 0] + block[1, 1]) + both.imag * (block[0, 1] - block[1, 0])
-    return np.sqrt(np.maximum(total, 0.0) / 2)
+    by = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
+    turned = np.stack([by, 1j * by], axis=-1).reshape(*t.shape, 6)
+    values, vectors = np.linalg.eigh(estimate.nuisance_covariance[:6, :6])
+    return np.stack([turned.real, turned.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real:
+    """Standard deviation of 1 / P that leakage and reference leave at any t: root of both parts' mean variance."""
+    return np.sqrt(np.sum(ratio_slopes(estimate, prior, t) ** 2, axis=(-2, -1)) / 2)

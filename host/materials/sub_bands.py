@@ -1,4 +1,9 @@
-"""The patches' ratios in sub-bands of the sweep: what tells a thin layer from a thick one."""
+"""The patches' ratios in sub-bands of the sweep: what tells a thin layer from a thick one.
+
+The error of a ratio has a part that all sub-bands of a patch share (leakage, metal reference, edges and tilt) and a
+part of its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them:
+their full covariance is recorded.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +18,9 @@ import numpy.typing as npt
 from polysight.host.imaging import ChannelImages, SubBand
 from polysight.host.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
 from polysight.host.materials.inputs import Optics
-from polysight.host.materials.inversion import ratio_error
+from polysight.host.materials.inversion import ratio_slopes
 from polysight.host.materials.layers import Bands, Spectrum
+from polysight.host.materials.measure import seen
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.materials.result import MaterialsResult
 from polysight.host.polarimetry import PlaneReference
@@ -24,6 +30,21 @@ from polysight.shared.errors import DataError
 Image = npt.NDArray[np.complexfloating]
 AMPLITUDE_ERROR = 0.1
 """Relative standard deviation of |H| of a patch: its size, its edges and its tilt are in it, and in no ratio."""
+BAND_SHARE = 0.75
+"""Error of V / H of one sub-band beside the others, per spread of the pixels about the whole sweep's V / H.
+
+All of these constants are measured in simulated scenes of layered plates (benchmarks/layers).
+"""
+BAND_STD = 5e-4
+"""The same that is there however even the pixels are."""
+BAND_AMPLITUDE_STD = 3e-3
+"""Relative error of |H| of one sub-band beside the others."""
+LAYERED_STD_RAD = 2.5e-3
+"""Error of the incidence angle where plates are layered: echoes from inside make their plane look farther, by 2.5 mm in
+simulated scenes of nothing else."""
+PHASE_PER_ANGLE = 4.5
+"""Radians by which V / H turns per radian of that error: H and V are lit from different points of a plane that images
+are not focused on. Measured in the same scenes."""
 
 
 def with_bands(
@@ -66,8 +87,10 @@ def band_rows(
 
     Returns
     -------
-    Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, amplitude_h. Null where
-    the sub-band shows nothing of the patch, or nothing of the metal: its footprint is another than the whole sweep's.
+    Patch number to K dicts: first_hz, last_hz, ratio {real, imag} or null, inverse_ratio_std, own_std (the part that
+    the other sub-bands do not share), amplitude_h, covariance [2][2 K] of the real and the imaginary part of 1 / ratio
+    with those of all sub-bands (real, imaginary part of the first, of the second, ...). Null where the sub-band shows
+    nothing of the patch, or nothing of the metal: its footprint is another than the whole sweep's.
 
     Raises
     ------
@@ -80,19 +103,34 @@ def band_rows(
             "a sub-band is divided by metal in the same part of the sweep",
             f"give a reference with --bands {len(bands)}",
         )
-    out: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
+    parts: dict[int, list[dict[str, Any]]] = {r.patch.label: [] for r in found.patches}
     for k, (band, made) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
         h, v, error = _relative_to_metal(found, made, leakage, smooth_px, reference)
         for r in found.patches:
             at = r.patch.interior & made.valid
-            seen = _seen(h[at], v[at], error)
-            if seen["ratio"] is not None:  # leakage is the same in every sub-band, and not known exactly
-                inverse = 1 / complex(seen["ratio"]["real"], seen["ratio"]["imag"])
-                left = float(ratio_error(found.inversion, found.prior, inverse))
-                seen["inverse_ratio_std"] = math.hypot(seen["inverse_ratio_std"], left)
-            out[r.patch.label].append({"first_hz": band.first_hz, "last_hz": band.last_hz, **seen})
-    return out
+            whole = (found.h[at], found.v[at])
+            parts[r.patch.label].append(
+                {"first_hz": band.first_hz, "last_hz": band.last_hz, **_seen(h[at], v[at], whole, error)}
+            )
+    common = {r.patch.label: seen(r.patch, found.h, found.v, 0.0).std for r in found.patches}
+    return {label: _with_covariance(rows, found, common[label]) for label, rows in parts.items()}
+
+
+def _with_covariance(rows: list[dict[str, Any]], found: MaterialsResult, common: float) -> list[dict[str, Any]]:
+    """One patch's sub-bands with the covariance of their errors; `common` is the deviation that its place brings."""
+    if any(row["ratio"] is None for row in rows) or not math.isfinite(common):
+        return [row | {"covariance": None} for row in rows]
+    inverse = np.array([1 / complex(row["ratio"]["real"], row["ratio"]["imag"]) for row in rows])
+    slopes = ratio_slopes(found.inversion, found.prior, inverse).reshape(2 * len(rows), 6)
+    place = common * np.tile(np.eye(2), (len(rows), 1))
+    own = np.repeat([row["own_std"] ** 2 for row in rows], 2)
+    covariance = slopes @ slopes.T + place @ place.T + np.diag(own)
+    std = np.sqrt(np.diag(covariance).reshape(-1, 2).mean(axis=1))
+    return [
+        row | {"inverse_ratio_std": float(std[k]), "covariance": covariance[2 * k : 2 * k + 2].tolist()}
+        for k, row in enumerate(rows)
+    ]
 
 
 def _relative_to_metal(
@@ -116,23 +154,33 @@ def _relative_to_metal(
     return h, v, reference_spread(h, v, metal, reference)
 
 
-def _seen(h: Image, v: Image, error: float) -> dict[str, Any]:
-    """Ratio of a patch's pixels [n] in a sub-band, its standard deviation, and |H|; null where they do not tell."""
+def _seen(h: Image, v: Image, whole: tuple[Image, Image], error: float) -> dict[str, Any]:
+    """Ratio of a patch's pixels [n] in a sub-band, its standard deviations, and |H|; null where they do not tell.
+
+    `whole` are H and V of the same pixels of the whole sweep, `error` the relative error of the metal reference.
+    """
     ratio = median_ratio(h, v)
     std = math.hypot(inverse_spread(h, v), error / abs(ratio)) if ratio else float("nan")
     if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
-        return {"ratio": None, "inverse_ratio_std": None, "amplitude_h": None}
+        return {"ratio": None, "inverse_ratio_std": None, "own_std": None, "amplitude_h": None}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = inverse_spread(np.ones_like(h), v / h - whole[1] / whole[0])
     return {
         "ratio": {"real": ratio.real, "imag": ratio.imag},
         "inverse_ratio_std": std,
+        "own_std": math.hypot(BAND_STD, BAND_SHARE * apart) if math.isfinite(apart) else std,
         "amplitude_h": float(np.nanmedian(np.abs(h))),
     }
 
 
 def bands_of_row(
-    row: Mapping[str, Any], chirp: Chirp, count: int = 1, amplitude_error: float = AMPLITUDE_ERROR
+    row: Mapping[str, Any],
+    chirp: Chirp,
+    count: int = 1,
+    amplitude_error: float = AMPLITUDE_ERROR,
+    theta_std_rad: float = 0.0,
 ) -> Bands | None:
-    """What :func:`polysight.host.materials.layers.fit_layer` needs of a row of materials.json.
+    """What :func:`polysight.host.materials.layer_fit.fit_layer` needs of a row of materials.json.
 
     Parameters
     ----------
@@ -143,7 +191,9 @@ def bands_of_row(
     count
         Sub-bands to use: those that were recorded with it, or 1: the whole sweep.
     amplitude_error
-        Relative standard deviation of |H|; 0: |H| is not used.
+        Relative standard deviation of |H|, the same error in all sub-bands; 0: |H| is not used.
+    theta_std_rad
+        Standard deviation of the incidence angle.
 
     Returns
     -------
@@ -164,12 +214,19 @@ def bands_of_row(
         )
     if any(p.get("ratio") is None or not p.get("inverse_ratio_std") for p in parts):
         return None
-    # The bands share what metal reference, edges and size are off by: K of them know no more of it than one.
-    shared = np.sqrt(count)
     inverse = np.array([1 / complex(p["ratio"]["real"], p["ratio"]["imag"]) for p in parts])
-    sigma = shared * np.array([float(p["inverse_ratio_std"]) for p in parts])
-    level = [p.get("amplitude_h") for p in parts]
+    spectrum, level = Spectrum.of(chirp, count), [p.get("amplitude_h") for p in parts]
+    sigma = np.array([float(p["inverse_ratio_std"]) for p in parts])
+    covariance = None
+    if count > 1 and all(p.get("covariance") for p in parts):
+        covariance = np.array([line for p in parts for line in p["covariance"]], np.float64)
+    else:
+        # Products of earlier releases do not say what the bands share: K of them know no more than one.
+        sigma = np.sqrt(count) * sigma
+    turn = (float(np.hypot(theta_std_rad, LAYERED_STD_RAD)), PHASE_PER_ANGLE) if theta_std_rad else (0.0, 0.0)
     if not amplitude_error or any(a is None for a in level):
-        return Bands(Spectrum.of(chirp, count), inverse, sigma)
-    amplitude = np.array(level, np.float64)
-    return Bands(Spectrum.of(chirp, count), inverse, sigma, amplitude, shared * amplitude_error * amplitude)
+        return Bands(spectrum, inverse, sigma, None, None, covariance, 0.0, *turn)
+    h = np.array(level, np.float64)
+    if covariance is None:
+        return Bands(spectrum, inverse, sigma, h, np.sqrt(count) * amplitude_error * h, None, 0.0, *turn)
+    return Bands(spectrum, inverse, sigma, h, BAND_AMPLITUDE_STD * h, covariance, amplitude_error, *turn)

@@ -19,6 +19,7 @@ Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 _AIR = np.asarray(1.0 + 0j)
 _NAN = complex(np.nan, np.nan)
+_CONDUCTOR = 1 - 1e24j  # in place of infinite permittivity: reflects -1 to one part in 1e12
 
 
 def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
@@ -136,6 +137,7 @@ def _stack(
     Raises PolysightError as :func:`multilayer`.
     """
     media: list[Complex] = [np.asarray(e, np.complex128) for e in _entries(eps)]
+    media = [np.where(np.isinf(e), _CONDUCTOR, e) for e in media]
     layers = [np.asarray(d, np.float64) for d in _entries(thickness_m)]
     if not media or len(layers) not in (len(media) - 1, len(media)):
         raise PolysightError(
@@ -170,7 +172,7 @@ def multilayer(
     ----------
     eps
         Relative permittivity of each medium in the order the wave meets them; each entry a number or an array that
-        broadcasts against frequency and angle. A single number is one medium.
+        broadcasts against frequency and angle. A single number is one medium. Infinite: a perfect conductor.
     thickness_m
         Thickness of each of them in metres. The last medium is a half space when its thickness is infinite or left
         out; otherwise air follows it. So `multilayer(eps, inf, f, theta)` is :func:`fresnel` and

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.host.materials.layers import Bands, Layer, LayerFit, Spectrum, fit_layer, predict
+from polysight.host.materials.layer_fit import LayerFit, fit_layer
+from polysight.host.materials.layers import Bands, Layer, Spectrum, predict
 from polysight.host.polarimetry import permittivity_from_ratio, ratio_from_permittivity
 from polysight.shared.errors import DataError, PolysightError
 from tests.support.rigs import published_rig

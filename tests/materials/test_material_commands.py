@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from polysight.host.cli.main import main
-from polysight.host.jobs.materials import parse_layer
-from polysight.host.materials import Entry, Library
+from polysight.host.materials import Entry, Library, parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.materials.published import write_materials
 from tests.support.paths import RIG_FILE
@@ -36,7 +35,7 @@ def test_water_behind_glass_as_typed(tmp_path, capsys):
     assert main([*arguments, "--json"]) == 0
     layer = json.loads(capsys.readouterr().out)[0]["layer"]
     assert layer["permittivity"] == pytest.approx([9.37, 18.0], rel=1e-4)
-    assert layer["thickness_m"] is None
+    assert layer["thickness_mm"] is None
     assert main(arguments) == 0
     assert "in the stack   9.37 - j18.00" in capsys.readouterr().out
     assert main(["permittivity", str(folder), "--segment", "9"]) != 0

@@ -8,7 +8,8 @@ import pytest
 from polysight.host.imaging import ChannelImages
 from polysight.host.imaging.images import SubBand
 from polysight.host.materials.analyse import MetalChoice
-from polysight.host.materials.layers import Bands, Layer, fit_layer
+from polysight.host.materials.layer_fit import fit_layer
+from polysight.host.materials.layers import Bands, Layer
 from polysight.host.materials.sub_bands import band_rows, bands_of_row
 from polysight.host.polarimetry import fresnel, ratio_from_permittivity
 from tests.support.rigs import published_rig

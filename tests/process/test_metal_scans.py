@@ -11,11 +11,9 @@ import pytest
 
 from polysight.host.cli.main import main
 from polysight.host.jobs.calibrate import load_reference
-from polysight.host.jobs.materials import parse_layer
 from polysight.host.jobs.process import imaged
-from polysight.host.materials import read_truth
+from polysight.host.materials import fit_layer, parse_layer, read_truth
 from polysight.host.materials.analyse import KnownScene, MetalChoice
-from polysight.host.materials.layers import fit_layer
 from polysight.host.materials.sub_bands import bands_of_row
 from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument

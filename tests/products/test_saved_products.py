@@ -13,7 +13,7 @@ import tomli_w
 
 from polysight.host.cli.main import main
 from polysight.host.imaging.images import sub_bands
-from polysight.host.jobs.materials import parse_layer
+from polysight.host.materials import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.products import write_json
 from polysight.host.products.files import MATERIALS, SavedProducts, read_products

@@ -1,0 +1,132 @@
+"""Layers of a segment of materials.json: the stack as typed, its fit, and the fit as plain values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from polysight.host.materials.layer_fit import THICKNESS_RANGE_M, LayerFit, fit_layer
+from polysight.host.materials.layers import METAL, Layer
+from polysight.host.materials.measure import NOT_PASSIVE
+from polysight.host.materials.sub_bands import AMPLITUDE_ERROR, bands_of_row
+from polysight.shared.config import Chirp
+
+LAYER_FORMS = (
+    "NAME,REAL,LOSS,MM (known; without MM a half space), NAME,metal, NAME,?,MM (unknown), NAME,?,A-B (its thickness"
+    " too, from A to B mm), NAME,?,? (of any thickness) or NAME,? (unknown half space)"
+)
+_RANGE = re.compile(r"([0-9.eE+]+)\s*-\s*([0-9.eE+]+)")
+
+
+def parse_layer(text: str) -> Layer:
+    """A layer as typed, in one of `LAYER_FORMS`. Raises ValueError for another form."""
+    name, *rest = (part.strip() for part in text.split(","))
+    if rest == ["metal"]:
+        return Layer(name, METAL)
+    if rest and rest[0] == "?" and len(rest) <= 2:
+        return _unknown(name, *rest[1:])
+    if len(rest) not in (2, 3):
+        raise ValueError(text)
+    real, loss, *thickness = (float(part) for part in rest)
+    if not (np.isfinite(real) and np.isfinite(loss)):
+        raise ValueError(text)
+    return Layer(name, complex(real, -loss), _metres(thickness[0]) if thickness else None)
+
+
+def _unknown(name: str, size: str = "") -> Layer:
+    if not size:
+        return Layer(name)
+    if size == "?":
+        return Layer(name, thickness_range_m=THICKNESS_RANGE_M)
+    if between := _RANGE.fullmatch(size):
+        low, high = (_metres(float(mm)) for mm in between.groups())
+        if low >= high:
+            raise ValueError(size)
+        return Layer(name, thickness_range_m=(low, high))
+    return Layer(name, None, _metres(float(size)))
+
+
+def _metres(mm: float) -> float:
+    if not 0 < mm < np.inf:
+        raise ValueError(mm)
+    return mm / 1e3
+
+
+def fit_row(
+    row: Mapping[str, Any],
+    chirp: Chirp,
+    stack: Sequence[Layer],
+    bands: int | None = None,
+    amplitude_error: float = AMPLITUDE_ERROR,
+    theta_std_rad: float = 0.0,
+) -> LayerFit | None:
+    """The unknown layer of a stack, from a segment of materials.json.
+
+    Parameters
+    ----------
+    row, chirp
+        The segment, and the chirp of its scan.
+    stack
+        Layers in the order the wave meets them, one unknown.
+    bands
+        Sub-bands to use; None: those that the segment holds where a thickness is fitted, else the whole sweep.
+    amplitude_error
+        How far |H| may be trusted, relative; 0 leaves it out.
+    theta_std_rad
+        Standard deviation of the incidence angle.
+
+    Returns
+    -------
+    None for the metal reference, a segment without a usable ratio, or one that is no plate (noise, several kinds).
+
+    Raises
+    ------
+    DataError
+        when the segment does not hold so many sub-bands, or there are fewer data than unknowns.
+    PolysightError
+        when the stack has not exactly one unknown layer, or a thickness is missing.
+    """
+    refused = row.get("refused")
+    if row.get("metal_reference") or (refused and refused.get("what") not in NOT_PASSIVE):
+        return None
+    if bands is None:
+        sized = any(layer.thickness_range_m for layer in stack)
+        bands = max(1, len(row.get("bands") or ())) if sized else 1
+    data = bands_of_row(row, chirp, bands, amplitude_error, theta_std_rad)
+    return None if data is None else fit_layer(data, stack, float(np.radians(row["incidence_deg"])))
+
+
+def incidence_std_rad(materials: Mapping[str, Any]) -> float:
+    """Standard deviation of the incidence angle by materials.json, radians; 0 where it does not say."""
+    told = ((materials.get("error_budget") or {}).get("incidence") or {}).get("std_deg")
+    return float(np.radians(told or 0.0))
+
+
+def layer_content(fit: LayerFit) -> dict[str, Any]:
+    """A fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
+    sized = fit.std_thickness_m > 0
+    units = np.array([1.0, 1.0, 1e3])[: 3 if sized else 2]
+    covariance = None if fit.covariance is None else (fit.covariance * np.outer(units, units)).tolist()
+    return {
+        **_solution(fit),
+        "std_real": fit.std_real,
+        "std_loss": fit.std_loss,
+        "thickness_std_mm": 1e3 * fit.std_thickness_m if sized else None,
+        "covariance": covariance,
+        "freedom": fit.freedom,
+        "ambiguous": fit.ambiguous,
+        "rivals": [_solution(r) for r in fit.rivals],
+        "at_limit": list(fit.at_limit),
+        "warnings": fit.warnings(),
+    }
+
+
+def _solution(fit: LayerFit) -> dict[str, Any]:
+    return {
+        "permittivity": [fit.permittivity.real, -fit.permittivity.imag],
+        "thickness_mm": None if fit.thickness_m is None else 1e3 * fit.thickness_m,
+        "chi2": fit.chi2,
+    }

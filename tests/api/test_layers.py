@@ -1,0 +1,48 @@
+"""A stack fitted to every patch of a processed scan, as a dataset."""
+
+import numpy as np
+import pytest
+
+from polysight.host.api.layers import layer_dataset
+from polysight.host.materials.layers import Layer, Spectrum, predict
+from polysight.host.products import ProcessedScan
+from polysight.shared.errors import ConfigError
+from tests.support.rigs import published_rig
+
+CHIRP = published_rig().chirp
+SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
+
+
+@pytest.fixture
+def done():
+    """A metal reference, and a sheet in air."""
+    q, h = predict([SHEET], Spectrum.of(CHIRP), np.radians(55.0))
+    ratio = complex(1 / q[0])
+    sheet = {"label": 2, "incidence_deg": 55.0, "ratio": {"real": ratio.real, "imag": ratio.imag}}
+    sheet |= {"inverse_ratio_std": 0.003, "amplitude_h": float(h[0]), "metal_reference": False}
+    materials = {"segments": [{"label": 1, "metal_reference": True}, sheet]}
+    return ProcessedScan({}, {}, {}, materials, np.zeros((2, 2), np.int32), None)
+
+
+def test_the_unknown_layer_of_each_patch(done):
+    """Nothing is said of the metal reference."""
+    found = layer_dataset(done, CHIRP, ["sheet,?,1.7"], None, 10.0)
+    assert found["patch"].values.tolist() == [1, 2]
+    eps = found["permittivity"].values
+    assert np.isnan(eps[0])
+    assert eps[1] == pytest.approx(SHEET.permittivity, rel=0.01)
+    assert found["thickness"].values[1] == pytest.approx(1.7e-3)
+    assert found["thickness"].attrs["units"] == "m"
+    same = layer_dataset(done, CHIRP, [Layer("sheet", None, 1.7e-3)], 1, 10.0)
+    assert same.equals(found)
+
+
+def test_a_free_thickness_by_one_band_is_told_ambiguous(done):
+    found = layer_dataset(done, CHIRP, ["sheet,?,0.5-4"], None, 10.0)
+    assert bool(found["ambiguous"].values[1])
+    assert " mm" in found["notes"].values[1]
+
+
+def test_other_forms_of_a_layer_are_refused(done):
+    with pytest.raises(ConfigError, match="is no layer"):
+        layer_dataset(done, CHIRP, ["sheet"], None, 10.0)

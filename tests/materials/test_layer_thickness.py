@@ -1,0 +1,185 @@
+"""A layer of unknown thickness: what was put in comes back, and what the data leave open is said."""
+
+import json
+
+import numpy as np
+import pytest
+
+from polysight import multilayer
+from polysight.host.cli.main import main
+from polysight.host.imaging import sub_bands
+from polysight.host.materials import METAL, Layer, LayerFit, bands_of_row, fit_layer, parse_layer
+from polysight.host.materials.layers import Bands, Spectrum, predict
+from tests.support.paths import RIG_FILE
+from tests.support.rigs import published_rig
+
+THETA = np.radians(55.0)
+CHIRP = published_rig().chirp
+BANDS = Spectrum.of(CHIRP, 4)
+RANGE, NEAR = (0.3e-3, 6e-3), (1e-3, 2.4e-3)
+SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
+PLATE = Layer("plate", METAL)
+GLASS = Layer("glass", 5.5 - 0.05j, 2e-3)
+OWN, COMMON = 3e-4, 3e-3
+
+
+def shared_covariance(own=OWN, common=COMMON, bands=4):
+    """An error that all bands share beside one of each."""
+    place = common * np.tile(np.eye(2), (bands, 1))
+    return own**2 * np.eye(2 * bands) + place @ place.T
+
+
+def measured(stack, offset=0j, theta_std=0.0, covariance=None):
+    q, h = predict(stack, BANDS, THETA)
+    covariance = shared_covariance() if covariance is None else covariance
+    sigma = np.sqrt(np.diag(covariance)[::2])
+    return Bands(BANDS, q + offset, sigma, h, 0.003 * h, covariance, 0.1, theta_std)
+
+
+@pytest.mark.parametrize(
+    ("true", "asked"),
+    [
+        ([SHEET], [Layer("sheet")]),
+        ([SHEET, PLATE], [Layer("sheet"), PLATE]),
+        ([GLASS, SHEET], [GLASS, Layer("film")]),
+    ],
+    ids=["sheet in air", "sheet on metal", "film behind a wall"],
+)
+def test_permittivity_and_thickness_come_back(true, asked):
+    fit = fit_layer(measured(true, covariance=shared_covariance(1e-5, 1e-5)), asked, THETA, RANGE)
+    assert fit.permittivity == pytest.approx(SHEET.permittivity, rel=1e-4)
+    assert fit.thickness_m == pytest.approx(1.7e-3, rel=1e-4)
+    assert not fit.ambiguous
+
+
+def test_a_liquid_behind_a_wall_comes_back():
+    fit = fit_layer(measured([GLASS, Layer("water", 9.4 - 18j)]), [GLASS, Layer("liquid")], THETA)
+    assert fit.permittivity == pytest.approx(9.4 - 18j, rel=1e-3)
+
+
+def test_infinite_permittivity_is_metal_behind_a_layer():
+    r_s, r_p = multilayer([1.0, METAL], [1e-3], 77e9, THETA)
+    turned = np.exp(-2j * 2 * np.pi * 77e9 / 299792458.0 * 1e-3 * np.cos(THETA))
+    np.testing.assert_allclose([r_s, r_p], -turned, rtol=1e-9)
+
+
+def test_an_error_that_all_bands_share_is_no_misfit_and_moves_little():
+    """Two deviations of the common error: the data still fit, within the error bars."""
+    for stack, asked in (([SHEET], [Layer("sheet")]), ([SHEET, PLATE], [Layer("sheet"), PLATE])):
+        fit = fit_layer(measured(stack, offset=2 * COMMON * np.exp(0.7j)), asked, THETA, NEAR)
+        assert fit.chi2 < 8
+        assert not any("does not explain" in words for words in fit.warnings())
+        assert abs(fit.permittivity.real - 3.4) < 3 * fit.std_real
+        assert abs(fit.thickness_m - 1.7e-3) < 3 * fit.std_thickness_m
+
+
+def test_differences_between_bands_are_known_better_than_each():
+    """With the same error of each band, the thickness is known better where most of it is common to all."""
+    alone = np.eye(8) * (OWN**2 + COMMON**2)
+    shared, apart = (
+        fit_layer(measured([SHEET], covariance=c), [Layer("sheet")], THETA, NEAR) for c in (shared_covariance(), alone)
+    )
+    assert shared.std_thickness_m < 0.7 * apart.std_thickness_m
+
+
+def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
+    """The ratio of one narrow band repeats with half a wave more in the sheet."""
+    band = Spectrum(np.array([[76.3e9], [76.4e9]]), np.ones((2, 1)))
+    q, h = predict([SHEET], band, THETA)
+    bands = Bands(band, q, np.full(2, 0.003), h, 0.05 * h)
+    fit = fit_layer(bands, [Layer("sheet")], THETA, RANGE)
+    again = SHEET.thickness_m + 299792458.0 / 76.35e9 / 2 / np.sqrt(3.4 - np.sin(THETA) ** 2)
+    sizes = [one.thickness_m for one in (fit, *fit.rivals)]
+    for true in (SHEET.thickness_m, again):
+        assert min(abs(size / true - 1) for size in sizes) < 0.05
+    assert fit.ambiguous
+    assert any("mm explains the data as well" in words for words in fit.warnings())
+
+
+def test_a_thickness_that_is_not_determined_is_told_ambiguous():
+    told = LayerFit(4 - 0.1j, 2e-3, 0.02, 0.02, 0.1e-3, 5.0, 9)
+    assert told.ambiguous
+    assert any("ambiguous" in words for words in told.warnings())
+    assert not LayerFit(4 - 0.1j, 2e-3, 0.02, 0.02, 0.02e-3, 5.0, 9).ambiguous
+
+
+def test_an_uncertain_angle_widens_the_error_bars():
+    sure, unsure = (fit_layer(measured([SHEET], theta_std=std), [Layer("sheet")], THETA, NEAR) for std in (0, 0.01))
+    assert unsure.std_real > 1.1 * sure.std_real
+
+
+@pytest.mark.parametrize(
+    ("text", "layer"),
+    [
+        ("sheet,?,0.5-3", Layer("sheet", thickness_range_m=(0.5e-3, 3e-3))),
+        ("sheet, ?, ?", Layer("sheet", thickness_range_m=(0.1e-3, 12e-3))),
+        ("plate,metal", PLATE),
+    ],
+)
+def test_forms_of_a_layer(text, layer):
+    assert parse_layer(text) == layer
+
+
+@pytest.mark.parametrize(
+    "text", ["s,?,3-0.5", "s,?,0-3", "s,?,a-b", "s,?,1-2-3", "s,?,1,2", "s,steel", "s,nan,1", "s,2,0,-1"]
+)
+def test_other_forms_are_refused_with_those_that_are_known(text, capsys):
+    with pytest.raises(SystemExit):
+        main(["permittivity", "out", "--layer", text])
+    assert "NAME,?,A-B" in capsys.readouterr().err
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Products of a sheet on metal, which one interface has no permittivity of."""
+    q, h = predict([SHEET, PLATE], BANDS, THETA)
+    covariance, ratio = shared_covariance(), 1 / q
+    edges = [(b.first_hz, b.last_hz) for b in sub_bands(CHIRP, 4)]
+    bands = [
+        {
+            "first_hz": edges[k][0], "last_hz": edges[k][1], "ratio": {"real": ratio[k].real, "imag": ratio[k].imag},
+            "inverse_ratio_std": COMMON, "own_std": OWN, "amplitude_h": h[k],
+            "covariance": covariance[2 * k : 2 * k + 2].tolist(),
+        }
+        for k in range(4)
+    ]  # fmt: skip
+    row = {"label": 3, "name": None, "incidence_deg": 55.0, "metal_reference": False, "permittivity": None}
+    row |= {"ratio": bands[0]["ratio"], "inverse_ratio_std": COMMON, "amplitude_h": h[0], "bands": bands}
+    row["refused"] = {"what": "it would amplify beyond its error bar", "why": "layers", "do": "fit"}
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "materials.json").write_text(json.dumps({"segments": [row]}))
+    return out
+
+
+def test_a_sheet_on_metal_as_typed(folder, capsys):
+    """Thin sheets seldom have a permittivity by one interface: their fit is printed all the same."""
+    words = [
+        "permittivity",
+        str(folder),
+        "--config",
+        str(RIG_FILE),
+        "--layer",
+        "sheet,?,1-2.4",
+        "--layer",
+        "plate,metal",
+    ]
+    assert main([*words, "--json"]) == 0
+    layer = json.loads(capsys.readouterr().out)[0]["layer"]
+    assert layer["permittivity"] == pytest.approx([3.4, 0.1], rel=0.01)
+    assert layer["thickness_mm"] == pytest.approx(1.7, rel=0.01)
+    assert np.sqrt(layer["covariance"][2][2]) == pytest.approx(layer["thickness_std_mm"])
+    assert all("thickness_mm" in rival for rival in layer["rivals"])
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "thickness 1.70" in out
+    assert " mm" in out
+
+
+def test_products_that_do_not_say_what_bands_share_know_no_more_than_one(folder):
+    row = json.loads((folder / "materials.json").read_text())["segments"][0]
+    new = bands_of_row(row, CHIRP, 4)
+    old = bands_of_row(row | {"bands": [b | {"covariance": None} for b in row["bands"]]}, CHIRP, 4)
+    assert old.covariance is None
+    np.testing.assert_allclose(old.sigma, 2 * COMMON)
+    assert new.covariance.shape == (8, 8)

@@ -20,7 +20,7 @@ Complex = npt.NDArray[np.complex128]
 PUBLISHED_SPREAD = (0.027, 0.19)
 """Standard deviations of ln eps' and ln eps'' where a library does not tell: root mean square of PET's and ceramic's in
 Fig. 17 of the paper (variances 0.0021 and 0.0295 of 3.78 and 4.75; 0.0255 and 0.1081 of 0.70 and 2.43)."""
-PRIOR_FREEDOM = 6.0
+PRIOR_FREEDOM = 4.0
 """How many specimens' worth of evidence that is, beside the library's own specimens."""
 OWN_FREEDOM = 10.0
 """How many specimens' worth of evidence the mean of all materials is, for one material's own spread."""
@@ -28,6 +28,7 @@ SOFT = 0.05
 """|V / H| below which its errors are taken to be additive (leakage, noise) instead of relative (gain, phase)."""
 _STEP = 1e-4
 _ROUNDS = 300
+_SETTLED = 1e-3
 _LEAST_LOSS = 1e-3
 _METAL = 0.1  # |t - 1| below which a material is metal, whose specimens do not differ
 
@@ -125,10 +126,13 @@ def fit_spread(
         spread[~used] = 0.0
         mean = np.einsum("gab,gbd,gd->ga", spread, information, sums)
         second = mean**2 + np.einsum("gaa->ga", spread)
+        before = pooled
         pooled = (PRIOR_FREEDOM * prior + second[used].sum(axis=0)) / (PRIOR_FREEDOM + used.sum())
         left = residuals - np.einsum("gda,ga->gd", f, mean)[group]
         blur = np.einsum("g,gda,gab,geb->de", count.astype(float), f, spread, f)
         placement = alike((left.T @ left + blur) / len(residuals))
+        if np.abs(pooled / before - 1).max() < _SETTLED:
+            break
     own = np.tile(pooled, (len(effects), 1))
     for k in np.flatnonzero(telling):
         mine = second[kind == k]

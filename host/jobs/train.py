@@ -31,7 +31,7 @@ from polysight.host.materials import (
     TrainingScan,
     analyse,
     check_labels,
-    drew_specimens,
+    drawn_specimens,
     make_library,
     material_of,
     patches_from_plates,
@@ -197,8 +197,8 @@ def _from_truth(data: Path, config: Path) -> TrainingScan:
     images = pipeline.form_images()
     known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
-    drawn = drew_specimens(data / TRUTH)
-    specimens = {n: f"{source.scan_id}/{n}" for n in names} if drawn else {}
+    drawn = drawn_specimens(data / TRUTH)
+    specimens = {} if drawn is None else {n: f"{source.scan_id}/{drawn}/{n}" for n in names}
     return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names, specimens=specimens)
 
 

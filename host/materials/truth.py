@@ -67,12 +67,15 @@ def read_truth(path: Path) -> tuple[TruthPlate, ...]:
         raise DataError(f"{path}: cannot be read as truth: {e}", "another program's file, or damaged", remedy) from None
 
 
-def drew_specimens(path: Path) -> bool:
-    """Whether the scene of a truth.json drew its plates' permittivities (`specimen_spread`). Raises DataError."""
+def drawn_specimens(path: Path) -> int | None:
+    """The seed by which the scene of a truth.json drew its plates' permittivities (`specimen_spread`); None: it did not.
+
+    Raises DataError.
+    """
     read_truth(path)
     scene = json.loads(path.read_text(encoding="utf-8")).get("scene")
     spread = scene.get("specimen_spread") if isinstance(scene, dict) else None
-    return isinstance(spread, list) and any(spread)
+    return scene.get("seed") if isinstance(scene, dict) and isinstance(spread, list) and any(spread) else None
 
 
 def truth_beside(folder: Path) -> tuple[Plates, str]:

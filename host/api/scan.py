@@ -68,7 +68,7 @@ def open_scan(
     library
         Reference library of the materials; the packaged simulated one if not given.
     model
-        Classifier: "knn", "discriminant", "own-spread", a full name, or "none" for no names. The library's own choice
+        Classifier: "knn", "discriminant", a full name, or "none" for no names. The library's own choice
         if not given.
     metal_box_mm
         Metal reference (x0, y0, x1, y1), mm from the image centre; found automatically if not given.

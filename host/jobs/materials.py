@@ -230,7 +230,8 @@ def _patch_line(row: dict[str, Any]) -> str:
     sure = f"{100 * row['confidence']:.0f} %" if row.get("confidence") is not None else ""
     e = row.get("permittivity")
     told = _estimate(e) if e is not None else "metal-like" if row.get("metal_like") else "-"
-    return f"{row['label']:>3}  {_padded(name)} {sure:>5s}  {told}{drawn}".rstrip() + "\n"
+    why = f"\n     {row['why']}" if row.get("why") else ""
+    return f"{row['label']:>3}  {_padded(name)} {sure:>5s}  {told}{drawn}".rstrip() + f"{why}\n"
 
 
 def _padded(name: str, width: int = 24) -> str:

@@ -68,7 +68,7 @@ def read_truth(path: Path) -> tuple[TruthPlate, ...]:
 
 
 def drawn_specimens(path: Path) -> int | None:
-    """The seed by which the scene of a truth.json drew its plates' permittivities (`specimen_spread`); None: it did not.
+    """The seed by which a truth.json's scene drew its plates' permittivities (`specimen_spread`); None: it did not.
 
     Raises DataError.
     """

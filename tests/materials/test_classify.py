@@ -100,7 +100,7 @@ def test_an_angle_the_library_does_not_hold_is_refused(powders):
         Classifier(powders)
 
 
-@pytest.mark.parametrize("model", [None, "knn", "discriminant", "own-spread"])
+@pytest.mark.parametrize("model", [None, "knn", "discriminant"])
 def test_patches_under_two_angles_are_named_together(seen, model):
     library, scenes = seen
     scans = [_seen(scene) for scene in scenes.values()]

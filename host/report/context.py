@@ -181,23 +181,22 @@ def context_of(
 
 
 def classifier_sentence(classifier: Classifier) -> str:
-    """What names, how it was chosen, and how well it names scans it has not seen."""
+    """What names, and how well it names scans it has not seen."""
     library, fit = classifier.library, classifier.fit
     kind = "simulated " if library.simulated else ""
     angles = " and ".join(f"{a:g}" for a in classifier.angles_deg)
     out = f"{classifier.model} on |H|, |V| and complex P"
     judged = fit.get("judged", {}).get(classifier.model)
-    if judged:
-        chosen = fit.get("model") == classifier.model
-        out += f", {'chosen' if chosen else 'asked for; not the one chosen'} by leaving whole scans out"
-        if chosen and len(fit["judged"]) > 1:
-            out += f" (the best of {len(fit['judged'])} models on the same split, so its figures flatter slightly)"
+    if judged and fit.get("model") != classifier.model:
+        out += ", asked for; not the one that names by default"
     out += f"; library of {len(library.names)} materials from {len(library.scans)} {kind}scans, {angles} degrees."
     if judged:
         out += (
             f" On scans left out of the library it names {100 * judged['pixels']:.1f} % of the pixels and "
             f"{100 * judged['patches']:.1f} % of the patches right"
         )
+        if fit.get("model") == classifier.model and fit.get("calibration_error") is not None:
+            out += f", its probabilities off by {fit['calibration_error']:.3f} (expected calibration error)"
         if "pixels_split_by_pixel" in judged:
             out += f" (split by pixel, which is optimistic: {100 * judged['pixels_split_by_pixel']:.1f} %)"
         channel = fit.get("by_channel", {})

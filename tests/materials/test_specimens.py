@@ -1,0 +1,144 @@
+"""Specimens differ: their spread is found, turned into features by Eq. 2, and doubts follow it."""
+
+import numpy as np
+import pytest
+
+from polysight.host.materials import MODELS, UNKNOWN, Classifier, Entry, Library
+from polysight.host.materials.classify import DISCRIMINANT, PAPER
+from polysight.host.materials.none_of_these import cost_of_none
+from polysight.host.materials.samples import Samples, SceneErrors, feature_matrix
+from polysight.host.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative
+from polysight.host.polarimetry import fresnel
+
+ANGLE = np.radians(60.0)
+KINDS = {"a": 2.2 - 0.02j, "b": 3.0 - 0.6j, "c": 4.0 - 0.3j, "d": 5.0 - 1.2j, "e": 6.5 - 0.2j, "f": 4.7 - 2.4j}
+
+
+def drawn(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelled=True):
+    """Pixels of every material in every scan, a specimen of its own in each, errors of the patch's gains and phase."""
+    rng = np.random.default_rng(seed)
+    eps = np.array(list(kinds.values()))
+    shape = (scans, eps.size)
+    own = eps.real * np.exp(spread[0] * rng.standard_normal(shape)) + 1j * eps.imag * np.exp(
+        spread[1] * rng.standard_normal(shape)
+    )
+    s, p = fresnel(own, ANGLE)
+
+    def channel(r):
+        error = gain * (rng.standard_normal((*shape, 1)) + 1j * rng.standard_normal((*shape, 1)))
+        speckle = gain * (rng.standard_normal((*shape, pixels)) + 1j * rng.standard_normal((*shape, pixels)))
+        return -r[..., None] * np.exp(error + speckle)
+
+    h, v = channel(s), channel(p)
+    i, k, _ = np.indices(h.shape)
+    which = np.char.add("s", i.ravel().astype(str)) if labelled else None
+    names = np.array(list(kinds))[k.ravel()]
+    x = feature_matrix(h, v, h / v).reshape(-1, 4)
+    return Samples(x, names, i.ravel().astype(str), (i * eps.size + k).ravel(), which, (60.0,))
+
+
+def test_the_effect_of_a_specimen_is_what_eq_2_says():
+    """Stretched a little, a material looks as its effect tells, under both angles together."""
+    angles = [np.radians(55.0), np.radians(60.0)]
+    for eps in KINDS.values():
+        log_h, t = features(eps, angles)
+        for step in ((1e-3, 0.0), (0.0, 1e-2)):
+            there = features(complex(eps.real * np.exp(step[0]), eps.imag * np.exp(step[1])), angles)
+            moved = relative(there[0] - log_h, there[1] - t, t).ravel()
+            np.testing.assert_allclose(effect(t, angles) @ step, moved, rtol=0.02, atol=1e-6)
+    assert not effect(np.array([1.0 + 0j]), [ANGLE]).any(), "metal has no specimens"
+
+
+def test_the_spread_is_found():
+    found = [np.sqrt(MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.03, 0.2), 40, seed)).spread) for seed in range(4)]
+    assert np.mean([f[:, 0].mean() for f in found]) == pytest.approx(0.03, rel=0.15)
+    assert np.mean([f[:, 1].mean() for f in found]) == pytest.approx(0.2, rel=0.2)
+
+
+def test_without_specimens_apart_the_published_spread_stands():
+    one = drawn((0.0, 0.0), 6, labelled=False)
+    np.testing.assert_allclose(
+        MODELS[DISCRIMINANT]("H+V+P").fit(one).spread, [np.square(PUBLISHED_SPREAD)] * len(KINDS)
+    )
+
+
+def test_the_order_of_patches_does_not_matter_to_the_spread():
+    rng, kinds = np.random.default_rng(3), np.repeat(np.arange(3), 10)
+    residual, plates = 0.02 * rng.standard_normal((30, 3)), np.arange(30)
+    effects, noise = rng.standard_normal((3, 3, 2)), 1e-4 * np.eye(3)
+    turn = rng.permutation(30)
+    here, there = (fit_spread(residual[at], kinds[at], plates[at], effects, noise) for at in (np.arange(30), turn))
+    for a, b in zip(here, there, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_probabilities_mean_what_they_say_of_specimens_never_seen():
+    close = {"a": 4.0 - 0.4j, "b": 4.2 - 0.45j, "c": 4.45 - 0.6j, "d": 4.7 - 0.7j}
+    model = MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.03, 0.15), 40, 1, kinds=close))
+    sure, right = [], []
+    for seed in range(40):
+        test = drawn((0.03, 0.15), 1, 100 + seed, kinds=close)
+        found = model.by_scan(test.x, test.patches)
+        sure += found.confidence.tolist()
+        right += (found.names == list(close)).tolist()
+        np.testing.assert_allclose(found.probabilities.sum(axis=1), 1)
+    assert 0.4 < np.mean(right) < 0.95
+    assert np.mean(sure) == pytest.approx(np.mean(right), abs=0.08)
+
+
+def test_what_all_patches_share_is_found_with_the_names():
+    """A leakage that moves every patch as its own ratio asks is taken off; judged alone, the patches are unsure."""
+    model = MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.005, 0.03), 30, 2, gain=0.003))
+    test = drawn((0.005, 0.03), 1, 7, gain=0.003)
+    t = np.array([test.x[test.patches == p, 2:].mean(axis=0) @ [1, 1j] for p in np.unique(test.patches)])
+    design = relative(np.zeros((t.size, 1)), -(1 - t)[:, None], t[:, None])[..., :, None][:, 0]
+    moved = test.x.copy()
+    for p, q in zip(np.unique(test.patches), t, strict=True):
+        moved[test.patches == p, 2] -= 0.03 * (1 - q).real
+        moved[test.patches == p, 3] -= 0.03 * (1 - q).imag
+    known = SceneErrors(np.zeros((t.size, 3, 3)), design, np.array([[0.03**2]]))
+    found = model.by_scan(moved, test.patches, known)
+    assert found.names.tolist() == list(KINDS)
+    assert (found.distance <= 1).all()
+
+
+def entries(samples):
+    """A library of the same patches."""
+    out = []
+    for p in np.unique(samples.patches):
+        at = samples.patches == p
+        h, v, q = samples.x[at, 0], samples.x[at, 1], samples.x[at, 2] + 1j * samples.x[at, 3]
+        out.append(
+            Entry(
+                str(samples.names[at][0]),
+                f"scan {samples.groups[at][0]}",
+                h.astype(np.float32),
+                v.astype(np.float32),
+                (1 / q).astype(np.complex64),
+                60.0,
+                True,
+                specimen=str(samples.specimens[at][0]),
+            )
+        )
+    return Library(tuple(out))
+
+
+@pytest.mark.parametrize("model", ["knn", "discriminant"])
+def test_what_the_library_lacks_gets_no_name_from_any_model(model):
+    classifier = Classifier(entries(drawn((0.01, 0.05), 12, 3)), model=model, angles_deg=[60.0])
+    strange = {"s": 8.0 - 0.5j, "t": 3.0 - 2.5j, "u": 2.8 - 0.02j, "v": 5.6 - 0.5j}
+    test = drawn((0.01, 0.05), 1, 9, kinds=strange)
+    named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
+    assert [n.verdict.name for n in named] == [UNKNOWN] * len(strange)
+    assert all(n.verdict.confidence > 0.5 for n in named)
+
+
+def test_none_of_these_is_likeliest_where_the_half_space_fits():
+    covariance = 1e-4 * np.eye(3)
+    log_h, t = features(5.0 - 0.5j, [ANGLE])
+    here, away = (cost_of_none(log_h[None] + off, t[None], covariance, [ANGLE])[0] for off in (0.0, 0.1))
+    assert away > here + 10
+
+
+def test_the_knn_is_marked_as_the_papers():
+    assert "paper" in PAPER

@@ -245,7 +245,11 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
                     raise ScanError(f"{file}: simulation failed, see above")
                 scans.append(training_scan(folder, config))
                 shutil.rmtree(folder)
-    note = "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans)) if all(s.simulated for s in scans) else ""
+    note = (
+        "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans))
+        if all(s.simulated for s in scans)
+        else ""
+    )
     library = make_library(told_apart(scans), note)
     library.save(out)
     sys.stdout.write("".join(f"{line}\n" for line in _summary(out, library)))

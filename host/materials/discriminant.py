@@ -188,7 +188,9 @@ class ErrorDiscriminant(Model):
         width = residual.shape[1]
         total = self._independent(_covariance(residual, len(residual)))
         shrink = width / (width + dof)
-        self.spread, placement = fit_spread(residual, material, plate, self._effects, total)
+        self.spread, placement = fit_spread(
+            residual, material, plate, self._effects, total, gains_alike=self.channels == "H+V+P"
+        )
         placement = self._independent(placement) * self._gain_and_phase
         placement = (1 - shrink) * placement + shrink * np.diag(np.diag(placement))
         self.between = _positive(placement - self.within / self.pixels) + 1e-8 * np.eye(width)

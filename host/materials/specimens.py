@@ -86,7 +86,12 @@ def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
 
 
 def fit_spread(
-    residuals: Real, material: npt.NDArray[np.intp], specimen: npt.NDArray[np.intp], effects: Real, noise: Real
+    residuals: Real,
+    material: npt.NDArray[np.intp],
+    specimen: npt.NDArray[np.intp],
+    effects: Real,
+    noise: Real,
+    gains_alike: bool = True,
 ) -> tuple[Real, Real]:
     """The specimens' spread and the placements' covariance that patches' residuals tell: expectation maximisation.
 
@@ -102,6 +107,8 @@ def fit_spread(
         float64 [materials, d, 2], of :func:`effect`.
     noise
         float64 [d, d], covariance to start from.
+    gains_alike
+        Whether the features are ln|H|, ln|V|, arg P of each angle, and gains of H and V err alike (:func:`alike`).
 
     Returns
     -------
@@ -130,14 +137,20 @@ def fit_spread(
         pooled = (PRIOR_FREEDOM * prior + second[used].sum(axis=0)) / (PRIOR_FREEDOM + used.sum())
         left = residuals - np.einsum("gda,ga->gd", f, mean)[group]
         blur = np.einsum("g,gda,gab,geb->de", count.astype(float), f, spread, f)
-        placement = alike((left.T @ left + blur) / len(residuals))
+        placement = (left.T @ left + blur) / len(residuals)
+        placement = alike(placement) if gains_alike else placement
         if np.abs(pooled / before - 1).max() < _SETTLED:
             break
-    own = np.tile(pooled, (len(effects), 1))
+    return _each(pooled, second, kind, telling), placement
+
+
+def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]) -> Real:
+    """The spread of each material: that of all together, corrected by its own specimens' squares [specimen, 2]."""
+    own = np.tile(pooled, (telling.size, 1))
     for k in np.flatnonzero(telling):
         mine = second[kind == k]
         own[k] = (OWN_FREEDOM * pooled + mine.sum(axis=0)) / (OWN_FREEDOM + len(mine))
-    return own, placement
+    return own
 
 
 def alike(covariance: Real) -> Real:

@@ -98,7 +98,11 @@ def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
     spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
     scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
     told = [(e.name, e.specimen, e.permittivity is None) for e in entries_of(training_scan(scan, RIG_FILE))]
-    assert told == [("copper", "small/1", True), ("board", "small/2", False)]
+    assert [(name, unknown) for name, _, unknown in told] == [("copper", True), ("board", False)]
+    assert len({specimen for _, specimen, _ in told}) == 2
+    again = simulate(published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
+    others = {e.specimen for e in entries_of(training_scan(again, RIG_FILE))}
+    assert not others & {specimen for _, specimen, _ in told}, "another simulation of a scene draws other specimens"
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
     told = [(e.name, e.specimen) for e in entries_of(training_scan(scan, RIG_FILE))]

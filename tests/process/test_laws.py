@@ -125,4 +125,5 @@ def test_the_library_never_saw_the_demo_scene():
     library = Library.load(SIMULATED_LIBRARY)
     assert library.simulated
     assert "nine-materials" not in library.scans
-    assert len(library.scans) == 8
+    assert len(library.scans) == 16
+    assert all(len({e.specimen for e in library.entries if e.name == name}) == 16 for name in library.names)

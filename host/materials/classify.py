@@ -148,10 +148,6 @@ class NamedPatch:
     distance: Real
     verdict: PatchName
 
-    def unknown(self) -> NamedPatch:
-        """The same patch, called unknown; its pixels keep their own names."""
-        return replace(self, verdict=replace(self.verdict, name=UNKNOWN, distance=max(self.verdict.distance, 1.0)))
-
 
 class Classifier:
     """Names pixels and patches by the library.
@@ -224,17 +220,17 @@ class Classifier:
         """
         good = [usable(x) for x in patches]
         some = [i for i, g in enumerate(good) if g.any()]
-        nothing = [self._named(g, None, PatchName(UNKNOWN, 0.0, {}, np.inf, 0)) for g in good]
+        out = [self._named(g, None, PatchName(UNKNOWN, 0.0, {}, np.inf, 0)) for g in good]
         if not some:
-            return nothing
+            return out
         number = np.concatenate([np.full(int(good[i].sum()), i) for i in some])
         x = np.concatenate([patches[i][good[i]] for i in some])
         found = self._model.by_scan(x, number, None if errors is None else errors.of(np.array(some)), INCLUSIONS)
         for row, i in enumerate(some):
             at = number == i
             pixels = found.pixel_names[at], found.pixel_distance[at]
-            nothing[i] = self._named(good[i], pixels, self._patch_name(found, row))
-        return nothing
+            out[i] = self._named(good[i], pixels, self._patch_name(found, row))
+        return out
 
     def _patch_name(self, found: NamedScan, row: int) -> PatchName:
         far, confidence = float(found.distance[row]), float(found.confidence[row])

@@ -30,7 +30,7 @@ from scipy.stats import f as f_distribution
 
 from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle
-from polysight.host.materials.specimens import apparent_permittivity, effect, fit_spread, softened
+from polysight.host.materials.specimens import apparent_permittivity, effect, fit_spread, relative
 
 REJECTED = 0.01
 """Share of the known materials' pixels, and of their patches, that may be called unknown."""
@@ -147,7 +147,8 @@ class ErrorDiscriminant(Model):
     ) -> NamedScan:
         """Names in one scan: what all patches' errors have in common is found, and taken off.
 
-        `errors` come to the library's own. With `others`, pixels are named by their patch, up to so large a share.
+        `errors` come to the library's own; they are of one angle, and left out with several.
+        With `others`, pixels are named by their patch, up to so large a share.
         """
         _, patch = np.unique(patches, return_inverse=True)
         ids = np.unique(patches)
@@ -258,12 +259,11 @@ class ErrorDiscriminant(Model):
 
     def _deviations(self, x: Real) -> Real:
         """From every material's anchor, [n, materials, features]."""
-        h, v, t = (c[:, None] for c in by_angle(x))
-        log_h = np.log(np.maximum(h, 1e-6)) - self._anchor_h
-        along = (t - self._anchor_t) * np.exp(-1j * np.angle(self._anchor_t)) / softened(self._anchor_t)
+        h, v, t = by_angle(x)
         if self.channels == "V":  # alone, by its own logarithm
-            return np.log(np.maximum(v, 1e-6)) - self._anchor_v
-        return self._chosen(np.stack([log_h, log_h + along.real, -along.imag], axis=-1))
+            return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
+        log_h = np.log(np.maximum(h, 1e-6))[:, None] - self._anchor_h
+        return self._chosen(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
 
     def _chosen(self, every: Real) -> Real:
         """The columns of the channels from ln|H|, ln|V|, arg P [..., angles, 3], as [..., features]."""

@@ -35,7 +35,8 @@ def explained(
     else:
         others = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)][:2]
         told = f"{found} is what the library's {like} looks like" if found else f"it looks like the library's {like}"
-        why = told + (f"; it could also be {' or '.join(others)}" if others else "; no other material comes near")
+        alone = "; no other material comes near" if name.probabilities else ""  # neighbours alone do not tell
+        why = told + (f"; it could also be {' or '.join(others)}" if others else alone)
     return replace(named, verdict=replace(name, why=why))
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import MODELS, UNKNOWN, Classifier, Entry, Library
-from polysight.host.materials.classify import DISCRIMINANT, PAPER
+from polysight.host.materials.classify import DISCRIMINANT
+from polysight.host.materials.explain import explained
 from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Samples, SceneErrors, feature_matrix
 from polysight.host.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative
@@ -140,5 +141,12 @@ def test_none_of_these_is_likeliest_where_the_half_space_fits():
     assert away > here + 10
 
 
-def test_the_knn_is_marked_as_the_papers():
-    assert "paper" in PAPER
+@pytest.mark.parametrize("model", ["knn", "discriminant"])
+def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
+    samples = drawn((0.01, 0.05), 12, 3)
+    classifier = Classifier(entries(samples), model=model, angles_deg=[60.0])
+    test = drawn((0.0, 0.0), 1, 4)
+    named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
+    told = [explained(n, eps, None, classifier).verdict.why for n, eps in zip(named, KINDS.values(), strict=True)]
+    assert all("looks like" in why for why in told)
+    assert any("no other material" in why for why in told) == (model == "discriminant")

@@ -15,6 +15,7 @@ from polysight.host.imaging.images import TAPERS, ChannelImages, ImageBuilder, S
 from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane, on_their_plane
 from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
+from polysight.host.imaging.tilt import Illumination, Rise, levelled
 
 __all__ = [
     "PLANE_REACH_M",
@@ -24,11 +25,13 @@ __all__ = [
     "Aperture",
     "ChannelImages",
     "Focus",
+    "Illumination",
     "ImageBuilder",
     "ImageGrid",
     "ImagedWith",
     "PlaneEstimate",
     "PointResponse",
+    "Rise",
     "SubBand",
     "SubBandImages",
     "Window",
@@ -37,6 +40,7 @@ __all__ = [
     "focus_sweep",
     "image_grid",
     "imaging_facts",
+    "levelled",
     "on_their_plane",
     "point_response",
     "project",

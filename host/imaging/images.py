@@ -17,6 +17,7 @@ from scipy import ndimage
 from polysight.host.imaging.geometry import Antennas, image_grid
 from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
 from polysight.host.imaging.samples import BoardSamples, Image
+from polysight.host.imaging.tilt import Illumination, illumination_geometry, levelled
 from polysight.host.sync import SyncedRow
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError
@@ -53,6 +54,8 @@ class ChannelImages:
         Board name to complex128 [rx]: gain and phase of each RX, from the direct path, that was divided out.
     notices
         What the user should know of how they were made.
+    lit
+        How both channels light the plane: what a plate's tilt changes. None where that is not known.
     """
 
     h: NDArray[np.complex64]
@@ -66,12 +69,20 @@ class ChannelImages:
     valid: NDArray[np.bool_]
     rx_calibration: dict[str, NDArray[np.complex128]]
     notices: tuple[str, ...] = ()
+    lit: Illumination | None = None
 
     def transposed(self) -> ChannelImages:
         """The images with x and y swapped."""
         pixels = ("h", "v", "h_raw", "v_raw", "h_footprint", "v_footprint", "valid")
         turned = {name: np.ascontiguousarray(getattr(self, name).T) for name in pixels}
-        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m)
+        lit = None if self.lit is None else self.lit.transposed()
+        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, lit=lit)
+
+    def level(self, plate: NDArray[np.bool_]) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
+        """H and V with one plate, bool [ny, nx], as it would be without its tilt."""
+        if self.lit is None:
+            return self.h, self.v
+        return levelled(self.h, self.v, self.lit, [plate], [self.lit.rise(self.h, self.v, plate)])
 
 
 class ImageBuilder:
@@ -111,6 +122,7 @@ class ImageBuilder:
         taper = TAPERS[rig.image.apodisation] if taper is None else taper
         weights = np.outer(_window(taper, plan.rows), _window(taper, plan.columns)).astype(np.float32)
         gated = reduction(rig.chirp, gate, window)
+        self._antennas, self._middle_hz = antennas, float(np.mean(gated.frequencies_hz))
         self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
 
     def add_row(
@@ -141,13 +153,13 @@ class ImageBuilder:
         `offset_m`: on a plane that lies so much farther than the rig file's.
         """
         grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
-        return self._channels({name: board.image(grid) for name, board in self.boards.items()})
+        return self._channels({name: board.image(grid) for name, board in self.boards.items()}, offset_m)
 
     def current(self) -> ChannelImages:
         """The same within 1e-6 of the peak, for looking on: at once where the builder is `live`."""
         return self._channels({name: board.current() for name, board in self.boards.items()})
 
-    def _channels(self, made: dict[str, tuple[Image, Image, str | None]]) -> ChannelImages:
+    def _channels(self, made: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> ChannelImages:
         h, v = made.values()
         visible = np.ones(self.grid.shape, bool)
         for _, weight, _ in (h, v):
@@ -159,7 +171,14 @@ class ImageBuilder:
         calibration = {name: board.rx_calibration() for name, board in self.boards.items()}
         notices = tuple(f"{name}: {notice}" for name, (_, _, notice) in made.items() if notice)
         axes = (self.grid.x_m, self.grid.y_m)
-        return ChannelImages(flat[0], flat[1], h[0], v[0], h[1], v[1], *axes, visible, calibration, notices)
+        lit = self._illumination(np.stack([h[1], v[1]]), float(np.mean(self.grid.z_m)) + offset_m)
+        return ChannelImages(flat[0], flat[1], h[0], v[0], h[1], v[1], *axes, visible, calibration, notices, lit)
+
+    def _illumination(self, footprints: NDArray[np.complex64], z_m: float) -> Illumination:
+        """How both channels light a plane at `z_m`."""
+        moved, steep = zip(*(illumination_geometry(a, z_m, self._middle_hz) for a in self._antennas), strict=True)
+        pitch = self.grid.pixel_m
+        return Illumination(footprints, np.stack(moved), np.array(steep), (pitch, pitch))
 
 
 def _window(name: Window, n: int) -> NDArray[np.float64]:

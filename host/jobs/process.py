@@ -115,7 +115,8 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
 def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
     """Images of a metal plate as the reference of other scans. Raises DataError when they show none."""
     name = pipeline.source.scan_id
-    found = plane_reference(images.h, images.v, images.x_m, images.y_m, images.valid, name=name)
+    h, v = images.level(images.valid)
+    found = plane_reference(h, v, images.x_m, images.y_m, images.valid, name=name)
     return replace(found, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 

@@ -29,6 +29,7 @@ from polysight.host.materials.permittivity import Permittivity, inverse_spread, 
 from polysight.host.materials.result import MaterialsResult, PatchResult
 from polysight.host.materials.scene_errors import scene_errors
 from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
+from polysight.host.materials.tilts import level
 from polysight.host.materials.truth import match_truth
 from polysight.host.polarimetry import (
     Calibrated,
@@ -71,6 +72,7 @@ def analyse(
         plane.check_axes(images.x_m, images.y_m)
         images = images.within(plane.valid)
     found = _patches(images, plane, known)
+    images, tilts = level(images, found)
     reference = _reference(images, metal, found)
     raw = to_metal(images.h, images.v, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
@@ -102,7 +104,9 @@ def analyse(
         for p in found.patches
     )
     library = () if classifier is None else classifier.library.names
-    return MaterialsResult(calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, library=library)
+    return MaterialsResult(
+        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, library=library, tilts=tilts
+    )
 
 
 def _names(

@@ -30,15 +30,16 @@ from scipy.stats import f as f_distribution
 
 from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle
-from polysight.host.materials.specimens import apparent_permittivity, effect, fit_spread, relative
+from polysight.host.materials.specimens import apparent_permittivity, effect, fit_spread, relative, without
 
-REJECTED = 0.01
+REJECTED = 0.02
 """Share of the known materials' pixels, and of their patches, that may be called unknown."""
 NONE = 0.02
 """Probability, before anything is measured, that a patch is none of the library's materials."""
 METAL_LIKE = 0.25
 """|1/P - 1| of a patch below this: the reference or another metal. It has no error of its own, so it tells of none."""
 _ROUNDS = 30
+_TURNS = 2  # of what the scene has in common, and of what it makes of patches that are none
 _BEYOND = 1.001  # the least distance of what is unknown
 _LN_2PI = float(np.log(2 * np.pi))
 
@@ -47,12 +48,14 @@ _LN_2PI = float(np.log(2 * np.pi))
 class _Scene:
     """What a scan's patches have in common: an error, its covariance, and what it does to each patch.
 
-    `design` [patch, d, q] turns the error's q numbers into deviations; `value` [q]; `covariance` [q, q].
+    `design` [patch, d, q] turns the error's q numbers into deviations; `value` [q]; `covariance` [q, q]; `precision`
+    [q, q] is what was known before any patch was seen.
     """
 
     design: Real
     value: Real
     covariance: Real
+    precision: Real
 
     @property
     def shift(self) -> Real:
@@ -155,14 +158,18 @@ class ErrorDiscriminant(Model):
         d = self._deviations(x) - self.level
         mean = np.stack([d[patch == i].mean(axis=0) for i in range(ids.size)])
         tells = ~self._metal_like(x, patch)
-        own = self._patch_covariances(min([self.pixels, *np.bincount(patch).tolist()]))
+        pixels = float(min([self.pixels, *np.bincount(patch).tolist()]))
+        own = self._patch_covariances(pixels)
         mine = np.zeros((ids.size, *self.scan.shape))
         if errors is not None and errors.own.shape[1:] == mine.shape[1:]:
             mine = errors.own
         else:
             errors = None
-        none = self._none(x, patch, own + mine.mean(axis=0))
-        scene = self._scene(mean, own + mine[:, None], errors, tells, none)
+        placed, scene = self.within / pixels + self.between + mine, self._before(ids.size, errors)
+        for _ in range(_TURNS):
+            none = self._none(x, patch, placed, scene)
+            scene = self._scene(mean, own + mine[:, None], scene, tells, none)
+        none = self._none(x, patch, placed, scene)
         q, cost = _costs(mean - scene.shift[:, None], own + (mine + scene.spread)[:, None])
         probability, far = _probabilities(cost, none), np.sqrt(q / self.patch_level)
         at = np.arange(ids.size), cost.argmin(axis=1)
@@ -202,24 +209,28 @@ class ErrorDiscriminant(Model):
         apart = every.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
         return self._chosen(apart).swapaxes(1, 2)
 
-    def _scene(self, mean: Real, own: Real, errors: SceneErrors | None, tells: npt.NDArray, none: Real) -> _Scene:
-        """The error that a scan's patches have in common, from their deviations [patches, materials, d].
-
-        Which material a patch is, is as uncertain as the last round left it; a patch that is none of them counts for
-        nothing. Without patches it is zero, as uncertain as it is from scan to scan.
-        """
-        count, _, width = mean.shape
+    def _before(self, count: int, errors: SceneErrors | None) -> _Scene:
+        """The error that so many patches have in common before any is seen: zero, as uncertain as scans differ."""
+        width = len(self.scan)
         design, prior = np.tile(np.eye(width), (count, 1, 1)), self.scan
         if errors is not None:
             design = np.concatenate([design, errors.design], axis=2)
             both = np.zeros((design.shape[2],) * 2)
             both[:width, :width], both[width:, width:] = prior, errors.covariance
             prior = both
-        scene = _Scene(design, np.zeros(len(prior)), prior)
+        return _Scene(design, np.zeros(len(prior)), prior, np.linalg.inv(prior))
+
+    @staticmethod
+    def _scene(mean: Real, own: Real, scene: _Scene, tells: npt.NDArray, none: Real) -> _Scene:
+        """The error that a scan's patches have in common, from their deviations [patches, materials, d].
+
+        Which material a patch is, is as uncertain as the last round left it; a patch that is none of them counts for
+        nothing. Where fewer than two patches tell it stays as it was before.
+        """
         at = np.flatnonzero(tells)
         if at.size < 2:
             return scene
-        precision, g = np.linalg.inv(prior), design[at]
+        design, precision, g = scene.design, scene.precision, scene.design[at]
         for _ in range(_ROUNDS):
             _, cost = _costs(mean - scene.shift[:, None], own + scene.spread[:, None])
             weight = _probabilities(cost, none)[at, :-1]
@@ -227,20 +238,28 @@ class ErrorDiscriminant(Model):
             covariance = np.linalg.inv(precision + np.sum(g.mT @ information @ g, axis=0))
             told = np.sum(g.mT @ (information @ middle[:, :, None]), axis=0)[:, 0]
             before, value = scene.value, covariance @ told
-            scene = _Scene(design, value, covariance)
+            scene = _Scene(design, value, covariance, precision)
             if np.abs(design @ (value - before)).max() < 1e-7:
                 break
         return scene
 
-    def _none(self, x: Real, patch: npt.NDArray[np.intp], covariances: Real) -> Real:
-        """Minus twice the log likelihood of each patch as any other half space, [patch]; see `none_of_these.py`."""
+    def _none(self, x: Real, patch: npt.NDArray[np.intp], covariances: Real, scene: _Scene) -> Real:
+        """Minus twice the log likelihood of each patch as any other half space, [patch]; see `none_of_these.py`.
+
+        `covariances` [patch, d, d] of the patches' own errors; the scene's come to them, as for the materials.
+        """
         h, _, t = by_angle(x)
         log_h = np.stack([np.log(np.maximum(h[patch == i], 1e-6)).mean(axis=0) for i in range(patch.max() + 1)])
         middle = np.stack([t[patch == i].mean(axis=0) for i in range(patch.max() + 1)])
-        typical = np.median(covariances, axis=tuple(range(covariances.ndim - 2)))
+        covariances = covariances + scene.spread
         if self.channels != "H+V+P" or not len(self.angles_rad):  # no wave to compare with: as at the threshold
-            return np.full(len(middle), self.patch_level + np.linalg.slogdet(typical)[1] + len(typical) * _LN_2PI)
-        return cost_of_none(log_h, middle, typical, self.angles_rad) - 2 * np.log(NONE / (1 - NONE) * self.names.size)
+            return np.asarray(
+                self.patch_level + np.linalg.slogdet(covariances)[1] + covariances.shape[1] * _LN_2PI, np.float64
+            )
+        log_h, middle = without(log_h, middle, scene.shift.reshape(*middle.shape, 3))
+        return cost_of_none(log_h, middle, covariances, self.angles_rad) - 2 * np.log(
+            NONE / (1 - NONE) * self.names.size
+        )
 
     def _anchor(self, x: Real, of: npt.NDArray[np.intp]) -> None:
         """Where each material's features are expanded: its pixels' means."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.imaging import ChannelImages
+from polysight.host.imaging import ChannelImages, Illumination
 from polysight.host.materials.inversion import Uncertain
 from polysight.host.materials.segment import Box, Segmentation, SegmentSettings
 from polysight.host.materials.truth import TruthPlate
@@ -32,6 +32,8 @@ class ImagePair:
         Pixel centres, metres, [nx] and [ny].
     valid
         bool [ny, nx]; None: all of it.
+    lit
+        How both channels light the plane; None: nothing is known of tilts.
     """
 
     h: Image
@@ -39,11 +41,12 @@ class ImagePair:
     x_m: npt.ArrayLike
     y_m: npt.ArrayLike
     valid: npt.NDArray[np.bool_] | None = None
+    lit: Illumination | None = None
 
     @classmethod
     def of(cls, images: ChannelImages) -> ImagePair:
         """The pair of channel images as imaging makes them."""
-        return cls(images.h, images.v, images.x_m, images.y_m, images.valid)
+        return cls(images.h, images.v, images.x_m, images.y_m, images.valid, images.lit)
 
     @property
     def usable(self) -> npt.NDArray[np.bool_]:

@@ -14,14 +14,14 @@ from polysight.host.materials.segment import Mask, Patch, Segmentation
 
 Image = npt.NDArray[np.complexfloating]
 
-SPREAD_SHARE = 0.45
+SPREAD_SHARE = 0.40
 """Error of a patch's V / H beside the spread of its pixels: speckle averages out, edges and neighbours do not.
 
 Fitted to simulated scenes (benchmarks/coverage), with the next two.
 """
-LEAST_STD = 1.55e-3
+LEAST_STD = 1.4e-3
 """Error of V / H that is there however even the pixels are: H and V are lit from points some 15 mm apart."""
-TILT_STD = 0.0145
+TILT_STD = 0.004
 """Error of V / H for a phase of H that spreads over the patch by one radian.
 
 A tilted plate is lit from elsewhere, and for H and V differently; one degree of tilt spreads the phase by 0.3 rad."""

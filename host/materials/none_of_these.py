@@ -24,21 +24,22 @@ _STEPS, _STEP = 8, 1e-4
 _PRIOR = 1 / (np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS))
 
 
-def cost_of_none(log_h: Real, t: Complex, covariance: Real, angles_rad: Sequence[float]) -> Real:
+def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequence[float]) -> Real:
     """Minus twice the log likelihood of each patch as any half space.
 
     Parameters
     ----------
     log_h, t
         ln|H| and V / H of the patches, [patch, angles].
-    covariance
-        float64 [3 * angles, 3 * angles] of their ln|H|, ln|V|, arg P, specimens' spread apart.
+    covariances
+        float64 [patch, 3 * angles, 3 * angles] of their ln|H|, ln|V|, arg P, specimens' spread apart.
     angles_rad
         Incidence angles.
     """
-    inverse = np.asarray(np.linalg.inv(covariance), np.float64)
-    constant = np.linalg.slogdet(covariance)[1] + len(covariance) * np.log(2 * np.pi)
-    return np.array([_one(h, q, inverse, angles_rad) + constant for h, q in zip(log_h, t, strict=True)])
+    inverse = np.asarray(np.linalg.inv(covariances), np.float64)
+    constant = np.linalg.slogdet(covariances)[1] + covariances.shape[1] * np.log(2 * np.pi)
+    every = zip(log_h, t, inverse, strict=True)
+    return np.asarray(constant + np.array([_one(h, q, i, angles_rad) for h, q, i in every]), np.float64)
 
 
 def _one(log_h: Real, t: Complex, inverse: Real, angles_rad: Sequence[float]) -> float:

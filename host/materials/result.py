@@ -15,10 +15,12 @@ from polysight.host.materials.measure import Refused, background, ratio_sigma
 from polysight.host.materials.metal import MetalReference
 from polysight.host.materials.permittivity import NOTHING, Permittivity
 from polysight.host.materials.segment import Patch, Segmentation
+from polysight.host.materials.tilts import Tilts
 from polysight.host.materials.truth import TruthPlate
 from polysight.host.polarimetry import Calibrated
 
 Image = npt.NDArray[np.complexfloating]
+LEVEL = Tilts({}, 1)
 SHRINKS = {
     "noise": "a larger plate, a finer grid or more pulses a position",
     "metal reference": "a larger metal plate, or `polysight calibrate metal`",
@@ -92,6 +94,8 @@ class MaterialsResult:
         Names of the materials that patches were compared with; empty when nothing was named.
     withheld
         Whether the verdict is `no result`: rows hold no name, no ratio and no permittivity then.
+    tilts
+        How the plates lie beside the image's plane; already taken out of `h` and `v`.
     """
 
     calibrated: Calibrated
@@ -108,6 +112,7 @@ class MaterialsResult:
     boxes: dict[int, str] = field(default_factory=dict)
     library: tuple[str, ...] = ()
     withheld: bool = False
+    tilts: Tilts = LEVEL
 
     def rows(self) -> list[dict[str, Any]]:
         """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""
@@ -143,6 +148,8 @@ class MaterialsResult:
         level = np.abs(self.h[r.patch.interior])
         level = level[np.isfinite(level)]
         row["amplitude_h"] = round(float(np.median(level)), 6) if level.size else None
+        if r.patch.label in self.tilts.rises:
+            row["tilt_deg"] = [round(float(np.degrees(t)), 3) for t in self.tilts.rises[r.patch.label]]
         if r.patch.label in self.bands:
             row["bands"] = self.bands[r.patch.label]
         if r.patch.label in self.boxes:

@@ -22,7 +22,7 @@ PUBLISHED_SPREAD = (0.027, 0.19)
 Fig. 17 of the paper (variances 0.0021 and 0.0295 of 3.78 and 4.75; 0.0255 and 0.1081 of 0.70 and 2.43)."""
 PRIOR_FREEDOM = 4.0
 """How many specimens' worth of evidence that is, beside the library's own specimens."""
-OWN_FREEDOM = 10.0
+OWN_FREEDOM = 20.0
 """How many specimens' worth of evidence the mean of all materials is, for one material's own spread."""
 SOFT = 0.05
 """|V / H| below which its errors are taken to be additive (leakage, noise) instead of relative (gain, phase)."""
@@ -77,6 +77,12 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
     """
     along = dt * np.exp(-1j * np.angle(t)) / softened(t)
     return np.stack([log_h, log_h + along.real, -along.imag], axis=-1)
+
+
+def without(log_h: Real, t: Complex, deviations: Real) -> tuple[Real, Complex]:
+    """ln|H| and t [..., angles] with deviations [..., angles, 3] taken off: :func:`relative` undone."""
+    h, v, phase = (deviations[..., i] for i in range(3))
+    return log_h - h, t - softened(t) * ((v - h) - 1j * phase) * np.exp(1j * np.angle(t))
 
 
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:

@@ -17,12 +17,13 @@ import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages, SubBand
 from polysight.host.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
-from polysight.host.materials.inputs import Optics
+from polysight.host.materials.inputs import ImagePair, Optics
 from polysight.host.materials.inversion import ratio_slopes
 from polysight.host.materials.layers import Bands, Spectrum
 from polysight.host.materials.measure import seen
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.materials.result import MaterialsResult
+from polysight.host.materials.tilts import level
 from polysight.host.polarimetry import PlaneReference
 from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError
@@ -148,7 +149,8 @@ def _relative_to_metal(
     if not metal.mask.any():
         nothing = np.full(made.valid.shape, complex(np.nan, np.nan))
         return nothing, nothing, float("nan")
-    h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (made.h, made.v))
+    pair, _ = level(ImagePair.of(made), found.segmentation, found.tilts)
+    h, v = (np.where(made.valid, c, complex(np.nan, np.nan)).astype(c.dtype) for c in (pair.h, pair.v))
     relative = without_leakage(to_metal(h, v, metal, reference), leakage)
     h, v = (smooth_inside(c, found.segmentation, smooth_px) for c in (relative.h, relative.v))
     return h, v, reference_spread(h, v, metal, reference)

@@ -22,6 +22,7 @@ from polysight.host.verdict import (
     plane_reasons,
     recording_reasons,
     signal_reasons,
+    tilt_reasons,
     verdict_of,
 )
 
@@ -81,6 +82,8 @@ def judge(
         std = float(np.degrees(found.prior.theta_std_rad))
         tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
         reasons += plane_reasons(plane.known, 1e3 * plane.offset_m, tilt, std)
+    judged = {r.patch.label for r in found.patches if r.refused is None}
+    reasons += tilt_reasons({k: float(np.degrees(found.tilts.across_rad(k))) for k in judged})
     if classifier is not None and len(classifier.angles_deg) == 1:
         angle = float(np.degrees(np.mean(found.theta_rad)))
         reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))

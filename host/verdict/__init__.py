@@ -16,6 +16,7 @@ from polysight.host.verdict.rules import (
     plane_reasons,
     recording_reasons,
     signal_reasons,
+    tilt_reasons,
 )
 from polysight.host.verdict.verdict import LEVELS, Level, NoResult, Reason, Verdict, read_verdict, verdict_of
 
@@ -36,5 +37,6 @@ __all__ = [
     "read_verdict",
     "recording_reasons",
     "signal_reasons",
+    "tilt_reasons",
     "verdict_of",
 ]

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials import MODELS, UNKNOWN, Classifier, Entry, Library
+from polysight.host.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
 from polysight.host.materials.classify import DISCRIMINANT
 from polysight.host.materials.explain import explained
 from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Samples, SceneErrors, feature_matrix
-from polysight.host.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative
+from polysight.host.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative, without
 from polysight.host.polarimetry import fresnel
+from polysight.papers.sensys2026.patches import Errors, draw, groups
 
 ANGLE = np.radians(60.0)
 KINDS = {"a": 2.2 - 0.02j, "b": 3.0 - 0.6j, "c": 4.0 - 0.3j, "d": 5.0 - 1.2j, "e": 6.5 - 0.2j, "f": 4.7 - 2.4j}
@@ -135,10 +136,36 @@ def test_what_the_library_lacks_gets_no_name_from_any_model(model):
 
 
 def test_none_of_these_is_likeliest_where_the_half_space_fits():
-    covariance = 1e-4 * np.eye(3)
+    covariance = 1e-4 * np.eye(3)[None]
     log_h, t = features(5.0 - 0.5j, [ANGLE])
     here, away = (cost_of_none(log_h[None] + off, t[None], covariance, [ANGLE])[0] for off in (0.0, 0.1))
     assert away > here + 10
+
+
+@pytest.mark.parametrize("own", [10.0, 40.0])
+def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
+    """They are compared with none of these under the same errors: of the rig, and of what the scan has in common.
+
+    The liquids' features differ by far more than the errors, and their specimens' effects by more than that: any mean
+    of the materials' covariances is far from each.
+    """
+    monkeypatch.setattr(specimens, "OWN_FREEDOM", own)
+    liquids, errors = groups()["liquids"].materials, Errors(0.00356, 0.022, spread=(0.05, 0.2))
+    model = MODELS[DISCRIMINANT]("H+V+P").fit(draw(liquids, 55.0, errors, 43, 8).samples())
+    test = draw(liquids, 55.0, errors, 500, 12).samples()
+    rejected = []
+    for scan in np.unique(test.groups):
+        mine = test.take(test.groups == scan)
+        rejected += (model.by_scan(mine.x, mine.patches).distance > 1).tolist()
+    assert np.mean(rejected) < 0.1
+
+
+def test_deviations_taken_off_are_those_that_were_put_on():
+    (here_h, here_t), (there_h, there_t) = (features(eps, [ANGLE]) for eps in (4.0 - 0.4j, 4.01 - 0.405j))
+    there = relative(there_h - here_h, there_t - here_t, here_t)
+    back_h, back_t = without(there_h, here_t + (there_t - here_t), there)
+    assert back_h == pytest.approx(here_h)
+    assert back_t == pytest.approx(here_t, abs=1e-4)
 
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])

@@ -19,6 +19,7 @@ from polysight.host.verdict import (
     read_verdict,
     recording_reasons,
     signal_reasons,
+    tilt_reasons,
     verdict_of,
 )
 
@@ -137,6 +138,8 @@ def test_other_rules():
     assert level(plane_reasons(False, 0.0, (0.0, 0.0), 0.3)) == "care"
     assert level(plane_reasons(True, 10.0, (0.0, 0.0), 0.1)) == "care"
     assert level(plane_reasons(True, 0.2, (0.1, 0.0), 0.1)) == "good"
+    assert level(tilt_reasons({1: 0.3, 2: -0.2})) == "good"
+    assert level(tilt_reasons({1: 0.3, 2: -0.8})) == "care"
     assert level(incidence_reasons(55.0, 54.9)) == "good"
     assert level(incidence_reasons(55.5, 54.9)) == "care"
 
@@ -157,6 +160,7 @@ def test_every_reason_says_what_why_and_what_to_do():
         *plane_reasons(True, 9.0, (0.9, 0.0), 0.3),
         *level_reasons({"H": 9.0, "V": 0.1}),
         *incidence_reasons(57.0, 54.9),
+        *tilt_reasons({1: 1.0, 4: -2.0}),
     ]
     assert len(reasons) >= 16
     for r in reasons:

@@ -1,0 +1,93 @@
+"""Tilted plates: their images tell the tilt, and show what level plates show. Scenes from the independent simulator."""
+
+import numpy as np
+import pytest
+
+from benchmarks.coverage import Cubes
+from polysight.host.imaging import Illumination, levelled
+from polysight.host.materials.segment import box_mask
+from polysight.host.pipeline import Pipeline
+from polysight.simulators.scene import decode_scene
+
+PLACES = [(-60.0, 40.0), (0.0, 40.0), (60.0, 40.0), (-60.0, -40.0), (0.0, -40.0), (60.0, -40.0)]
+TILTS_DEG = [(0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-0.7, 0.7), (0.5, -1.0)]
+
+
+@pytest.fixture(scope="module")
+def tilted(rig):
+    """Images of six plates of one material, each tilted as TILTS_DEG; and of the same six, level."""
+    return [_images(rig, tilts) for tilts in (TILTS_DEG, [(0.0, 0.0)] * 6)]
+
+
+def _images(rig, tilts):
+    plates = [
+        {"name": "a", "centre_mm": list(at), "size_mm": [45.0, 45.0], "permittivity": [4.0, 0.4], "tilt_deg": list(t)}
+        for at, t in zip(PLACES, tilts, strict=True)
+    ]
+    grid = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
+    scene = {"name": "tilts", "object_distance_mm": 499.0, "grid": grid, "plates": plates}
+    pipeline = Pipeline(Cubes(rig, decode_scene(scene, "tilts")))
+    for row in pipeline.source.rows():
+        pipeline.add_row(row)
+    return pipeline.form_images()
+
+
+def _insides(images):
+    return [box_mask((x - 12, y - 12, x + 12, y + 12), images.x_m, images.y_m) for x, y in PLACES]
+
+
+def _ratios(h, v, masks):
+    return np.array([np.median((v[m] / h[m]).real) + 1j * np.median((v[m] / h[m]).imag) for m in masks])
+
+
+def test_the_phase_of_a_patch_tells_its_tilt(tilted):
+    images = tilted[0]
+    found = [images.lit.rise(images.h, images.v, mask) for mask in _insides(images)]
+    assert np.degrees(found) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
+
+
+def test_a_tilted_plate_shows_the_ratio_and_brightness_of_a_level_one(tilted):
+    images, level = tilted
+    masks = _insides(images)
+    rises = [images.lit.rise(images.h, images.v, mask) for mask in masks]
+    h, v = levelled(images.h, images.v, images.lit, masks, rises)
+    truth = _ratios(level.h, level.v, masks)
+    before, after = (np.abs(_ratios(*c, masks) / truth - 1) for c in ((images.h, images.v), (h, v)))
+    assert before.max() > 0.02
+    assert after.max() < 0.01
+    brightness = [np.median(np.abs(h[m])) / np.median(np.abs(level.h[m])) for m in masks]
+    assert np.array(brightness) == pytest.approx(1, abs=0.015)
+
+
+def test_tilts_turn_with_the_image(tilted):
+    images = tilted[0]
+    turned = images.transposed()
+    assert (images.lit.across, turned.lit.across) == (1, 0)
+    for mask in _insides(images):
+        rise, other = images.lit.rise(images.h, images.v, mask), turned.lit.rise(turned.h, turned.v, mask.T)
+        assert other[::-1] == pytest.approx(rise, abs=1e-9)
+        factors, swapped = images.lit.to_level(mask, rise), turned.lit.to_level(mask.T, other)
+        assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
+
+
+def test_noise_and_phases_too_steep_for_a_plate_tell_no_tilt():
+    rng = np.random.default_rng(1)
+    flat = np.ones((2, 40, 40), np.complex64)
+    lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+    mask = np.ones((40, 40), bool)
+    noise = rng.standard_normal((40, 40)) + 1j * rng.standard_normal((40, 40))
+    assert lit.rise(noise, noise, mask) == (0.0, 0.0)
+    steep = np.exp(-1j * 0.08 * 1900 * 2e-3 * np.arange(40))[None, :] * np.ones((40, 1))
+    assert lit.rise(steep, steep, mask) == pytest.approx((0.0, 0.0))
+    gentle = np.exp(-1j * 0.02 * 1900 * 2e-3 * np.arange(40))[None, :] * np.ones((40, 1))
+    assert lit.rise(gentle, gentle, mask) == pytest.approx((0.02, 0.0))
+
+
+def test_factors_stay_finite_at_the_edge_of_the_light():
+    footprints = np.ones((2, 20, 20), np.complex64)
+    footprints[:, :, 10:] = 0
+    lit = Illumination(footprints, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+    factors = lit.to_level(np.ones((20, 20), bool), (0.02, 0.0))
+    assert np.isfinite(factors).all()
+    assert factors.min() > 0.5
+    assert factors.max() < 2

@@ -107,7 +107,7 @@ def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -
         bend += (np.eye(2) - np.outer(e[:2], e[:2])) / r
         cosines += float(e[2])
     wave = 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S
-    return np.linalg.inv(bend) * cosines, wave * cosines
+    return np.asarray(np.linalg.inv(bend) * cosines, np.float64), wave * cosines
 
 
 def levelled(

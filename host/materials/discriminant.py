@@ -218,7 +218,7 @@ class ErrorDiscriminant(Model):
             both = np.zeros((design.shape[2],) * 2)
             both[:width, :width], both[width:, width:] = prior, errors.covariance
             prior = both
-        return _Scene(design, np.zeros(len(prior)), prior, np.linalg.inv(prior))
+        return _Scene(design, np.zeros(len(prior)), prior, np.asarray(np.linalg.inv(prior), np.float64))
 
     @staticmethod
     def _scene(mean: Real, own: Real, scene: _Scene, tells: npt.NDArray, none: Real) -> _Scene:

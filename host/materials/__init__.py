@@ -23,6 +23,7 @@ from polysight.host.materials.concentration import (
     fit_concentration,
     polarisation_angle_rad,
 )
+from polysight.host.materials.discriminant import REJECTED
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, ImagePair, KnownScene, MetalChoice, Optics
 from polysight.host.materials.inversion import (
     Inversion,
@@ -82,7 +83,7 @@ from polysight.host.materials.published import (
     told_angle,
 )
 from polysight.host.materials.result import MaterialsResult, PatchResult
-from polysight.host.materials.samples import CHANNELS, Samples, feature_matrix
+from polysight.host.materials.samples import CHANNELS, Model, Samples, SceneErrors, feature_matrix
 from polysight.host.materials.segment import (
     Box,
     Patch,
@@ -129,6 +130,7 @@ __all__ = [
     "NOT_PASSIVE",
     "PAPER",
     "PATCHES",
+    "REJECTED",
     "SAME_ANGLE_DEG",
     "SHORT",
     "SIMULATED_LIBRARY",
@@ -154,6 +156,7 @@ __all__ = [
     "MetalChoice",
     "MetalEvidence",
     "MetalReference",
+    "Model",
     "NamedPatch",
     "Optics",
     "Patch",
@@ -164,6 +167,7 @@ __all__ = [
     "Plates",
     "Refused",
     "Samples",
+    "SceneErrors",
     "Score",
     "Seen",
     "SeenPatches",

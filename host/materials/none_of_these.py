@@ -38,34 +38,30 @@ def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequenc
     """
     inverse = np.asarray(np.linalg.inv(covariances), np.float64)
     constant = np.linalg.slogdet(covariances)[1] + covariances.shape[1] * np.log(2 * np.pi)
-    every = zip(log_h, t, inverse, strict=True)
-    return np.asarray(constant + np.array([_one(h, q, i, angles_rad) for h, q, i in every]), np.float64)
-
-
-def _one(log_h: Real, t: Complex, inverse: Real, angles_rad: Sequence[float]) -> float:
-    start = apparent_permittivity(t, angles_rad)
+    start = np.array([apparent_permittivity(q, angles_rad) for q in t])
     low = np.array([np.log(REAL_RANGE[0]), 0.0])
     high = np.array([np.log(REAL_RANGE[1]), np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)])
-    at = np.clip(np.array([np.log(start.real), np.arcsinh(-start.imag / SOFT_LOSS)]), low, high)
-    best, curvature = np.inf, np.eye(2)
+    at = np.clip(np.stack([np.log(start.real), np.arcsinh(-start.imag / SOFT_LOSS)], axis=1), low, high)
+    best, curvature = np.full(len(t), np.inf), np.tile(np.eye(2), (len(t), 1, 1))
     for _ in range(_STEPS):
         off, slope = _off(at, log_h, t, angles_rad)
-        information = slope.T @ inverse @ slope + 1e-9 * np.eye(2)
-        cost = float(off @ inverse @ off)
-        if cost < best:
-            best, curvature = cost, information
-        step = np.linalg.solve(information, slope.T @ inverse @ off)
-        at = np.asarray(np.clip(at - step, low, high), np.float64)
-    return best - 2 * np.log(_PRIOR * 2 * np.pi) + float(np.linalg.slogdet(curvature)[1])
+        weighed = slope.mT @ inverse
+        information = weighed @ slope + 1e-9 * np.eye(2)
+        cost = np.einsum("pd,pde,pe->p", off, inverse, off)
+        better = cost < best
+        best, curvature = np.where(better, cost, best), np.where(better[:, None, None], information, curvature)
+        step = np.linalg.solve(information, weighed @ off[..., None])[..., 0]
+        at = np.clip(at - step, low, high)
+    return np.asarray(constant + best - 2 * np.log(_PRIOR * 2 * np.pi) + np.linalg.slogdet(curvature)[1], np.float64)
 
 
 def _off(at: Real, log_h: Real, t: Complex, angles_rad: Sequence[float]) -> tuple[Real, Real]:
-    """Deviations of a half space from what was seen, [d], and their derivatives by its two numbers, [d, 2]."""
+    """Deviations of half spaces at [patch, 2] from what was seen, [patch, d], and their derivatives, [patch, d, 2]."""
 
-    def deviations(one: Real) -> Real:
-        own_h, own_t = features(complex(np.exp(one[0]), -SOFT_LOSS * np.sinh(one[1])), angles_rad)
-        return relative(own_h - log_h, own_t - t, t).ravel()
+    def deviations(where: Real) -> Real:
+        own_h, own_t = features(np.exp(where[:, 0]) - 1j * SOFT_LOSS * np.sinh(where[:, 1]), angles_rad)
+        return relative(own_h - log_h, own_t - t, t).reshape(len(t), -1)
 
     here = deviations(at)
-    steps = np.eye(2) * _STEP
-    return here, np.stack([(deviations(at + step) - here) / _STEP for step in steps], axis=1)
+    columns = [(deviations(at + step) - here) / _STEP for step in np.eye(2) * _STEP]
+    return here, np.stack(columns, axis=-1)

@@ -15,9 +15,20 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from polysight.host.materials import CHANNELS, DISCRIMINANT, PAPER, Samples, Score, best_model, score, strangers
+from polysight.host.materials import (
+    CHANNELS,
+    DISCRIMINANT,
+    PAPER,
+    REJECTED,
+    Samples,
+    Score,
+    best_model,
+    score,
+    strangers,
+)
 from polysight.host.polarimetry import fresnel
 from polysight.host.report import INK, PALETTE
+from polysight.papers.sensys2026.accuracy_curves import curves_picture
 from polysight.papers.sensys2026.item import Item, Picture, Run, Table, dress, new_figure, percent
 from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups
 from polysight.papers.sensys2026.specimen_spread import spread_table
@@ -134,7 +145,7 @@ def unknowns(quick: bool) -> Table:
             percent(float(np.mean(list(missed.values())))), ", ".join(never) or "–",
         ))  # fmt: skip
     head = ("Task", "known, called unknown", "never learnt, called unknown", "taken for another more often than not")
-    return Table("Patches called unknown; 1 % of the known ones are meant to be", head, tuple(rows))
+    return Table(f"Patches called unknown; {REJECTED:.0%} of the known ones are meant to be", head, tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -231,7 +242,8 @@ def fig18(run: Run) -> Item:
             unknowns(run.quick),
             sensitivity(),
         ),
-        {s.task.replace(", ", "-").replace(" ", "-"): s.picture() for s in scores},
+        {s.task.replace(", ", "-").replace(" ", "-"): s.picture() for s in scores}
+        | {"conditions": curves_picture(run.quick)},
         {s.task: s.plain(run.quick) for s in scores},
     )
 

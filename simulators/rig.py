@@ -27,6 +27,7 @@ from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.faults import read_faults
 from polysight.simulators.loopback import on_free_subnet
 from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.radars import make_image
 from polysight.simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight.simulators.wires import MAX_SOCKET_PATH
 
@@ -65,6 +66,9 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
     if native:
         under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+        image = folder / "firmware.bin"  # the boards come with an empty flash
+        image.write_bytes(make_image())
+        table["radar"]["firmware"] = str(image)
     table["stage"]["port"] = str(folder / "ttySTAGE")
     table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
     # Its processes share a machine's cores with whatever else runs there, which a real rig's do not.

@@ -18,6 +18,7 @@ START_HZ_PER_CODE = 3.6e9 / 2**26  # ICD 81
 SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6  # ICD 83: 48.279 kHz/us
 CHIRP_TICK_US, FRAME_TICK_US = 0.01, 0.005
 STOP_AT_FRAME_END, START, STOP_WHILE_WAITING = 0, 1, 4  # ICD 178
+SOFTWARE_TRIGGER, HARDWARE_TRIGGER = 1, 2  # ICD 92
 IfMode = Literal["complex1x", "complex2x"]
 
 
@@ -65,6 +66,7 @@ class Bare(Command):
 RF_POWER_UP = Bare(0x4000)  # ICD 269; must never be sent again (ICD 20)
 RF_INIT = Bare(0x00C0)
 GET_RF_VERSION = Bare(0x0220)
+GET_DIE_ID = Bare(0x0223)  # ICD 188
 GET_MAIN_VERSION = Bare(0x40E0)
 GET_TEMPERATURES = Bare(0x02EA)
 
@@ -221,7 +223,7 @@ class Chirp(Command):
 
 @dataclass(frozen=True)
 class Frame(Command):
-    """Frames of `loops` chirps, each started by an edge of SYNC_IN (ICD 90-94).
+    """Frames of `loops` chirps, each started by an edge of SYNC_IN, or all at once by software (ICD 90-94).
 
     `samples` goes where the ICD has a reserved field and TI's library 16-bit words per chirp: twice as many.
     """
@@ -232,13 +234,13 @@ class Frame(Command):
     samples: int
     loops: int = 1
     trigger_delay_us: float = 0.0
-    HARDWARE: ClassVar[int] = 2
+    trigger: int = HARDWARE_TRIGGER
 
     def data(self) -> bytes:
         """Chirps, loops, frames, words, period, trigger, delay."""
         period, delay = (round(t / FRAME_TICK_US) for t in (self.period_us, self.trigger_delay_us))
         words = 2 * self.samples
-        return struct.pack("<6HIHHI", 0, 0, 0, self.loops, self.frames, words, period, self.HARDWARE, 0, delay)
+        return struct.pack("<6HIHHI", 0, 0, 0, self.loops, self.frames, words, period, self.trigger, 0, delay)
 
 
 @dataclass(frozen=True)

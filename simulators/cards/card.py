@@ -283,7 +283,10 @@ class SimulatedCard:
         self.endpoint = CardEndpoint(board.name, network, faults, seed, time_scale, clock_s, pace)
         dead_s = (rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6  # pulses at a time scale are less regular than real ones
         native = rig.radar.control == "native"
-        self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses) if native else None
+        die = 1 + [b.name for b in rig.boards].index(board.name)
+        self.radar = (
+            RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die=die) if native else None
+        )
         self._sync = SyncInput(rig, self.radar)
         self._events = PulseEvents(faults)
         self._pulse_faults = PulseFaults(faults, seed, board.name)

@@ -11,7 +11,7 @@ from polysight.host.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameC
 from polysight.host.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight.host.radar.program import program
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import Fault
+from polysight.simulators.radars import Fault, cores
 from polysight.simulators.radars import board as simulated
 
 FRAMES = 32
@@ -47,7 +47,7 @@ def test_every_step_is_told_in_order_and_once(radar, board):
     radar.configure()
     radar.arm(FRAMES)
     expected = [0x404C, 0x4000, 0x0220, 0x40E0, 0x0080, 0x0082, 0x02CC, 0x4041, 0x0083, 0x008D, 0x0086, 0x00C0]
-    expected += [0x0100, 0x0101, 0x4042, 0x4044, 0x0085, 0x4043, 0x4045, 0x02EA, 0x0102, 0x40C0, 0x0140]
+    expected += [0x0100, 0x0101, 0x4042, 0x4044, 0x0085, 0x4043, 0x4045, 0x0223, 0x02EA, 0x0102, 0x40C0, 0x0140]
     assert board.executed == expected
     start = struct.unpack_from("<I", board.settings[0x0100], 4)[0]
     slope = struct.unpack_from("<h", board.settings[0x0100], 28)[0]
@@ -64,7 +64,7 @@ def test_only_the_transmitter_transmits(rig):
 
 def test_armed_only_when_the_radar_says_so(radar, monkeypatch):
     radar.configure()
-    monkeypatch.setattr(simulated, "READY_S", 1e9)
+    monkeypatch.setattr(cores, "READY_S", 1e9)
     with pytest.raises(DeviceError, match="0x100B"):
         radar.arm(FRAMES)
     assert radar.state is State.FAULT
@@ -168,15 +168,6 @@ def test_unplugged_is_a_fault_and_plugged_in_again_recovers(radar, board):
     assert radar.state is State.ARMED
 
 
-def test_without_firmware_it_is_refused_and_with_it_written_it_runs(radar, board):
-    board.patch = False
-    with pytest.raises(DeviceError, match="no patch"):
-        radar.configure()
-    assert radar.state is State.FAULT
-    radar.configure(on_power=lambda: radar.download(bytes(range(256)) * 4))
-    assert radar.state is State.CONFIGURED
-
-
 def test_a_refused_setting_is_a_fault_that_names_it(radar, board):
     board.inject(Fault.REFUSE)
     with pytest.raises(DeviceError, match="DeviceConfiguration"):
@@ -185,7 +176,7 @@ def test_a_refused_setting_is_a_fault_that_names_it(radar, board):
 
 
 def test_a_board_that_stays_silent_is_named(radar, board):
-    board.destroyed = True
+    board.cores.destroyed = True
     with pytest.raises(DeviceError, match="LS: the radar did not report 0x5000"):
         radar.configure()
 
@@ -194,11 +185,13 @@ def test_the_report_holds_versions_temperatures_calibration_and_every_byte_sent(
     radar.configure()
     radar.arm(FRAMES)
     told = radar.report()
-    assert told["rf_firmware"] == told["main_firmware"] == "2.2.3.1 patch 2.1.1.1"
+    assert (told["rf_firmware"], told["main_firmware"]) == ("2.2.1.7 patch 2.2.4.0", "2.2.1.7 patch 2.2.2.0")
+    assert told["die_id"] == "5eed0001-00000d1e-000008c3-00000001"
     assert told["temperatures_c"]["tx2"] == 46
     assert told["calibration"]["temperature_c"] == 41
     assert told["sent"][0].startswith("78566587")
-    assert told["sent"][1] == "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"
+    first = next(raw for raw in told["sent"] if not raw.startswith("78566587"))
+    assert first == "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"
     assert any("ready for triggers" in line for line in told["events"])
     assert radar.report()["sent"] == []
 

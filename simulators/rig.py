@@ -66,6 +66,7 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
     if native:
         under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+    if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
         image = folder / "firmware.bin"  # the boards come with an empty flash
         image.write_bytes(make_image())
         table["radar"]["firmware"] = str(image)

@@ -92,6 +92,11 @@ class RadarBoard:
         """Where the board is, as far as it was read."""
         return self._state
 
+    @property
+    def warnings(self) -> list[str]:
+        """What went wrong on the link and was mended, since the last report."""
+        return self._link.warnings[:]
+
     def configure(self, on_step: Callable[[Step, str], None] | None = None) -> None:
         """From wherever it is, by a reset, to `CONFIGURED`; `on_step` is told each step and what came of it.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 
 import msgspec
 import pytest
@@ -156,7 +157,7 @@ def test_a_replayed_trace_comes_to_the_same_end(rig_file, board, capsys, tmp_pat
 
 
 @pytest.mark.usefixtures("opened")
-def test_a_trace_holds_both_directions_and_every_change_of_a_line(rig_file, capsys, tmp_path):
+def test_a_trace_holds_both_directions_and_every_change_of_a_line(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
     lines = [json.loads(line) for line in trace.read_text().splitlines()]
@@ -166,7 +167,7 @@ def test_a_trace_holds_both_directions_and_every_change_of_a_line(rig_file, caps
     assert levels == [n % 2 for n in range(len(levels))]  # each a change
     said = "".join(r.get("in", "") for r in lines)
     assert said.count("badccdab") == levels.count(1)
-    assert all(a["t"] <= b["t"] for a, b in zip(lines[1:], lines[2:], strict=False))
+    assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))
 
 
 @pytest.mark.usefixtures("opened")
@@ -200,7 +201,7 @@ def test_a_trace_cut_off_anywhere_replays_to_its_end(rig_file, capsys, tmp_path)
 
 
 @pytest.mark.usefixtures("opened")
-def test_a_trace_is_played_to_a_simulated_board(rig_file, capsys, tmp_path):
+def test_a_trace_is_played_to_a_simulated_board(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
     same = replay(trace, lambda now: RadarBoard(now, flash=make_image()))

@@ -46,7 +46,7 @@ class Said:
 
 def link(*messages: bytes) -> tuple[Link, Said]:
     said = Said(*messages)
-    return Link("RH", said, VirtualClock(), lambda raw: None), said
+    return Link("RH", said, VirtualClock(), [].append), said
 
 
 @pytest.mark.parametrize("raw", received.ALL.values(), ids=received.ALL.keys())
@@ -92,7 +92,7 @@ def test_the_fault_during_loading_is_a_register_that_read_back_wrong():
 
 def test_a_refusal_without_a_body_ends_the_command_at_once():
     asked, said = link(received.AWR1243_ERROR)
-    with pytest.raises(DeviceError, match="refuses DeviceConfiguration.*does not say why"):
+    with pytest.raises(DeviceError, match=r"refuses DeviceConfiguration.*does not say why"):
         asked.call(DeviceConfiguration())
     assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
 

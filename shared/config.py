@@ -171,7 +171,8 @@ class Radar(Section, frozen=True):
     sent a line before each row; `servers` holds its `address:port` by board name. `native`: this host configures the
     boards over USB; `native` says by board name where each is, the rest is for all of them. `firmware` is TI's image,
     downloaded into the boards' RAM at each start ("": what their flash holds); a relative path counts from the rig
-    file's folder. `slow_spi` sends words one by one at 1 MHz.
+    file's folder. `calibration_dir` keeps what each board's RF init found and gives it back at its next starts ("":
+    each start calibrates anew). `slow_spi` sends words one by one at 1 MHz.
     """
 
     control: Literal["endless", "line_server", "native"] = "endless"
@@ -184,6 +185,7 @@ class Radar(Section, frozen=True):
     rf_gain_target_db: Literal[30, 33, 36] = 30
     tx_backoff_db: Annotated[int, msgspec.Meta(ge=0)] = 0
     firmware: str = ""
+    calibration_dir: str = ""
     slow_spi: bool = False
 
     def __post_init__(self) -> None:
@@ -351,5 +353,6 @@ def load_instrument(path: Path) -> Instrument:
     folder = path.parent.resolve()  # from now on the working folder does not matter, nor where a manifest is read
     files = {kind: name and str(folder / name) for kind, name in to_builtins(rig.calibration).items()}
     pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
-    radar = msgspec.structs.replace(rig.radar, firmware=rig.radar.firmware and str(folder / rig.radar.firmware))
+    places = {key: (name := getattr(rig.radar, key)) and str(folder / name) for key in ("firmware", "calibration_dir")}
+    radar = msgspec.structs.replace(rig.radar, **places)
     return msgspec.structs.replace(rig, pi=pi, radar=radar, calibration=CalibrationFiles(**files))

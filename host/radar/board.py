@@ -12,7 +12,9 @@ from enum import Enum
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
+from polysight.host.radar import lab_commands as lab
 from polysight.host.radar.bring_up import BringUp, Step, data_of
+from polysight.host.radar.calibration_data import CalibrationFiles
 from polysight.host.radar.firmware import Image
 from polysight.host.radar.program import Program
 from polysight.host.radar.spi import Clock, Link, WordLink
@@ -57,6 +59,8 @@ class RadarBoard:
         Downloaded to the device's RAM at each start; None: what its flash holds.
     die_id
         The only board that is accepted; "" for any.
+    calibration
+        Where what its RF init found is kept for its next starts; None: it calibrates anew each time.
 
     Attributes
     ----------
@@ -76,15 +80,17 @@ class RadarBoard:
         program: Program,
         firmware: Image | None = None,
         die_id: str = "",
+        calibration: CalibrationFiles | None = None,
     ) -> None:
         self.name, self._words, self._clock, self._program = name, words, clock, program
-        self._firmware, self._die_id = firmware, die_id
+        self._firmware, self._die_id, self._calibration = firmware, die_id, calibration
         self._sent: list[bytes] = []
         self._link = Link(name, words, clock, self._sent.append)
         self._state, self._frames = State.OFF, 0
         self.reason = ""
         self.facts: dict[str, object] = {}
         self.steps: list[Step] = []
+        self._sent_frames: tuple[c.Command, ...] = ()
         self._log: list[str] = []
 
     @property
@@ -143,7 +149,7 @@ class RadarBoard:
         self.facts.clear()
         return BringUp(
             self.name, self._link, self._words, self._clock, self._program, self._firmware, self._die_id,
-            self.facts, self._keep,
+            self._calibration, self.facts, self._keep,
         )  # fmt: skip
 
     def arm(self, frames: int) -> None:
@@ -170,8 +176,7 @@ class RadarBoard:
             self.read_temperatures()
             if frames != self._frames:
                 self._frames = 0
-                for command in self._program.frames(frames):
-                    self._link.call(command)
+                self._set_frames(frames, c.HARDWARE_TRIGGER)
                 self._frames = frames
             self._link.call(c.FrameControl(c.START))
             self._wait(e.TRIGGER_READY, _READY_S)
@@ -185,10 +190,39 @@ class RadarBoard:
         """
         with _Failing(self):
             self._frames = 0
-            for command in self._program.frames(1, c.SOFTWARE_TRIGGER):
-                self._link.call(command)
+            self._set_frames(1, c.SOFTWARE_TRIGGER)
             self._link.call(c.FrameControl(c.START))
             return str(self._wait(e.FRAME_END, _READY_S + self._program.frame_period_us * 1e-6))
+
+    def _set_frames(self, frames: int, trigger: int) -> None:
+        self._sent_frames = self._program.frames(frames, trigger)
+        for command in self._sent_frames:
+            self._link.call(command)
+
+    def read_back(self) -> list[str]:
+        """Profile, chirp and frame as the board has them, where they differ from what it was sent. Raises DeviceError.
+
+        For a configured board whose frames were set.
+        """
+        sent = {one.ID: one.block().data for one in (*self._program.waveform, *self._sent_frames)}
+        differences = []
+        for question, of in ((lab.ReadProfile(), 0x0100), (lab.ReadChirp(), 0x0101), (lab.ReadFrame(), 0x0102)):
+            blocks = self._link.call(question).blocks
+            found = blocks[0].data if blocks else b""
+            if found != sent[of]:
+                differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {found.hex()}")
+        return differences
+
+    def stream_tone(self, tone: lab.StreamTone, on: bool) -> None:
+        """Begin or end continuous streaming of one frequency, for tests of the RF; frames must not run.
+
+        It leaves the board without its chirp: configure it before the next row. Raises DeviceError.
+        """
+        with _Failing(self):
+            if on:
+                self._link.call(tone)
+            self._link.call(lab.StreamData(on))
+            self._link.call(lab.StreamEnable(on))
 
     def reconnect(self, words: WordLink) -> None:
         """Go on over another link, the one before being gone; the next `arm` resets and configures the board."""

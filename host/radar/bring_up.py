@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
+from polysight.host.radar.calibration_data import CalibrationFiles, read_calibration, restore_calibration
 from polysight.host.radar.firmware import TO_FLASH, TO_RAM, Image, describe_patch, send_image
 from polysight.host.radar.messages import Message
 from polysight.host.radar.program import Program
@@ -54,6 +55,8 @@ class BringUp:
         Downloaded to RAM when the board does not hold it; None: what its flash holds.
     die_id
         The only board that is accepted; "" for any.
+    calibration
+        Where what an RF init found is kept; None: each start calibrates anew.
     facts
         Where what the board says of itself is kept.
     log
@@ -69,11 +72,13 @@ class BringUp:
         program: Program,
         firmware: Image | None,
         die_id: str,
+        calibration: CalibrationFiles | None,
         facts: dict[str, object],
         log: Callable[[str], None],
     ) -> None:
         self._name, self._link, self._words, self._clock, self._program = name, link, words, clock, program
         self._firmware, self._die_id, self._facts, self._log = firmware, die_id, facts, log
+        self._calibration = calibration
         self._passed_over: list[str] = []
         self._cure = ""
 
@@ -234,6 +239,12 @@ class BringUp:
         return "acknowledged"
 
     def _rf_init(self) -> str:
+        die, kept, restored = "", None, ""
+        if self._calibration is not None:
+            die = self._ask_die()
+            kept = self._calibration.load(die)
+        if kept is not None:
+            restored = "; " + restore_calibration(self._link, self._name, kept, _CALIBRATION_S, self.note)
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_S, self.note)
         self._facts["calibration"] = dict(event.values)
@@ -242,7 +253,10 @@ class BringUp:
             raise DeviceError(
                 f"{self._name}: calibration failed: {event}", "no reference clock or supply", "power-cycle it"
             )
-        return str(event)
+        if self._calibration is not None and kept is None:
+            self._calibration.save(die, read_calibration(self._link, self._name))
+        self._facts["calibration_restored"] = bool(restored)
+        return str(event) + restored
 
     def _waveform(self) -> str:
         for command in self._program.waveform:

@@ -74,6 +74,18 @@ def check_board(
         tell(Row("one frame", True, expected, board.run_one_frame()))
     except PolysightError as error:
         tell(Row("one frame", False, expected, error.what, f"{error.why}; {error.remedy}"))
+        return board
+    expected = "profile, chirp and frame as they were sent"
+    try:
+        found = board.read_back()
+        do = (
+            "compare the fields with docs/spec/mmwavelink.md; a reserved field that differs is harmless"
+            if found
+            else ""
+        )
+        tell(Row("read back", not found, expected, "; ".join(found) or "the same", do))
+    except PolysightError as error:
+        tell(Row("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
     return board
 
 

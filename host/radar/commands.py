@@ -167,7 +167,7 @@ class LdoBypass(Command):
 
 @dataclass(frozen=True)
 class Profile(Command):
-    """Profile 0: the chirp's ramp and its ADC window (ICD 79-86)."""
+    """A profile, 0..3: the chirp's ramp and its ADC window (ICD 79-86)."""
 
     ID = 0x0100
     start_hz: float
@@ -182,13 +182,14 @@ class Profile(Command):
     rx_gain_db: int
     rf_gain_target_db: int
     tx_backoff_db: int = 0
+    index: int = 0
 
     def data(self) -> bytes:
         """VCO chosen by the firmware, calibration tables updated, no phase shift, TX from the ramp's knee."""
         back_off = self.tx_backoff_db * 0x010101
         return struct.pack(
             "<HBB6IhhHHBBHHH",
-            0,
+            self.index,
             0,
             0,
             start_code(self.start_hz),
@@ -211,14 +212,17 @@ class Profile(Command):
 
 @dataclass(frozen=True)
 class Chirp(Command):
-    """Chirp 0 of profile 0, unchanged, with the transmitters of a bit mask (ICD 88)."""
+    """Chirps `first` to `last` (0..511) of a profile, unchanged, with the transmitters of a bit mask (ICD 88)."""
 
     ID = 0x0101
     tx: int
+    first: int = 0
+    last: int = 0
+    profile: int = 0
 
     def data(self) -> bytes:
         """Range of indices, profile, four variations of zero, TX."""
-        return struct.pack("<4HI4H", 0, 0, 0, 0, 0, 0, 0, 0, self.tx)
+        return struct.pack("<4HI4H", self.first, self.last, self.profile, 0, 0, 0, 0, 0, self.tx)
 
 
 @dataclass(frozen=True)

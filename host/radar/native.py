@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.calibration_data import CalibrationFiles
 from polysight.host.radar.constraints import constraints, direct_if_hz, require
 from polysight.host.radar.firmware import Image, read_image
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
@@ -44,7 +45,11 @@ def open_board(place: str, slow: bool = False) -> WordLink:
 def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmware: Image | None) -> RadarBoard:
     """One board of a rig behind a word link, with the firmware that the rig file asks for."""
     native = rig.radar.native[name]
-    return RadarBoard(name, words, clock, program(rig, rig.by_name(name)), firmware, native.die_id)
+    made = program(rig, rig.by_name(name))
+    settings = b"".join(one.block().data for one in (*made.basic, *made.waveform))
+    folder = rig.radar.calibration_dir
+    calibration = CalibrationFiles(Path(folder), settings) if folder else None
+    return RadarBoard(name, words, clock, made, firmware, native.die_id, calibration)
 
 
 def plan_lines(rig: Instrument) -> list[str]:

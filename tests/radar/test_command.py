@@ -17,7 +17,7 @@ from polysight.simulators.radars import RadarBoard, make_image
 from polysight.simulators.radars.__main__ import replay
 
 STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
-STEPS.append("one frame")
+STEPS += ["one frame", "read back"]
 
 
 @pytest.fixture

@@ -52,7 +52,8 @@ def test_four_channels_in_their_modes(plugged):
 
 
 @pytest.mark.parametrize("packet", [1, 2, 3, 7, 61, 510])
-def test_answers_cut_anywhere_arrive_whole(bus, plugged, board, clock, packet):
+@pytest.mark.usefixtures("plugged")
+def test_answers_cut_anywhere_arrive_whole(bus, clock, packet):
     bus.packet = packet
     words = open_usb("FT1234")
     words.reset(held=True)
@@ -63,7 +64,6 @@ def test_answers_cut_anywhere_arrive_whole(bus, plugged, board, clock, packet):
     clock.sleep(0.1)
     assert words.read(2) == [0xDCBA, 0xABCD]
     words.close()
-    del board
 
 
 def test_slow_mode_is_one_word_a_transfer(plugged):
@@ -76,7 +76,7 @@ def test_slow_mode_is_one_word_a_transfer(plugged):
     words.close()
 
 
-def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugged, board):
+def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugged):
     bus.plug(chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3)))  # two with one serial number
     open_usb("usb:1-4.2").write([0x1234])
     assert plugged.chip.words_written == [0x1234]

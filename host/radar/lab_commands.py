@@ -1,6 +1,7 @@
 """Sub-blocks beyond a scan's: reading back, calibration data, continuous streaming, advanced frames.
 
-Layouts: ICD (messages.py), at the printed page in each docstring. Not run on hardware yet.
+Layouts: ICD (messages.py), at the printed page in each docstring; the bytes are those of TI's library. Not run on
+hardware yet.
 """
 
 from __future__ import annotations
@@ -85,8 +86,8 @@ class RestoreCalibration(Command):
     content: bytes
 
     def data(self) -> bytes:
-        """Part and its 224 bytes."""
-        return struct.pack("<2H", 0, self.part) + self.content
+        """How many parts, which one, and its 224 bytes; TI's library sends the count where the ICD reserves a field."""
+        return struct.pack("<2H", CALIBRATION_PARTS, self.part) + self.content
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,8 @@ def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugg
         open_usb("usb:1-7")
 
 
-def test_a_chip_that_is_not_there_is_named(plugged):
+@pytest.mark.usefixtures("plugged")
+def test_a_chip_that_is_not_there_is_named():
     with pytest.raises(DeviceError, match="FT9, channel A: cannot be opened"):
         open_usb("FT9")
 

@@ -68,7 +68,7 @@ class Case:
 
     name: str
     cause: str
-    act: Callable[[FaultyWords], None] = lambda words: None
+    act: Callable[[FaultyWords], None] = FaultyWords.close
     flash: bytes = IMAGE.data
     firmware: Image | None = None
     die_id: str = ""

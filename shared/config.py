@@ -322,8 +322,8 @@ class Instrument(Section, frozen=True):
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of one frame of one chirp: samples x 4 RX x (I, Q) x int16."""
-        return self.chirp.samples * len(self.antennas.rx_mm) * 2 * 2
+        """Bytes of one frame: chirps x samples x 4 RX x (I, Q) x int16."""
+        return self.burst.chirps * self.chirp.samples * len(self.antennas.rx_mm) * 2 * 2
 
     @property
     def row_bytes(self) -> int:

@@ -359,7 +359,7 @@ def noise_facts(rig: Instrument, noise: Noise) -> NoiseFacts:
     """
     a, b = rig.chirp.linear_samples
     rx = len(rig.antennas.rx_mm)
-    position = 10 ** (noise.direct_snr_db / 10) * rig.burst.pulses
+    position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
     gain = rx * _gain(_window(_FAST_TIME_WINDOW, b - a))
     for taper in _tapers(rig):
         gain *= _gain(taper)

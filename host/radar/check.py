@@ -69,12 +69,17 @@ def check_board(
     except PolysightError as error:
         tell(_failed(board.steps[len(done)] if len(done) < len(board.steps) else None, error))
         return board
-    expected = "frame end, 1 frame" + (" (this board transmits one chirp)" if transmits else "")
+    _frame_and_read_back(board, transmits, tell)
+    return board
+
+
+def _frame_and_read_back(board: RadarBoard, transmits: bool, tell: Callable[[Row], None]) -> None:
+    expected = "frame end, 1 frame" + (" (this board transmits)" if transmits else "")
     try:
         tell(Row("one frame", True, expected, board.run_one_frame()))
     except PolysightError as error:
         tell(Row("one frame", False, expected, error.what, f"{error.why}; {error.remedy}"))
-        return board
+        return
     expected = "profile, chirp and frame as they were sent"
     try:
         found = board.read_back()
@@ -86,7 +91,6 @@ def check_board(
         tell(Row("read back", not found, expected, "; ".join(found) or "the same", do))
     except PolysightError as error:
         tell(Row("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
-    return board
 
 
 def _failed(step: Step | None, error: PolysightError) -> Row:

@@ -86,9 +86,13 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
     slower = "raise burst.period_us"
     yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "take fewer points or pulses a row")
     yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", slower)
-    yield Constraint(
-        "inter-frame time", "frame period - chirps", period - chirps, INTER_FRAME_US, None, "us", slower
-    )  # ICD 91
+    if rig.burst.chirps > 1:
+        apart = f"set radar.idle_us to {rig.burst.chirp_us - chirps + rig.radar.idle_us:g}, or burst.chirp_us"
+        yield Constraint(
+            "chirp spacing", "idle + ramp - chirp_us", chirps - rig.burst.chirp_us, -0.006, 0.006, "us", apart
+        )
+    rest = period - rig.burst.chirps * chirps
+    yield Constraint("inter-frame time", "frame period - chirps", rest, INTER_FRAME_US, None, "us", slower)  # ICD 91
     gap = rig.burst.period_us - period
     yield Constraint("pulse gap", "pulse period - frame period", gap, AFTER_FRAME_US, None, "us", slower)  # ICD 93
     yield Constraint("pulse width", "SYNC_IN pulse", rig.burst.width_us, *WIDTH_US, "us", "set burst.width_us")

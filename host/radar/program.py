@@ -30,10 +30,12 @@ class Program:
     waveform: tuple[c.Command, ...]
     samples: int
     frame_period_us: float
+    chirps: int = 1
 
     def frames(self, count: int, trigger: int = c.HARDWARE_TRIGGER) -> tuple[c.Command, ...]:
-        """Frames of one chirp each: the RF core's part, then the main core's."""
-        return (c.Frame(count, self.frame_period_us, self.samples, trigger=trigger), c.FrameApply(self.samples))
+        """Frames of the burst: the RF core's part, then the main core's."""
+        frame = c.Frame(count, self.frame_period_us, self.samples, self.chirps, trigger=trigger)
+        return (frame, c.FrameApply(self.samples, self.chirps))
 
 
 def frame_period_us(rig: Instrument) -> float:
@@ -90,6 +92,7 @@ def program(rig: Instrument, board: Board) -> Program:
         ),
         samples=chirp.samples,
         frame_period_us=frame_period_us(rig),
+        chirps=rig.burst.chirps,
     )
     for command in (*made.basic, *made.waveform):
         command.block()  # refuses here what fits no field

@@ -204,6 +204,55 @@ def test_closing_stops_what_waits(radar, board, words):
     assert not board.ready_for_triggers
 
 
+def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
+    import msgspec
+
+    burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=5000.0)
+    many = msgspec.structs.replace(rig, burst=burst)
+    radar = RadarBoard("LS", words, clock, program(many, many.by_name("LS")))
+    radar.arm(FRAMES)
+    loops, frames = struct.unpack_from("<2H", board.settings[0x0102], 6)
+    chirps = struct.unpack_from("<I", board.settings[0x40C0])[0]
+    assert (loops, frames, chirps) == (16, FRAMES, 16)
+    pulses(board, clock, FRAMES, 5e-3)
+    assert radar.poll() is State.DONE
+
+
+def test_the_main_core_s_fault_is_passed_over_only_until_the_board_is_configured(rig, words, clock, board):
+    radar = RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")))
+    radar.configure()
+    assert any("main core fault" in line for line in radar.report()["events"])
+    board.say(MAIN_CPU_FAULT, struct.pack("<BBH", 5, 0, 0) + bytes(32))
+    assert radar.poll() is State.FAULT
+
+
+def test_a_failure_after_the_main_core_s_fault_names_it(radar, board):
+    board.inject(Fault.NO_ANSWER, Fault.NO_ANSWER, Fault.NO_ANSWER)
+    with pytest.raises(DeviceError) as caught:
+        radar.configure()
+    assert "it had reported before: main core fault: register read-back error" in caught.value.why
+
+
+def test_another_board_than_the_rig_file_names_is_refused(rig, words, clock):
+    radar = RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")), die_id="5eed0002-0-0-0")
+    with pytest.raises(DeviceError, match=r"die id 5eed0001.*the rig file names 5eed0002"):
+        radar.configure()
+
+
+def test_events_without_end_delay_nothing_for_long(radar, board, clock):
+    radar.arm(FRAMES)
+    for _ in range(5000):
+        board.say(0x1012, bytes(20))
+    began = clock.time
+    assert radar.poll() is State.ARMED
+    assert clock.time - began < 0.5
+    assert any("without a pause" in line for line in radar.warnings)
+    for _ in range(200):
+        radar.poll()
+    assert len(radar.report()["events"]) <= 1000
+    assert radar.poll() is State.ARMED
+
+
 def test_states_without_a_way_out_are_none():
     assert set(TRANSITIONS) == set(State)
     assert all(TRANSITIONS.values())

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Sequence
 
 import pytest
 
-from polysight.host.radar.commands import RF_POWER_UP, DeviceConfiguration, LowPower
+from polysight.host.radar.commands import GET_MAIN_VERSION, RF_POWER_UP, DeviceConfiguration, LowPower
 from polysight.host.radar.events import BOOT_STATUS, MAIN_CPU_FAULT, MAIN_POWER_UP, decode_event
 from polysight.host.radar.messages import Direction, Kind, SubBlock, decode, decode_header
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import DeviceError
+from polysight.simulators.radars.wire import frame, ones_sum
 from tests.support.radar import received
 from tests.support.radar.boards import VirtualClock
 
@@ -115,6 +118,26 @@ def test_a_refusal_of_another_sequence_is_late():
     with pytest.raises(DeviceError, match="no valid answer"):
         asked.call(DeviceConfiguration())
     assert "late" in asked.warnings[0]
+
+
+def chunk(remaining: int, block: int, data: bytes) -> bytes:
+    """One of an answer's chunks, from the simulated device's encoder."""
+    raw = bytearray(frame(6, 1, 0x207, struct.pack("<2H", block, len(data) + 4) + data, 1, 0, True))
+    raw[10:12] = remaining.to_bytes(2, "little")
+    raw[14:16] = b"\0\0"
+    raw[14:16] = (0xFFFF - ones_sum(bytes(raw[4:14]))).to_bytes(2, "little")
+    return bytes(raw[:-4]) + zlib.crc32(bytes(raw[4:-4])).to_bytes(4, "little")
+
+
+def test_an_answer_in_chunks_is_joined():
+    asked, _ = link(chunk(2, 0x40E0, bytes(16)), chunk(1, 0x40E1, b"abcd"), chunk(0, 0x40E2, b"efgh"))
+    assert [b.data for b in asked.call(GET_MAIN_VERSION).blocks] == [bytes(16), b"abcd", b"efgh"]
+
+
+def test_a_chunk_that_is_missing_is_no_answer():
+    asked, _ = link(chunk(2, 0x40E0, bytes(16)), chunk(0, 0x40E2, b"efgh"))
+    with pytest.raises(DeviceError, match="parts of the answer are missing"):
+        asked.call(GET_MAIN_VERSION)
 
 
 @pytest.mark.parametrize(

@@ -316,6 +316,8 @@ class RadarBoard:
         self._keep(str(event))
         if event.fatal:
             self.fail(str(event))
+        elif event.id == e.MAIN_POWER_UP:  # asked for only in a bring-up
+            self.fail("it has started anew by itself: its supply failed for a moment, or somebody pressed reset")
         elif event.id == e.FRAME_END and self._state in (State.ARMED, State.RUNNING):
             self._to(State.DONE)
         elif event.id == e.TRIGGER_READY and self._state in (State.CONFIGURED, State.DONE):

@@ -60,7 +60,12 @@ def _words(text: str) -> list[int]:
 
 def main() -> int:
     """Exit status 0 when the simulated board answers the same."""
-    parser = argparse.ArgumentParser(prog="python -m polysight.simulators.radars", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m polysight.simulators.radars",
+        description=__doc__,
+        epilog="example:\n  python -m polysight.simulators.radars first-day.jsonl",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("trace", type=Path, metavar="TRACE", help="a file that `polysight radar --trace FILE` wrote")
     parser.add_argument("--empty-flash", action="store_true", help="a board on its first day")
     args = parser.parse_args()

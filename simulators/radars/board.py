@@ -93,7 +93,7 @@ class RadarBoard:
             first_generation=first_generation,
         )  # fmt: skip
         self.plugged = True
-        self._powered = True
+        self.powered = True
         self._faults: deque[Fault] = deque()
         self._pulses_seen = 0
         self._held, self._mode = True, 0
@@ -137,7 +137,7 @@ class RadarBoard:
     def power(self, on: bool) -> None:
         """Switch the board's supply; its USB chip has one of its own. What is in the flash stays, finished or not."""
         self._forget()
-        self._powered = on
+        self.powered = on
         if on and not self._held:
             self._boot()
 
@@ -154,7 +154,7 @@ class RadarBoard:
         self._held = held
 
     def _boot(self) -> None:
-        if self._mode == FUNCTIONAL and self.functional_jumpers and self._powered and not self.destroyed:
+        if self._mode == FUNCTIONAL and self.functional_jumpers and self.powered and not self.destroyed:
             self.cores.boot()
 
     @property
@@ -256,7 +256,7 @@ class RadarBoard:
     def _message(self, raw: bytes) -> None:
         opcode, length, flags, remaining, count = struct.unpack_from("<5H", raw)
         fault = self._faults.popleft() if self._faults else None
-        if fault is Fault.NO_ANSWER or self.destroyed or not self._powered or self.now() < self._busy_until:
+        if fault is Fault.NO_ANSWER or self.destroyed or not self.powered or self.now() < self._busy_until:
             return
         direction, number, sequence, wide = (opcode & 15) + 1, opcode >> 6, flags >> 12, self._answers_32_bit
         if fault is Fault.NACK or zlib.crc32(raw[: length - 4]) != int.from_bytes(raw[length - 4 :], "little"):

@@ -15,6 +15,7 @@ MODULES = (
     "polysight.host.cli.main", "polysight.pi_controller.cli", "docs.check",
     "polysight.simulators", "polysight.simulators.rig", "polysight.simulators.cards", "polysight.simulators.stage",
     "polysight.simulators.wires", "polysight.simulators.uno", "polysight.simulators.replay",
+    "polysight.simulators.radars",
 )  # fmt: skip
 
 

@@ -226,6 +226,17 @@ def test_the_main_core_s_fault_is_passed_over_only_until_the_board_is_configured
     assert radar.poll() is State.FAULT
 
 
+def test_a_board_that_starts_anew_by_itself_is_a_fault_and_comes_back(radar, board, clock):
+    radar.arm(FRAMES)
+    board.power(False)
+    board.power(True)
+    clock.sleep(0.1)
+    assert radar.poll() is State.FAULT
+    assert "started anew by itself" in radar.reason
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
+
+
 def test_a_failure_after_the_main_core_s_fault_names_it(radar, board):
     board.inject(Fault.NO_ANSWER, Fault.NO_ANSWER, Fault.NO_ANSWER)
     with pytest.raises(DeviceError) as caught:

@@ -56,6 +56,21 @@ def test_random_faults(clean, request):
     assert len(unnamed) <= (1 - NAMED) * failed
 
 
+OF_THE_BOARD = ("flash", "another board", "jumpers")
+
+
+def test_whatever_failed_between_them_the_next_row_runs_once_it_is_mended():
+    """A reset and a configuration bring every board back that is sound itself."""
+    for number in range(60):
+        case, at = draw(random.Random(number))
+        if case.name.startswith(OF_THE_BOARD):
+            continue
+        found = run(case, at)
+        found.heal()
+        found.radar.arm(FRAMES)
+        assert found.radar.state is State.ARMED, (number, case.name, at)
+
+
 def test_the_faults_strike(clean):
     """Of the faults that are drawn most happen within the run: the law above is not one of faults that never come."""
     del clean

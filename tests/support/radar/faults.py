@@ -174,6 +174,15 @@ class Outcome:
     struck: bool
     radar: RadarBoard
     board: Simulated
+    words: FaultyWords
+
+    def heal(self) -> None:
+        """Let what was wrong between host and board be mended: plugged in, powered, quiet lines."""
+        self.words.flip, self.words.stuck, self.words.dead = (lambda word: word), None, None
+        self.board.plugged, self.board.cores.destroyed = True, False
+        self.board.inject()
+        if not self.board.powered:
+            self.board.power(True)
 
 
 def run(case: Case, at: int) -> Outcome:
@@ -200,4 +209,4 @@ def run(case: Case, at: int) -> Outcome:
             raise DeviceError("the radar did not report its frames' end", "; ".join(radar.warnings), "")
     except DeviceError as e:
         error = e
-    return Outcome(case, at, error, clock.time, words.begun is not None, radar, board)
+    return Outcome(case, at, error, clock.time, words.begun is not None, radar, board, words)

@@ -80,7 +80,7 @@ class BringUp:
         self._firmware, self._die_id, self._facts, self._log = firmware, die_id, facts, log
         self._calibration = calibration
         self._passed_over: list[str] = []
-        self._cure = ""
+        self._cure, self._had = "", ""
 
     def power_steps(self) -> list[Step]:
         """Until both cores run."""
@@ -132,7 +132,7 @@ class BringUp:
                 "download it again; radar.firmware starts it from RAM until then",
             )
         after = self._main_patch()
-        self._verify(after, image)
+        self._verify(after, before, image)
         return f"main core's patch {after} from flash (before: {before})"
 
     def _reset(self) -> str:
@@ -159,7 +159,7 @@ class BringUp:
 
     def _load(self) -> str:
         if self._firmware is not None:
-            has = self._same_family(self._firmware)
+            self._had = has = self._same_family(self._firmware)
             if has == self._firmware.patches[0] and self._cure != "firmware":
                 return f"the flash holds patch {has} already; nothing is sent"
             send_image(self._link, self._name, self._firmware, TO_RAM)
@@ -204,13 +204,18 @@ class BringUp:
     def _main_patch(self) -> str:
         return _patch(data_of(self._name, self._link.call(c.GET_MAIN_VERSION), c.GET_MAIN_VERSION, 16))
 
-    def _verify(self, patch: str, image: Image) -> None:
-        if patch != image.patches[0]:
+    def _verify(self, patch: str, before: str, image: Image) -> None:
+        """A patch that is still the old one is an error. Where TI keeps it in the file is not documented, so another
+        one than the file's is only told.
+        """
+        told = f"{self._name}: reports patch {patch} after the download, {image.name} holds {image.patches[0]}"
+        if patch == image.patches[0]:
+            return
+        if patch in (before, _NO_PATCH):
             raise DeviceError(
-                f"{self._name}: reports patch {patch} after the download, {image.name} holds {image.patches[0]}",
-                "it did not start from what was sent",
-                "switch its power off and on, then `polysight radar check`",
+                told, "it did not start from what was sent", "switch its power off and on, then `polysight radar check`"
             )
+        self._link.warnings.append(told)
 
     def _rf_up(self) -> str:
         self._link.call(c.DeviceConfiguration())
@@ -230,7 +235,7 @@ class BringUp:
                     _FIRMWARE,
                 )
             if key == "main_firmware" and self._firmware is not None:
-                self._verify(_patch(v), self._firmware)
+                self._verify(_patch(v), self._had, self._firmware)
         return f"RF {self._facts['rf_firmware']}, main {self._facts['main_firmware']}"
 
     def _basic(self) -> str:
@@ -300,6 +305,9 @@ class BringUp:
             raise DeviceError(
                 f"{self._name}: {event}", "the radar stopped itself", "it is reset when the row is retaken"
             )
+
+
+_NO_PATCH = describe_patch(0, 0, 0, 0)
 
 
 def _patch(version: bytes) -> str:

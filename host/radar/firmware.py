@@ -100,6 +100,8 @@ def check_image(data: bytes, name: str) -> Image:
             "an image for AWR1243 or another",
         )
     patches = tuple(describe_patch(*data[at + _PATCH_AT : at + _PATCH_AT + 4]) for at in begins)
+    if others := [p for p in patches if not p.startswith(f"{GENERATION}.")]:
+        raise _refused(name, f"its patches are {', '.join(others)}, those of an AWR2243 2.x", "an image for xWR6243")
     return Image(name, data, rom, patches)
 
 

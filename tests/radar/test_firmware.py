@@ -40,6 +40,7 @@ def with_crc(data: bytes) -> bytes:
         (with_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
         (with_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
         (FIRST_GENERATION, "for devices of generation 1"),
+        (with_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
     ],
 )
 def test_what_is_no_image_is_refused_with_the_reason(data, why):
@@ -218,6 +219,27 @@ def test_a_flash_that_does_not_keep_what_it_was_sent_is_noticed(new, clock, monk
     monkeypatch.setattr(new.cores, "_download", forget)
     with pytest.raises(DeviceError, match="not from its flash"):
         made(new, clock).write_flash(IMAGE, ignored)
+
+
+@pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
+def test_what_the_board_reports_afterwards_is_compared(new, clock, monkeypatch, reported, warned):
+    """Another patch than the file's is told; the old one, or none, is an error."""
+    effect = new.cores._effect
+
+    def answer(number, data):
+        told = effect(number, data)
+        return told[:10] + bytes(reported) if number == 0x40E0 and any(told[10:]) else told
+
+    monkeypatch.setattr(new.cores, "_effect", answer)
+    radar = made(new, clock, IMAGE)
+    if warned:
+        radar.configure()
+        assert any("reports patch 2.9.3.0 after the download" in line for line in radar.warnings)
+        return
+    with pytest.raises(DeviceError, match="no patch"):
+        radar.configure()
+    with pytest.raises(DeviceError, match=r"reports patch 0\.0\.0\.0"):
+        radar.write_flash(IMAGE, ignored)
 
 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.LOST_INTERRUPT, Fault.NACK, Fault.BAD_CHECKSUM])

@@ -53,6 +53,11 @@ class Burst(Section, frozen=True):
             f"period_us must be at least {frame_us:g} us: {self.chirps} chirps and {MIN_PERIOD_US:g} us after them",
         )
 
+    def __str__(self) -> str:
+        if self.chirps == 1:
+            return f"{self.pulses} pulses, {self.period_us:g} us apart"
+        return f"{self.pulses} pulses of {self.chirps} chirps, {self.chirp_us:g} us apart"
+
     @property
     def chirps_a_position(self) -> int:
         """Chirps of all frames of a position."""

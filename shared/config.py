@@ -144,13 +144,24 @@ class Card(Section, frozen=True):
 class NativeRadar(Section, frozen=True):
     """One board under `radar.control = "native"`.
 
-    `ldo_bypass` can destroy a board with 1.3 V on its RF supplies: it needs the board's own USB serial number, again,
-    in `ldo_bypass_acknowledged`.
+    It is found by `usb_serial`, or by `usb_path`, the place of its plug ("1-4.2": bus, then the hub's ports). With
+    `die_id` another board there is refused. `ldo_bypass` can destroy a board with 1.3 V on its RF supplies: it needs
+    the board's own USB serial number, again, in `ldo_bypass_acknowledged`.
     """
 
-    usb_serial: Annotated[str, msgspec.Meta(min_length=1)]
+    usb_serial: str = ""
     ldo_bypass: bool = False
     ldo_bypass_acknowledged: str = ""
+    usb_path: Annotated[str, msgspec.Meta(pattern=r"^([0-9]+-[0-9]+(\.[0-9]+)*)?$")] = ""
+    die_id: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{8}(-[0-9a-f]{8}){3})?$")] = ""
+
+    def __post_init__(self) -> None:
+        require(bool(self.usb_serial) != bool(self.usb_path), "each of radar.native needs usb_serial or usb_path")
+
+    @property
+    def place(self) -> str:
+        """Where the board is found: its serial number, address, or `usb:` and the path."""
+        return self.usb_serial or f"usb:{self.usb_path}"
 
 
 class Radar(Section, frozen=True):
@@ -158,7 +169,10 @@ class Radar(Section, frozen=True):
 
     `endless`: started once, with frames without end; nothing is needed. `line_server`: each board's control server is
     sent a line before each row; `servers` holds its `address:port` by board name. `native`: this host configures the
-    boards over USB; `native` holds their serial numbers by board name, the rest is for all of them.
+    boards over USB; `native` says by board name where each is, the rest is for all of them. `firmware` is TI's image,
+    downloaded into the boards' RAM at each start ("": what their flash holds); a relative path counts from the rig
+    file's folder. `calibration_dir` keeps what each board's RF init found and gives it back at its next starts ("":
+    each start calibrates anew). `slow_spi` sends words one by one at 1 MHz.
     """
 
     control: Literal["endless", "line_server", "native"] = "endless"
@@ -167,16 +181,19 @@ class Radar(Section, frozen=True):
     )
     native: dict[str, NativeRadar] = msgspec.field(default_factory=dict)
     idle_us: Positive = 100.0  # before each chirp
-    rx_gain_db: int = 30
+    rx_gain_db: int = 32
     rf_gain_target_db: Literal[30, 33, 36] = 30
     tx_backoff_db: Annotated[int, msgspec.Meta(ge=0)] = 0
+    firmware: str = ""
+    calibration_dir: str = ""
+    slow_spi: bool = False
 
     def __post_init__(self) -> None:
         for board, address in self.servers.items():
             port = int(address.rpartition(":")[2])
             require(0 < port <= 65535, f"port {port} of radar.servers.{board} is outside 1..65535")
-        serials = [b.usb_serial for b in self.native.values()]
-        require(len(set(serials)) == len(serials), f"each of radar.native needs its own usb_serial, not {serials}")
+        places = [b.place for b in self.native.values()]
+        require(len(set(places)) == len(places), f"each of radar.native needs its own usb_serial or path, not {places}")
 
 
 class Geometry(Section, frozen=True):
@@ -305,8 +322,8 @@ class Instrument(Section, frozen=True):
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of one frame of one chirp: samples x 4 RX x (I, Q) x int16."""
-        return self.chirp.samples * len(self.antennas.rx_mm) * 2 * 2
+        """Bytes of one frame: chirps x samples x 4 RX x (I, Q) x int16."""
+        return self.burst.chirps * self.chirp.samples * len(self.antennas.rx_mm) * 2 * 2
 
     @property
     def row_bytes(self) -> int:
@@ -336,4 +353,6 @@ def load_instrument(path: Path) -> Instrument:
     folder = path.parent.resolve()  # from now on the working folder does not matter, nor where a manifest is read
     files = {kind: name and str(folder / name) for kind, name in to_builtins(rig.calibration).items()}
     pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
-    return msgspec.structs.replace(rig, pi=pi, calibration=CalibrationFiles(**files))
+    places = {key: (name := getattr(rig.radar, key)) and str(folder / name) for key in ("firmware", "calibration_dir")}
+    radar = msgspec.structs.replace(rig.radar, **places)
+    return msgspec.structs.replace(rig, pi=pi, radar=radar, calibration=CalibrationFiles(**files))

@@ -7,6 +7,7 @@ are those of the AWR2243 (TI mmWave Radar Interface Control, frame configuration
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Annotated
 
 import msgspec
 
@@ -25,11 +26,18 @@ _PLACING = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_
 
 
 class Burst(Section, frozen=True):
-    """SYNC_IN pulses of one position; each starts one frame of one chirp."""
+    """SYNC_IN pulses of one position; each starts one frame of `chirps` chirps, `chirp_us` from one to the next.
+
+    One chirp a frame needs no `chirp_us`. One pulse of many chirps (`pulses = 1, chirps = 16`) is a shorter burst,
+    whose trigger uncertainty is drawn once; radars of `control = "native"` are told so, others must be configured for
+    it.
+    """
 
     pulses: Count
     period_us: Positive
     width_us: Positive = 1.0
+    chirps: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
+    chirp_us: Annotated[float, msgspec.Meta(ge=0)] = 0.0
 
     def __post_init__(self) -> None:
         require(
@@ -38,6 +46,31 @@ class Burst(Section, frozen=True):
         )
         shortest, longest = WIDTH_US
         require(shortest <= self.width_us <= longest, f"width_us must be {WIDTH_TEXT} (SYNC_IN pulse of the AWR2243)")
+        require(self.chirps == 1 or self.chirp_us > 0, "chirps of a frame need chirp_us, from one to the next")
+        frame_us = self.chirps * self.chirp_us + MIN_PERIOD_US
+        require(
+            self.chirps == 1 or frame_us <= self.period_us,
+            f"period_us must be at least {frame_us:g} us: {self.chirps} chirps and {MIN_PERIOD_US:g} us after them",
+        )
+
+    def __str__(self) -> str:
+        if self.chirps == 1:
+            return f"{self.pulses} pulses, {self.period_us:g} us apart"
+        return f"{self.pulses} pulses of {self.chirps} chirps, {self.chirp_us:g} us apart"
+
+    @property
+    def chirps_a_position(self) -> int:
+        """Chirps of all frames of a position."""
+        return self.pulses * self.chirps
+
+    @property
+    def chirp_times_s(self) -> tuple[float, ...]:
+        """When each chirp of a position begins, seconds after the first pulse."""
+        return tuple(
+            1e-6 * (pulse * self.period_us + chirp * self.chirp_us)
+            for pulse in range(self.pulses)
+            for chirp in range(self.chirps)
+        )
 
 
 class Grid(Section, frozen=True):
@@ -159,8 +192,8 @@ def plan_raster(grid: Grid) -> RasterPlan:
 
 
 def burst_duration_s(burst: Burst) -> float:
-    """Time from the first to the last SYNC_IN pulse of a position, in seconds."""
-    return (burst.pulses - 1) * burst.period_us * 1e-6
+    """Time from the first to the last chirp of a position, in seconds."""
+    return burst.chirp_times_s[-1]
 
 
 def burst_middle_s(burst: Burst) -> float:

@@ -27,10 +27,12 @@ from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.faults import read_faults
 from polysight.simulators.loopback import on_free_subnet
 from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
+from polysight.simulators.radars import make_image
 from polysight.simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight.simulators.wires import MAX_SOCKET_PATH
 
 PATIENT_HEARTBEAT_MS = 2000
+IMAGE_FILE = "firmware.bin"
 READY_LIMIT_S = 60.0
 STOP_LIMIT_S = 5.0
 UNO_TIME_SCALE = 2.0
@@ -65,6 +67,8 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
     if native:
         under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+    if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
+        table["radar"]["firmware"] = str(folder / IMAGE_FILE)  # the boards come with an empty flash
     table["stage"]["port"] = str(folder / "ttySTAGE")
     table["pi"] |= {"journal_dir": str(folder / "journal"), "key_dir": str(folder / "keys")}
     # Its processes share a machine's cores with whatever else runs there, which a real rig's do not.
@@ -257,6 +261,8 @@ def _write_files(rig: Instrument, scene: Scene | None, folder: Path, options: Ri
     table = to_builtins(rig)
     table["name"] = rig.name if rig.name.endswith("(simulated)") else f"{rig.name} (simulated)"
     (folder / "instrument.toml").write_bytes(tomli_w.dumps(table).encode())
+    if rig.radar.firmware == str(folder / IMAGE_FILE):
+        (folder / IMAGE_FILE).write_bytes(make_image())
     if scene is not None and not options.pattern:
         facts = truth(rig, scene, scene.seed if options.seed is None else options.seed)
         (folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")

@@ -63,7 +63,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
 def _power(scan: RawSource, board: Board, setups: dict[str, BoardSetup]) -> tuple[Real, Real, Real]:
     """IF (Hz), power and the noise in it (ADC counts squared) of the direct path in every chirp of some rows."""
     rig = scan.instrument
-    key = f"{places_crc32(rig)} {rig.chirp} {rig.burst}"  # scans of one sweep share it
+    key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"  # scans of one sweep share it
     if key not in setups:
         setups[key] = BoardSetup.of(rig, board)
     heard = [find_direct(rig, board, words, ok, setups[key]) for _, words, ok in board_rows(scan, board.name, ROWS)]

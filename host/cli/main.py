@@ -20,6 +20,7 @@ from polysight.shared.errors import PolysightError, os_error
 FAMILIES = {
     "simulated": ("demo", "simulate", "reproduce"),
     "rig": ("plan", "doctor", "card", "inspect"),
+    "radar": ("radar",),
     "scan": ("scan", "resume", "validate", "preview", "drop-raw"),
     "process": ("process", "image", "focus", "sync-report"),
     "materials": ("materials", "report", "permittivity", "concentration", "classify", "train", "export"),

@@ -298,5 +298,6 @@ def capture(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str, Captu
 
 def _read(rig: Instrument, folder: Path, name: str, row: RowCapture, radar: BoardState | None, frames: int) -> Captured:
     payload = np.fromfile(folder / "raw" / name / f"0000{PART}", np.uint8)
-    words, valid = row_words(payload, row.missing, frames, rig.chirp.samples, len(rig.antennas.rx_mm))
+    chirps = frames * rig.burst.chirps
+    words, valid = row_words(payload, row.missing, chirps, rig.chirp.samples, len(rig.antennas.rx_mm))
     return Captured(words, valid, row, radar)

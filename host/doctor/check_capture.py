@@ -82,7 +82,7 @@ def check_radar(bench: Bench, board: Board) -> Finding:
         return error(
             f"the radar stopped by itself: {got.radar.detail}",
             "see there",
-            "`python -m polysight.host.radar check`",
+            "`polysight radar check BOARD`",
             **facts,
         )
     if row.packets == 0:

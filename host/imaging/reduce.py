@@ -122,10 +122,10 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
 
     The first tap is the middle one, the others stand on both sides. By least squares up to 0.45 cycles a position.
     """
-    burst = rig.burst
-    step = rig.stage.speed_mm_s * burst.period_us * 1e-6 / rig.grid.step_x_mm  # of a pulse, in positions
+    times_s = np.array(rig.burst.chirp_times_s)
+    moved = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm  # of each chirp, in positions
     turns = np.linspace(0, _BAND, 91)
-    loss = np.cos(2 * np.pi * np.outer(turns, (np.arange(burst.pulses) - (burst.pulses - 1) / 2) * step)).mean(axis=1)
+    loss = np.cos(2 * np.pi * np.outer(turns, moved)).mean(axis=1)
     out = np.zeros((REACH + 1, REACH + 1))
     out[0, 0] = 1
     for reach in range(1, REACH + 1):

@@ -38,10 +38,11 @@ def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequenc
     """
     inverse = np.asarray(np.linalg.inv(covariances), np.float64)
     constant = np.linalg.slogdet(covariances)[1] + covariances.shape[1] * np.log(2 * np.pi)
-    start = np.array([apparent_permittivity(q, angles_rad) for q in t])
+    start = np.array([apparent_permittivity(q, angles_rad) for q in t], np.complex128)
     low = np.array([np.log(REAL_RANGE[0]), 0.0])
     high = np.array([np.log(REAL_RANGE[1]), np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)])
-    at = np.clip(np.stack([np.log(start.real), np.arcsinh(-start.imag / SOFT_LOSS)], axis=1), low, high)
+    at: Real = np.stack([np.log(start.real), np.arcsinh(-start.imag / SOFT_LOSS)], axis=1)
+    at = np.asarray(np.clip(at, low, high), np.float64)
     best, curvature = np.full(len(t), np.inf), np.tile(np.eye(2), (len(t), 1, 1))
     for _ in range(_STEPS):
         off, slope = _off(at, log_h, t, angles_rad)
@@ -51,7 +52,7 @@ def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequenc
         better = cost < best
         best, curvature = np.where(better, cost, best), np.where(better[:, None, None], information, curvature)
         step = np.linalg.solve(information, weighed @ off[..., None])[..., 0]
-        at = np.clip(at - step, low, high)
+        at = np.asarray(np.clip(at - step, low, high), np.float64)
     return np.asarray(constant + best - 2 * np.log(_PRIOR * 2 * np.pi) + np.linalg.slogdet(curvature)[1], np.float64)
 
 

@@ -114,10 +114,10 @@ def _burst(rig: Instrument, burst: BurstFacts) -> Iterator[Caution]:
         yield Caution(
             "idle", f"the radars rest {1 - burst.duty:.0%} of a row: up to {more} pulses a position cost no time"
         )
-    if rig.burst.pulses == 1:
+    if rig.burst.chirps_a_position == 1:
         yield Caution("burst", "one chirp a position: nothing tells the noise and the alignment's residual")
     if tail := tail_s(rig):
-        pulses = nearest_whole(rig)
+        pulses = nearest_whole(rig) if rig.burst.chirps == 1 else 0
         remedy = f"; with {pulses} pulses it would not" if pulses else ""
         yield Caution(
             "card",
@@ -359,7 +359,7 @@ def noise_facts(rig: Instrument, noise: Noise) -> NoiseFacts:
     """
     a, b = rig.chirp.linear_samples
     rx = len(rig.antennas.rx_mm)
-    position = 10 ** (noise.direct_snr_db / 10) * rig.burst.pulses
+    position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
     gain = rx * _gain(_window(_FAST_TIME_WINDOW, b - a))
     for taper in _tapers(rig):
         gain *= _gain(taper)

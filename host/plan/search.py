@@ -163,8 +163,17 @@ def _grids(rig: Instrument) -> Iterator[Instrument]:
 def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[Instrument]:
     """As many pulses as travel and time to the next position allow, at the slowest speed that keeps the time.
 
-    At the rig's period and the radars' shortest; all that fit, and as many as make a row whole packets.
+    At the rig's period and the radars' shortest; all that fit, and as many as make a row whole packets. A burst of
+    frames of many chirps stays as it is.
     """
+    if rig.burst.chirps > 1:
+        for speed in _speeds(rig, minutes):
+            plan = _with(rig, speed, rig.burst.pulses, rig.burst.period_us)
+            fits = _most_pulses(plan) >= rig.burst.pulses
+            if fits and scan_time(plan, row_overhead_s).minutes <= minutes:
+                yield plan
+                return
+        return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
         for whole in (False, True):
             for speed in _speeds(rig, minutes):
@@ -189,7 +198,8 @@ def _with(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> 
 
 def _most_pulses(rig: Instrument) -> int:
     fits = _MARGIN * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
-    still = 1 + _MOST_TRAVEL_WAVELENGTHS * (rig.burst.pulses - 1) / burst_facts(rig).travel_wavelengths
+    travel = burst_facts(rig).travel_wavelengths
+    still = 1 + _MOST_TRAVEL_WAVELENGTHS * (rig.burst.chirps_a_position - 1) / travel
     return min(int(fits), int(still), MAX_FRAMES // rig.grid.columns)
 
 

@@ -55,7 +55,7 @@ def describe(f: Forecast) -> str:
     w, h = (g.columns - 1) * g.step_x_mm, (g.rows - 1) * g.step_y_mm
     lines = [
         ("scan", f"{g.columns} x {g.rows} positions, steps {g.step_x_mm:g} x {g.step_y_mm:g} mm, {w:g} x {h:g} mm"),
-        ("", f"{s.speed_mm_s:g} mm/s, {b.pulses} chirps a position, {b.period_us:g} us apart"),
+        ("", f"{s.speed_mm_s:g} mm/s, {b.chirps_a_position} chirps a position, {b.chirp_us or b.period_us:g} us apart"),
         ("time", f"{duration(t.total_s)}, without homing and rows taken again: {duration(t.measuring_s)} measuring,"),
         (
             "",
@@ -117,6 +117,7 @@ def numbers(f: Forecast) -> dict[str, Any]:
         "speed_mm_s": s.speed_mm_s,
         "accel_mm_s2": s.accel_mm_s2,
         "pulses": b.pulses,
+        "chirps": b.chirps,
         "period_us": b.period_us,
         "columns": g.columns,
         "rows": g.rows,

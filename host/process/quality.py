@@ -139,7 +139,7 @@ class Quality:
         """Rows, positions and frames compared with the plan; rows that were never recorded count as not received."""
         plan, boards = self.source.plan, list(self.boards.values())
         absent = [row for row in range(plan.rows) if any(row not in board.rows for board in boards)]
-        frames_at = 1 if self.source.synchronised else self.source.instrument.burst.pulses
+        frames_at = 1 if self.source.synchronised else self.source.instrument.burst.chirps_a_position
         return {
             "rows_planned": plan.rows,
             "rows_recorded": plan.rows - len(absent),

@@ -200,7 +200,7 @@ def _config_summary(rig: Instrument) -> dict[str, Any]:
         "incidence": f"{incidence_deg(rig, h):.1f} degrees",
         "chirp": f"{c.first_sample_hz / 1e9:.3f} GHz + {c.swept_hz / 1e9:.3f} GHz in {c.samples} samples",
         "grid": f"{rig.grid.columns} x {rig.grid.rows} positions, {rig.grid.step_x_mm:g} x {rig.grid.step_y_mm:g} mm",
-        "burst": f"{rig.burst.pulses} pulses, {rig.burst.period_us:g} us apart, stage at {rig.stage.speed_mm_s:g} mm/s",
+        "burst": f"{rig.burst}, stage at {rig.stage.speed_mm_s:g} mm/s",
         "leakage": "not measured"
         if leak.leakage_std is None
         else f"H {complex(*leak.leakage_h):.3g}, V {complex(*leak.leakage_v):.3g}, +- {leak.leakage_std:g} (rig file)",

@@ -12,15 +12,16 @@ from enum import Enum
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
-from polysight.host.radar.messages import Message
-from polysight.host.radar.program import ERASE_TIMEOUT_S, TO_FLASH, Program, file_chunks
-from polysight.host.radar.spi import RESPONSE_S, Clock, Link, WordLink
-from polysight.shared.errors import DeviceError
+from polysight.host.radar import lab_commands as lab
+from polysight.host.radar.bring_up import BringUp, Step, data_of
+from polysight.host.radar.calibration_data import CalibrationFiles
+from polysight.host.radar.firmware import Image
+from polysight.host.radar.program import Program
+from polysight.host.radar.spi import Clock, Link, WordLink
+from polysight.shared.errors import DeviceError, PolysightError
 
-_POWER_UP_S = 5.0
-_CALIBRATION_S = 5.0
 _READY_S = 1.0
-_RESET_HELD_S = 0.1
+_MOST_EVENTS = 1000
 _SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")
 
 
@@ -52,21 +53,44 @@ TRANSITIONS: Mapping[State, frozenset[State]] = {
 class RadarBoard:
     """One board behind a word link.
 
+    Parameters
+    ----------
+    firmware
+        Downloaded to the device's RAM at each start; None: what its flash holds.
+    die_id
+        The only board that is accepted; "" for any.
+    calibration
+        Where what its RF init found is kept for its next starts; None: it calibrates anew each time.
+
     Attributes
     ----------
     reason
         Why it is in `FAULT`.
     facts
-        What it said of itself: versions, temperatures, calibration.
+        What it said of itself: versions, die id, temperatures, calibration.
+    steps
+        Of its last bring-up, in order.
     """
 
-    def __init__(self, name: str, words: WordLink, clock: Clock, program: Program) -> None:
+    def __init__(
+        self,
+        name: str,
+        words: WordLink,
+        clock: Clock,
+        program: Program,
+        firmware: Image | None = None,
+        die_id: str = "",
+        calibration: CalibrationFiles | None = None,
+    ) -> None:
         self.name, self._words, self._clock, self._program = name, words, clock, program
+        self._firmware, self._die_id, self._calibration = firmware, die_id, calibration
         self._sent: list[bytes] = []
         self._link = Link(name, words, clock, self._sent.append)
         self._state, self._frames = State.OFF, 0
         self.reason = ""
         self.facts: dict[str, object] = {}
+        self.steps: list[Step] = []
+        self._sent_frames: tuple[c.Command, ...] = ()
         self._log: list[str] = []
 
     @property
@@ -74,27 +98,59 @@ class RadarBoard:
         """Where the board is, as far as it was read."""
         return self._state
 
-    def configure(self, on_power: Callable[[], None] = lambda: None) -> None:
-        """From wherever it is, by a reset, to `CONFIGURED`.
+    @property
+    def warnings(self) -> list[str]:
+        """What went wrong on the link and was mended, since the last report."""
+        return self._link.warnings[:]
 
-        `on_power` is called when the main core is up, before anything else (to download firmware).
+    def configure(self, on_step: Callable[[Step, str], None] | None = None) -> None:
+        """From wherever it is, by a reset, to `CONFIGURED`; `on_step` is told each step and what came of it.
 
         Raises
         ------
-        DeviceError
+        DeviceError, ConfigError
             naming the step that failed; the board is then in `FAULT`.
         """
         with _Failing(self):
-            self._power_up(on_power)
-            self._read_versions()
-            for command in self._program.basic:
-                self._link.call(command)
-            self._link.call(c.RF_INIT)
-            self._calibrated(self._wait(e.RF_INIT_DONE, _CALIBRATION_S))
-            self._to(State.RF_READY)
-            for command in self._program.waveform:
-                self._link.call(command)
-            self._to(State.CONFIGURED)
+            up = self._begin()
+            stages = (
+                (up.power_steps(), State.POWERED),
+                (up.rf_steps(), State.RF_READY),
+                (up.waveform_steps(), State.CONFIGURED),
+            )
+            self.steps = [step for steps, _ in stages for step in steps]
+            for steps, then in stages:
+                for step in steps:
+                    try:
+                        came = step.run()
+                    except DeviceError as error:
+                        raise up.blame(error) from None
+                    if on_step is not None:
+                        on_step(step, came)
+                self._to(then)
+
+    def write_flash(self, image: Image, progress: Callable[[int, int], None]) -> str:
+        """Write firmware to the board's flash, start from it and verify; returns what it holds now.
+
+        `progress` is told parts sent and in all. The board is `OFF` afterwards. Raises DeviceError, ConfigError.
+        """
+        with _Failing(self):
+            up = self._begin()
+            try:
+                told = up.write_flash(image, progress)
+            except DeviceError as error:
+                raise up.blame(error) from None
+        return told
+
+    def _begin(self) -> BringUp:
+        if self._state is not State.OFF:
+            self._to(State.OFF)
+        self.reason, self._frames = "", 0
+        self.facts.clear()
+        return BringUp(
+            self.name, self._link, self._words, self._clock, self._program, self._firmware, self._die_id,
+            self._calibration, self.facts, self._keep,
+        )  # fmt: skip
 
     def arm(self, frames: int) -> None:
         """Count out frames and start them, until the radar has said that it waits for their triggers.
@@ -120,13 +176,53 @@ class RadarBoard:
             self.read_temperatures()
             if frames != self._frames:
                 self._frames = 0
-                for command in self._program.frames(frames):
-                    self._link.call(command)
+                self._set_frames(frames, c.HARDWARE_TRIGGER)
                 self._frames = frames
             self._link.call(c.FrameControl(c.START))
             self._wait(e.TRIGGER_READY, _READY_S)
             if self._state is not State.ARMED:
                 raise DeviceError(f"{self.name}: {self.reason}", "a fatal event while it was armed", "resume the scan")
+
+    def run_one_frame(self) -> str:
+        """One frame, started by software and not by a pulse, for a configured board; what came of it.
+
+        Raises DeviceError.
+        """
+        with _Failing(self):
+            self._frames = 0
+            self._set_frames(1, c.SOFTWARE_TRIGGER)
+            self._link.call(c.FrameControl(c.START))
+            return str(self._wait(e.FRAME_END, _READY_S + self._program.frame_period_us * 1e-6))
+
+    def _set_frames(self, frames: int, trigger: int) -> None:
+        self._sent_frames = self._program.frames(frames, trigger)
+        for command in self._sent_frames:
+            self._link.call(command)
+
+    def read_back(self) -> list[str]:
+        """Profile, chirp and frame as the board has them, where they differ from what it was sent. Raises DeviceError.
+
+        For a configured board whose frames were set.
+        """
+        sent = {one.ID: one.block().data for one in (*self._program.waveform, *self._sent_frames)}
+        differences = []
+        for question, of in ((lab.ReadProfile(), 0x0100), (lab.ReadChirp(), 0x0101), (lab.ReadFrame(), 0x0102)):
+            blocks = self._link.call(question).blocks
+            found = blocks[0].data if blocks else b""
+            if found != sent[of]:
+                differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {found.hex()}")
+        return differences
+
+    def stream_tone(self, tone: lab.StreamTone, on: bool) -> None:
+        """Begin or end continuous streaming of one frequency, for tests of the RF; frames must not run.
+
+        It leaves the board without its chirp: configure it before the next row. Raises DeviceError.
+        """
+        with _Failing(self):
+            if on:
+                self._link.call(tone)
+            self._link.call(lab.StreamData(on))
+            self._link.call(lab.StreamEnable(on))
 
     def reconnect(self, words: WordLink) -> None:
         """Go on over another link, the one before being gone; the next `arm` resets and configures the board."""
@@ -153,15 +249,10 @@ class RadarBoard:
     def read_temperatures(self) -> None:
         """Ask for the temperatures. Raises DeviceError."""
         answer = self._link.call(c.GET_TEMPERATURES)
-        data = _data_of(self.name, answer, c.GET_TEMPERATURES, 24)
+        data = data_of(self.name, answer, c.GET_TEMPERATURES, 24)
         stamp, *degrees = struct.unpack_from("<I9h", data)
         self.facts["temperatures_c"] = dict(zip(_SENSORS, degrees, strict=True))
         self.facts["device_ms"] = stamp
-
-    def download(self, image: bytes) -> None:
-        """Write firmware to the board's flash; for `configure`'s moment after power-up. Raises DeviceError."""
-        for n, (chunk, remaining) in enumerate(file_chunks(image, TO_FLASH)):
-            self._link.call(chunk, timeout_s=ERASE_TIMEOUT_S if n == 0 else RESPONSE_S, remaining=remaining)
 
     def report(self) -> dict[str, object]:
         """What happened since the last report: facts, every byte sent, events, warnings. For the manifest."""
@@ -195,45 +286,6 @@ class RadarBoard:
             self.reason = reason
             self._to(State.FAULT)
 
-    def _power_up(self, on_power: Callable[[], None]) -> None:
-        if self._state is not State.OFF:
-            self._to(State.OFF)
-        self.reason, self._frames = "", 0
-        self.facts.clear()
-        self._words.reset(held=True)
-        self._clock.sleep(_RESET_HELD_S)
-        self._link.restart()
-        self._words.reset(held=False)
-        up = self._link.wait_for((e.MAIN_POWER_UP, e.MAIN_CPU_FAULT), _POWER_UP_S, self._note)
-        if up.id != e.MAIN_POWER_UP or up.detail:
-            raise DeviceError(f"{self.name}: {up}", "the board does not start soundly", "switch its power off and on")
-        on_power()
-        self._link.call(c.DeviceConfiguration())
-        self._link.call(c.RF_POWER_UP)
-        self._link.wait_for((e.RF_POWER_UP_DONE,), _POWER_UP_S, self._note)
-        self._to(State.POWERED)
-
-    def _read_versions(self) -> None:
-        for key, question in (("rf_firmware", c.GET_RF_VERSION), ("main_firmware", c.GET_MAIN_VERSION)):
-            v = _data_of(self.name, self._link.call(question), question, 16)
-            hardware, release, patch = v[:3], v[3:7], (*v[10:12], v[15] >> 4, v[15] & 15)
-            self.facts[key] = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
-            self.facts["hardware"] = ".".join(map(str, hardware))
-            if not any(patch):
-                raise DeviceError(
-                    f"{self.name}: its {key.replace('_', ' ')} has no patch (version {self.facts[key]})",
-                    "the firmware was never written to this board's flash",
-                    "write TI's image once: docs/how-to/radar-bring-up.md",
-                )
-
-    def _calibrated(self, event: e.Event) -> None:
-        self.facts["calibration"] = dict(event.values)
-        passed = event.values.get("passed")
-        if not isinstance(passed, int) or passed & e.SYNTHESIZER != e.SYNTHESIZER:
-            raise DeviceError(
-                f"{self.name}: calibration failed: {event}", "no reference clock or supply", "power-cycle it"
-            )
-
     def _stop(self) -> None:
         """Stop frames that wait for triggers. The stop is forbidden within a frame: one frame period passes first."""
         self._clock.sleep(self._program.frame_period_us * 1e-6)
@@ -248,17 +300,24 @@ class RadarBoard:
 
     def _note(self, event: e.Event) -> None:
         """Keep an event for the report; a fatal one ends what is being done."""
-        self._log.append(str(event))
+        self._keep(str(event))
         if event.fatal:
             self.fail(str(event))
             raise DeviceError(
                 f"{self.name}: {event}", "the radar stopped itself", "it is reset when the row is retaken"
             )
 
+    def _keep(self, line: str) -> None:
+        """For the report; of events without end the first ones."""
+        if len(self._log) < _MOST_EVENTS:
+            self._log.append(line)
+
     def _on_event(self, event: e.Event) -> None:
-        self._log.append(str(event))
+        self._keep(str(event))
         if event.fatal:
             self.fail(str(event))
+        elif event.id == e.MAIN_POWER_UP:  # asked for only in a bring-up
+            self.fail("it has started anew by itself: its supply failed for a moment, or somebody pressed reset")
         elif event.id == e.FRAME_END and self._state in (State.ARMED, State.RUNNING):
             self._to(State.DONE)
         elif event.id == e.TRIGGER_READY and self._state in (State.CONFIGURED, State.DONE):
@@ -283,16 +342,4 @@ class _Failing:
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if error is not None:
-            self._board.fail(error.what if isinstance(error, DeviceError) else str(error))
-
-
-def _data_of(name: str, answer: Message, question: c.Command, least: int) -> bytes:
-    """The sub-block of an answer that was asked for. Raises DeviceError when it is not there."""
-    for block in answer.blocks:
-        if block.id == question.ID and len(block.data) >= least:
-            return block.data
-    raise DeviceError(
-        f"{name}: the answer to 0x{question.ID:04X} does not hold it",
-        "another device or firmware",
-        "check the firmware",
-    )
+            self._board.fail(error.what if isinstance(error, PolysightError) else str(error))

@@ -18,6 +18,7 @@ START_HZ_PER_CODE = 3.6e9 / 2**26  # ICD 81
 SLOPE_HZ_PER_S_PER_CODE = 3.6e9 * 900 / 2**26 * 1e6  # ICD 83: 48.279 kHz/us
 CHIRP_TICK_US, FRAME_TICK_US = 0.01, 0.005
 STOP_AT_FRAME_END, START, STOP_WHILE_WAITING = 0, 1, 4  # ICD 178
+SOFTWARE_TRIGGER, HARDWARE_TRIGGER = 1, 2  # ICD 92
 IfMode = Literal["complex1x", "complex2x"]
 
 
@@ -65,6 +66,7 @@ class Bare(Command):
 RF_POWER_UP = Bare(0x4000)  # ICD 269; must never be sent again (ICD 20)
 RF_INIT = Bare(0x00C0)
 GET_RF_VERSION = Bare(0x0220)
+GET_DIE_ID = Bare(0x0223)  # ICD 188
 GET_MAIN_VERSION = Bare(0x40E0)
 GET_TEMPERATURES = Bare(0x02EA)
 
@@ -165,7 +167,7 @@ class LdoBypass(Command):
 
 @dataclass(frozen=True)
 class Profile(Command):
-    """Profile 0: the chirp's ramp and its ADC window (ICD 79-86)."""
+    """A profile, 0..3: the chirp's ramp and its ADC window (ICD 79-86)."""
 
     ID = 0x0100
     start_hz: float
@@ -180,13 +182,14 @@ class Profile(Command):
     rx_gain_db: int
     rf_gain_target_db: int
     tx_backoff_db: int = 0
+    index: int = 0
 
     def data(self) -> bytes:
         """VCO chosen by the firmware, calibration tables updated, no phase shift, TX from the ramp's knee."""
         back_off = self.tx_backoff_db * 0x010101
         return struct.pack(
             "<HBB6IhhHHBBHHH",
-            0,
+            self.index,
             0,
             0,
             start_code(self.start_hz),
@@ -209,19 +212,22 @@ class Profile(Command):
 
 @dataclass(frozen=True)
 class Chirp(Command):
-    """Chirp 0 of profile 0, unchanged, with the transmitters of a bit mask (ICD 88)."""
+    """Chirps `first` to `last` (0..511) of a profile, unchanged, with the transmitters of a bit mask (ICD 88)."""
 
     ID = 0x0101
     tx: int
+    first: int = 0
+    last: int = 0
+    profile: int = 0
 
     def data(self) -> bytes:
         """Range of indices, profile, four variations of zero, TX."""
-        return struct.pack("<4HI4H", 0, 0, 0, 0, 0, 0, 0, 0, self.tx)
+        return struct.pack("<4HI4H", self.first, self.last, self.profile, 0, 0, 0, 0, 0, self.tx)
 
 
 @dataclass(frozen=True)
 class Frame(Command):
-    """Frames of `loops` chirps, each started by an edge of SYNC_IN (ICD 90-94).
+    """Frames of `loops` chirps, each started by an edge of SYNC_IN, or all at once by software (ICD 90-94).
 
     `samples` goes where the ICD has a reserved field and TI's library 16-bit words per chirp: twice as many.
     """
@@ -232,13 +238,13 @@ class Frame(Command):
     samples: int
     loops: int = 1
     trigger_delay_us: float = 0.0
-    HARDWARE: ClassVar[int] = 2
+    trigger: int = HARDWARE_TRIGGER
 
     def data(self) -> bytes:
         """Chirps, loops, frames, words, period, trigger, delay."""
         period, delay = (round(t / FRAME_TICK_US) for t in (self.period_us, self.trigger_delay_us))
         words = 2 * self.samples
-        return struct.pack("<6HIHHI", 0, 0, 0, self.loops, self.frames, words, period, self.HARDWARE, 0, delay)
+        return struct.pack("<6HIHHI", 0, 0, 0, self.loops, self.frames, words, period, self.trigger, 0, delay)
 
 
 @dataclass(frozen=True)

@@ -86,9 +86,13 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
     slower = "raise burst.period_us"
     yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "take fewer points or pulses a row")
     yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", slower)
-    yield Constraint(
-        "inter-frame time", "frame period - chirps", period - chirps, INTER_FRAME_US, None, "us", slower
-    )  # ICD 91
+    if rig.burst.chirps > 1:
+        apart = f"set radar.idle_us to {rig.burst.chirp_us - chirps + rig.radar.idle_us:g}, or burst.chirp_us"
+        yield Constraint(
+            "chirp spacing", "idle + ramp - chirp_us", chirps - rig.burst.chirp_us, -0.006, 0.006, "us", apart
+        )
+    rest = period - rig.burst.chirps * chirps
+    yield Constraint("inter-frame time", "frame period - chirps", rest, INTER_FRAME_US, None, "us", slower)  # ICD 91
     gap = rig.burst.period_us - period
     yield Constraint("pulse gap", "pulse period - frame period", gap, AFTER_FRAME_US, None, "us", slower)  # ICD 93
     yield Constraint("pulse width", "SYNC_IN pulse", rig.burst.width_us, *WIDTH_US, "us", "set burst.width_us")
@@ -117,7 +121,8 @@ def _chirp(rig: Instrument) -> Iterator[Constraint]:
     yield Constraint("ramp", "ramp end", c.ramp_end_us, None, 5000, "us", "lower chirp.ramp_end_us")
     yield Constraint("idle", "idle time", rig.radar.idle_us, 0, 5242.87, "us", "lower radar.idle_us")
     gain = rig.radar.rx_gain_db
-    yield Constraint("RX gain", "RX gain", gain, 24, 52, "dB", "set radar.rx_gain_db to 24..52, even")  # error 52
+    # ICD table 5.24; the text of error 52 says 24..52, which not every temperature and RF target reaches.
+    yield Constraint("RX gain", "RX gain", gain, 32, 52, "dB", "set radar.rx_gain_db to 32..52, even")
     yield Constraint("RX gain step", "RX gain modulo 2", gain % 2, None, 0, "dB", "set an even radar.rx_gain_db")
     yield Constraint("TX back-off", "back-off", rig.radar.tx_backoff_db, 0, 20, "dB", "lower radar.tx_backoff_db")
 
@@ -131,7 +136,8 @@ def _of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
     yield Constraint(f"sweep{here}", "start + offset + slope x ramp end", top, *BAND_HZ, "Hz", offset)
     if board.name in rig.radar.native:
         native = rig.radar.native[board.name]
-        unacknowledged = native.ldo_bypass and native.ldo_bypass_acknowledged != native.usb_serial
+        named = native.usb_serial and native.ldo_bypass_acknowledged == native.usb_serial  # a USB path names no board
+        unacknowledged = native.ldo_bypass and not named
         yield Constraint(
             f"LDO bypass{here}",
             "bypass without this board's acknowledgement",

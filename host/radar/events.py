@@ -57,6 +57,48 @@ _ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted"
 _RF_GROUP1_FATAL = 1 << 25  # programmable filter, double bit error (ICD 216); its parity error is reserved there
 _MAIN_GROUP1_FATAL = 1 << 22  # FRC lockstep (ICD 320)
 
+# Boot status (ICD table 7.3), bit: what it means. The first group says that the flash is empty or its image broken.
+_FLASH_BITS = {
+    2: "image 1 not authentic",
+    3: "image 2 not authentic",
+    4: "image 3 not authentic",
+    5: "no program header",
+    6: "no image header",
+    19: "image length wrong",
+    20: "main core's image offset wrong",
+    21: "RF core's image offset wrong",
+    22: "DSP's image offset wrong",
+    26: "error in the 2 kB image",
+    28: "main core's image not found",
+    29: "image header counts wrong",
+    30: "image header damaged (CRC)",
+    31: "image 4 not authentic",
+    32: "configuration's offset wrong",
+    39: "serial flash not found",
+}
+_HARDWARE_BITS = {
+    8: "fuses damaged",
+    48: "crystal not detected",
+    50: "DSP does not start",
+    51: "main core's logic self-test failed",
+    52: "DSP's self-test failed",
+    53: "memory self-test failed (single port)",
+    54: "memory self-test failed (two ports)",
+    55: "memory not initialised",
+    56: "ROM self-test failed",
+}
+_OTHER_BITS = {
+    0: "certificate not authentic",
+    1: "certificate unreadable",
+    7: "older software than allowed",
+    27: "shared memory not allocated",
+    49: "started on the crystal",
+    57: "voltage monitor",
+    63: "error signal module",
+    **dict.fromkeys((*range(9, 19), *range(23, 26), *range(33, 39)), "certificate or key"),
+}
+_BOOT_BITS = _FLASH_BITS | _HARDWARE_BITS | _OTHER_BITS
+
 REFUSALS = {  # API error codes, ICD 338-349, of the commands sent here
     1: "wrong message number",
     2: "no sub-block in the message",
@@ -104,7 +146,8 @@ class Event:
     fatal
         Whether the device must be reset.
     values
-        What a manifest keeps of it.
+        What a manifest keeps of it. Of a boot status, `cure` is "firmware" when the flash is empty or broken, which a
+        download mends, "hardware" when the device found a fault of its own, and "" otherwise.
     """
 
     id: int
@@ -117,8 +160,10 @@ class Event:
         return self.name + (f": {self.detail}" if self.detail else "")
 
 
-def describe_refusal(number: int, block: int) -> str:
+def describe_refusal(number: int | None, block: int | None) -> str:
     """Error number and sub-block of a refused command, in words."""
+    if number is None or block is None:
+        return "it does not say why"
     return f"{REFUSALS.get(number, 'see the interface control document')} (error {number}, sub-block 0x{block:04X})"
 
 
@@ -140,15 +185,15 @@ def _plain(data: bytes) -> _Read:
     return "", False, {}
 
 
-def _word(words: Mapping[int, str] | tuple[str, ...], number: int) -> str:
+def _word(words: Mapping[int, str] | tuple[str, ...], number: int, kind: str = "code") -> str:
     try:
         return words[number]
     except (KeyError, IndexError):
-        return f"code {number}"
+        return f"{kind} {number}"
 
 
-def _bits(names: Mapping[int, str], mask: int) -> str:
-    return ", ".join(_word(names, b) for b in range(mask.bit_length()) if mask >> b & 1)
+def _bits(names: Mapping[int, str], mask: int, kind: str = "code") -> str:
+    return ", ".join(dict.fromkeys(_word(names, b, kind) for b in range(mask.bit_length()) if mask >> b & 1))
 
 
 def _cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
@@ -183,10 +228,22 @@ def _analog(data: bytes) -> _Read:
     return _bits(_ANALOG, signals) or "no signal named", bool(kind), {"signals": signals}
 
 
-def _main_power_up(data: bytes) -> _Read:
-    ticks, boot, tests = struct.unpack_from("<IQQ", data)
-    detail = f"boot errors 0x{boot:X}, self-tests failed 0x{tests:X}" if boot or tests else ""
-    return detail, False, {"power_up_us": ticks * 0.005, "boot_errors": boot, "tests_failed": tests}
+def _boot(data: bytes) -> _Read:
+    """Power-up time and status; 16 bytes from the ROM of a first-generation device with empty flash, else 20.
+
+    The short form's order is that of the one that was received (tests/support/radar/received.py): status, time, tests.
+    """
+    if len(data) < 20:
+        boot, ticks, tests = struct.unpack_from("<IIQ", data)
+    else:
+        ticks, boot, tests = struct.unpack_from("<IQQ", data)
+    told = [_bits(_BOOT_BITS, boot, "bit")] if boot else []
+    if tests:
+        told.append(f"self-tests failed 0x{tests:X}")
+    hardware, flash = (any(boot >> bit & 1 for bit in bits) for bits in (_HARDWARE_BITS, _FLASH_BITS))
+    cure = "hardware" if hardware else "firmware" if flash else ""
+    values = {"power_up_us": ticks * 0.005, "boot_errors": boot, "tests_failed": tests, "cure": cure}
+    return "; ".join(told), False, values
 
 
 def _rf_power_up(data: bytes) -> _Read:
@@ -208,10 +265,10 @@ _EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
     ANALOG_FAULT: ("analog supply fault", _analog),
     TIMING_FAILURE: ("calibrations do not fit the frame", _plain),
     CALIBRATION_REPORT: ("run-time calibration", _plain),
-    MAIN_POWER_UP: ("main core is up", _main_power_up),
+    MAIN_POWER_UP: ("main core is up", _boot),
     RF_POWER_UP_DONE: ("RF core is up", _rf_power_up),
     MAIN_CPU_FAULT: ("main core fault", _cpu(())),
     MAIN_ESM_FAULT: ("main core error signal", _esm(_MAIN_GROUP1_FATAL)),
-    BOOT_STATUS: ("booted over SPI", _main_power_up),
+    BOOT_STATUS: ("booted over SPI", _boot),
     RF_ERROR: ("RF core error", _rf_error),
 }

@@ -23,7 +23,7 @@ CRC_BYTES = 4
 MESSAGE_LIMIT = 256  # with the sync word
 BODY_LIMIT = 232  # of one sub-block; the chunk size that TI recommends over SPI (ICD 20)
 BLOCKS_PER_MESSAGE_ID = 32
-ERROR_BLOCK = 0x0000
+ERROR_MESSAGE, ERROR_BLOCK = 0, 0x0000
 _HEADER = struct.Struct("<6H")
 _BLOCK = struct.Struct("<2H")
 _PAD = b"\xff"
@@ -76,13 +76,19 @@ class Message:
     remaining_chunks: int = 0
 
     @property
-    def error(self) -> tuple[int, int] | None:
-        """Error number and sub-block of a response that refuses the command (ICD table 5.1); None of any other."""
+    def error(self) -> tuple[int | None, int | None] | None:
+        """Error number and sub-block of a response that refuses the command; None of any other message.
+
+        A refusal has message id 0, whatever was asked (ICD 4.4), and the sub-block of ICD table 5.1. Both are None when
+        it has no body, as first-generation devices send it.
+        """
+        if self.kind is not Kind.RESPONSE:
+            return None
         for block in self.blocks:
-            if self.kind is Kind.RESPONSE and block.id == ERROR_BLOCK and len(block.data) >= 4:
+            if block.id == ERROR_BLOCK and len(block.data) >= 4:
                 number, where = _BLOCK.unpack(block.data[:4])
                 return number, where
-        return None
+        return (None, None) if self.message_id == ERROR_MESSAGE else None
 
 
 @dataclass(frozen=True)
@@ -116,6 +122,12 @@ class Header:
     def sequence(self) -> int:
         """Sequence number, 0..15."""
         return self.flags >> 12
+
+    @property
+    def is_bare_refusal(self) -> bool:
+        """True of an error response that announces a sub-block and holds none, as an AWR1243 sends it."""
+        refused = self.kind is Kind.RESPONSE and self.message_id == ERROR_MESSAGE
+        return refused and self.length == HEADER_BYTES + self.crc_bytes
 
 
 def command(blocks: tuple[SubBlock, ...], *, sequence: int = 0, retry: bool = False, remaining: int = 0) -> Message:
@@ -198,7 +210,7 @@ def decode(raw: bytes) -> Message:
         direction,
         header.kind,
         header.message_id,
-        _blocks(inner[HEADER_BYTES:end], header.block_count),
+        _blocks(inner[HEADER_BYTES:end], 0 if header.is_bare_refusal else header.block_count),
         header.sequence,
         header.flags & _RETRY == _RETRY,
         header.remaining_chunks,

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
+from pathlib import Path
 
 from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.calibration_data import CalibrationFiles
 from polysight.host.radar.constraints import constraints, direct_if_hz, require
+from polysight.host.radar.firmware import Image, read_image
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
+from polysight.host.radar.messages import command, encode
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import Clock, SystemClock, WordLink
 from polysight.host.radar.usb import SCHEME, open_tcp, open_usb
 from polysight.shared.config import Instrument
-from polysight.shared.errors import DeviceError
+from polysight.shared.errors import ConfigError, DeviceError
 
 _LOOK_S = 0.005
 _REOPEN_S = 5.0  # USB takes a moment to find a chip again
@@ -29,9 +34,47 @@ _TOLD = {
 }
 
 
-def open_board(serial: str) -> WordLink:
-    """A board's word link by its USB serial number, or by `tcp://address:port`. Raises ConfigError, DeviceError."""
-    return open_tcp(serial) if serial.startswith(SCHEME) else open_usb(serial)
+def open_board(place: str, slow: bool = False) -> WordLink:
+    """A board's word link by its USB serial number, `usb:PATH`, or `tcp://address:port`.
+
+    `slow` sends words one by one at 1 MHz. Raises ConfigError, DeviceError.
+    """
+    return open_tcp(place, slow) if place.startswith(SCHEME) else open_usb(place, slow)
+
+
+def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmware: Image | None) -> RadarBoard:
+    """One board of a rig behind a word link, with the firmware that the rig file asks for."""
+    native = rig.radar.native[name]
+    made = program(rig, rig.by_name(name))
+    settings = b"".join(one.block().data for one in (*made.basic, *made.waveform))
+    folder = rig.radar.calibration_dir
+    calibration = CalibrationFiles(Path(folder), settings) if folder else None
+    return RadarBoard(name, words, clock, made, firmware, native.die_id, calibration)
+
+
+def plan_lines(rig: Instrument) -> list[str]:
+    """Each constraint with its value, and every message that each board will be sent, as hexadecimal."""
+    frames = rig.grid.columns * rig.burst.pulses
+    lines = [f"{'holds ' if c.holds else 'BROKEN'}  {c}" for c in constraints(rig, frames)]
+    for board in rig.boards:
+        lines.append(f"\n{board.name}, sequence numbers from 0:")
+        made = program(rig, board)
+        for number, sent in enumerate((*made.basic, *made.waveform, *made.frames(frames))):
+            raw = encode(command((sent.block(),), sequence=number % 16))
+            lines.append(f"  {type(sent).__name__:19} {raw.hex()}")
+    return lines
+
+
+def firmware_of(rig: Instrument) -> Image | None:
+    """The image that a rig file wants in its boards' RAM, checked. Raises ConfigError."""
+    if not rig.radar.firmware:
+        return None
+    try:
+        return read_image(Path(rig.radar.firmware))
+    except OSError as e:
+        raise ConfigError(
+            f"radar.firmware: {rig.radar.firmware} cannot be read: {e.strerror}", "a typing error", "correct the path"
+        ) from None
 
 
 class _NoLink:
@@ -70,7 +113,7 @@ class NativeRadars(RadarControl):
     rig
         With `radar.native` for each board. What it asks of the radars is looked at before anything is written.
     open_words
-        Opens a board's word link by its serial number.
+        Opens a board's word link by its place: `open_board`, fast or slow as the rig file says, when None.
     clock
         Time.
 
@@ -83,19 +126,20 @@ class NativeRadars(RadarControl):
     """
 
     def __init__(
-        self, rig: Instrument, open_words: Callable[[str], WordLink] = open_board, clock: Clock | None = None
+        self, rig: Instrument, open_words: Callable[[str], WordLink] | None = None, clock: Clock | None = None
     ) -> None:
-        self._rig, self._clock, self._open_words = rig, clock or SystemClock(), open_words
+        self._rig, self._clock = rig, clock or SystemClock()
+        self._open_words = open_words or partial(open_board, slow=rig.radar.slow_spi)
         frames = rig.grid.columns * rig.burst.pulses
         require(rig, frames)
         self._constraints = [str(c) for c in constraints(rig, frames)]
         self._boards: dict[str, RadarBoard] = {}
+        firmware = firmware_of(rig)
         with ExitStack() as opened:
             opened.callback(self.close)
             for board in rig.boards:
-                made = program(rig, board)
                 words = self._open(board.name)
-                self._boards[board.name] = RadarBoard(board.name, words, self._clock, made)
+                self._boards[board.name] = radar_board(rig, board.name, words, self._clock, firmware)
             for board in self._boards.values():
                 board.configure()
             opened.pop_all()
@@ -115,7 +159,7 @@ class NativeRadars(RadarControl):
                         board.arm(frames)
 
     def _open(self, name: str) -> WordLink:
-        return self._open_words(self._rig.radar.native[name].usb_serial)
+        return self._open_words(self._rig.radar.native[name].place)
 
     def _reopen(self, board: RadarBoard) -> bool:
         """Open a failed board's link anew; False when it does not come back."""

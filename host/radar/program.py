@@ -1,23 +1,17 @@
-"""What a board is told from power-up to its frames, and the parts in which a firmware image is downloaded.
+"""What a board is told from power-up to its frames.
 
 Order: ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. Not run on hardware yet.
 """
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 
 from polysight.host.radar import commands as c
-from polysight.host.radar.commands import FileChunk
-from polysight.host.radar.messages import BODY_LIMIT
 from polysight.shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instrument
 
 TRIGGER_MARGIN_US = 200.0
 """From the end of a frame's period to the next pulse: 150 us at least, 300 us at most recommended (ICD 93)."""
-TO_RAM = 0  # place of a firmware image: lost at power-off
-TO_FLASH = 4  # the first of four places in the board's serial flash
-ERASE_TIMEOUT_S = 10.0  # the first part is acknowledged when the flash is erased
 
 
 @dataclass(frozen=True)
@@ -36,10 +30,12 @@ class Program:
     waveform: tuple[c.Command, ...]
     samples: int
     frame_period_us: float
+    chirps: int = 1
 
-    def frames(self, count: int) -> tuple[c.Command, ...]:
-        """Frames of one chirp each: the RF core's part, then the main core's."""
-        return (c.Frame(count, self.frame_period_us, self.samples), c.FrameApply(self.samples))
+    def frames(self, count: int, trigger: int = c.HARDWARE_TRIGGER) -> tuple[c.Command, ...]:
+        """Frames of the burst: the RF core's part, then the main core's."""
+        frame = c.Frame(count, self.frame_period_us, self.samples, self.chirps, trigger=trigger)
+        return (frame, c.FrameApply(self.samples, self.chirps))
 
 
 def frame_period_us(rig: Instrument) -> float:
@@ -96,22 +92,8 @@ def program(rig: Instrument, board: Board) -> Program:
         ),
         samples=chirp.samples,
         frame_period_us=frame_period_us(rig),
+        chirps=rig.burst.chirps,
     )
     for command in (*made.basic, *made.waveform):
         command.block()  # refuses here what fits no field
     return made
-
-
-def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:
-    """Commands that download an image, each with the number of those that follow it.
-
-    Raises
-    ------
-    ValueError
-        when the image is empty.
-    """
-    if not image:
-        raise ValueError("the firmware image is empty")
-    whole = struct.pack("<II", file_type, len(image)) + image
-    parts = [whole[at : at + BODY_LIMIT] for at in range(0, len(whole), BODY_LIMIT)]
-    return [(FileChunk(part), len(parts) - 1 - n) for n, part in enumerate(parts)]

@@ -1,7 +1,8 @@
 """mmWaveLink over 16-bit words: commands and their answers, events between them, and what to do when one is lost.
 
 Procedure: ICD section 3. A time-out sends the same message again with the retry flag, which the device answers without
-obeying twice; a NACK sends it with a new sequence number. Not run on hardware yet.
+obeying twice; a NACK sends it with a new sequence number. Every wait has a limit, and a device that never stops sending
+events is read for a moment only. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -10,14 +11,17 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from dataclasses import replace
+from typing import NamedTuple, Protocol
 
 from polysight.host.radar.commands import RF_POWER_UP, Command
 from polysight.host.radar.events import Event, decode_event, describe_refusal
 from polysight.host.radar.messages import (
+    DEVICE_SYNC,
     HEADER_BYTES,
     READY_TO_READ,
     SYNC_BYTES,
+    Direction,
     Kind,
     Message,
     command,
@@ -30,11 +34,28 @@ from polysight.shared.errors import DeviceError, ProtocolError
 RESPONSE_S = 1.0
 ATTEMPTS = 3
 SETTLE_S = 30e-6  # from the interrupt to the first word (ICD 20)
+DATA_S = 1e-3  # from the interrupt's fall to the first word read, as TI's port waits
 _LOOK_S = 0.5e-3
 _INTERRUPT_LOW_S = 0.1
+MESSAGES_A_POLL = 64  # read in one look at most, or
+POLL_S = 0.25  # for so long, when events follow each other without end
+_MOST_WARNINGS = 100
 _SYNC_SEARCH_BYTES = 252
 _FLUSH_BYTES = 244  # of a message whose header is not to be believed: so many bytes bring the device back in step
 _DO = "check the board's power, the 60-pin connector and the USB cable, then `polysight resume SCAN`"
+
+
+class Problem(NamedTuple):
+    """Why a message could not be had: what was seen, and the likely cause."""
+
+    what: str
+    why: str
+
+
+_SILENT = "the board has no power, hangs, or its interrupt line is not connected"
+_NOT_CLOCKED = "the board does not hear its SPI clock or chip select, or its interrupt line is stuck"
+_NOT_HEARD = "the board's data line (MISO) is not connected, or SPI is disturbed"
+_DISTURBED = "the SPI lines are disturbed: noise, a loose 60-pin connector, or a clock that is too fast"
 
 
 class WordLink(Protocol):
@@ -96,44 +117,53 @@ class Link:
         What carries them.
     on_sent
         Told every message as it is written.
+
+    Attributes
+    ----------
+    sequence
+        Number of the next command, 0..15.
+    warnings
+        What went wrong and was mended, at most 100 lines.
     """
 
     def __init__(self, name: str, words: WordLink, clock: Clock, on_sent: Callable[[bytes], None]) -> None:
         self._name, self._words, self._clock, self._on_sent = name, words, clock, on_sent
-        self._sequence = 0
+        self.sequence = 0
         self._events: deque[Event] = deque()
         self.warnings: list[str] = []
 
     def restart(self) -> None:
         """The device was reset: it counts from zero again, and what it had said is void."""
-        self._sequence = 0
+        self.sequence = 0
         self._events.clear()
 
     def call(self, sent: Command, *, timeout_s: float = RESPONSE_S, remaining: int = 0) -> Message:
-        """Send a command and return the device's answer.
+        """Send a command and return the device's answer, its chunks joined.
 
         Raises
         ------
         DeviceError
             when the device does not answer, or refuses the command; RF power-up is never sent twice.
         """
-        problems: list[str] = []
+        problems: list[Problem] = []
         retry = False
         for _ in range(1 if sent is RF_POWER_UP else ATTEMPTS):
-            raw = encode(command((sent.block(),), sequence=self._sequence, retry=retry, remaining=remaining))
-            self._write(raw)
-            answer, problem = self._answer(sent.block().message_id, timeout_s)
+            asked = command((sent.block(),), sequence=self.sequence, retry=retry, remaining=remaining)
+            self._write(encode(asked))
+            answer, problem = self._answer(asked, timeout_s)
             if answer is None:
                 problems.append(problem)
                 retry = True
                 continue
-            self._sequence = (self._sequence + 1) % 16
+            self.sequence = (self.sequence + 1) % 16
             if answer.kind is Kind.NACK:
-                problems.append("the device received it damaged")
+                problems.append(Problem("the device received it damaged", _DISTURBED))
                 retry = False
                 continue
             if problems:
-                self._warn(f"{type(sent).__name__} (0x{sent.ID:04X}) sent {len(problems) + 1} times: {problems[-1]}")
+                self._warn(
+                    f"{type(sent).__name__} (0x{sent.ID:04X}) sent {len(problems) + 1} times: {problems[-1].what}"
+                )
             if answer.error is not None:
                 raise DeviceError(
                     f"{self._name}: the radar refuses {sent}: {describe_refusal(*answer.error)}",
@@ -143,19 +173,14 @@ class Link:
             return answer
         raise DeviceError(
             f"{self._name}: no valid answer to {sent} after {len(problems)} tries:"
-            f" {'; '.join(dict.fromkeys(problems))}",
-            "the board has no power, hangs, or its SPI lines are disturbed",
+            f" {'; '.join(dict.fromkeys(p.what for p in problems))}",
+            "; ".join(dict.fromkeys(p.why for p in problems)),
             _DO,
         )
 
     def poll(self) -> list[Event]:
-        """Events since the last look; reads what waits in the device. Raises DeviceError when the link is gone."""
-        while self._words.interrupt():
-            message, problem = self._receive()
-            if message is None:
-                self._warn(problem)
-                break
-            self._keep(message)
+        """Events since the last look; reads what waits, within limits. Raises DeviceError without a link."""
+        self._look()
         events = list(self._events)
         self._events.clear()
         return events
@@ -169,8 +194,11 @@ class Link:
             when it does not come.
         """
         deadline = self._clock.now() + limit_s
+        lost: Problem | None = None
         while True:
-            events = self.poll()
+            lost = self._look() or lost
+            events = list(self._events)
+            self._events.clear()
             for event in events:
                 on_event(event)
             for event in events:
@@ -179,16 +207,34 @@ class Link:
             if self._clock.now() > deadline:
                 wanted = ", ".join(f"0x{i:04X}" for i in ids)
                 raise DeviceError(
-                    f"{self._name}: the radar did not report {wanted} within {limit_s:g} s",
-                    "it hangs, was reset, or its interrupt line is not connected",
+                    f"{self._name}: the radar did not report {wanted} within {limit_s:g} s"
+                    + (f"; a message was lost meanwhile: {lost.what}" if lost else ""),
+                    lost.why if lost else f"it was reset, or: {_SILENT}",
                     _DO,
                 )
             self._clock.sleep(_LOOK_S)
 
-    def _answer(self, message_id: int, timeout_s: float) -> tuple[Message | None, str]:
+    def _look(self) -> Problem | None:
+        """Read what waits in the device and keep its events; what could not be read."""
+        deadline = self._clock.now() + POLL_S
+        for _ in range(MESSAGES_A_POLL):
+            if not self._words.interrupt():
+                return None
+            message, problem = self._receive()
+            if message is None:
+                self._warn(problem.what)
+                return problem
+            self._keep(message)
+            if self._clock.now() > deadline:
+                break
+        self._warn("it sends one message after the other without a pause; the rest is read later")
+        return None
+
+    def _answer(self, asked: Message, timeout_s: float) -> tuple[Message | None, Problem]:
         """The response to the message just sent, or None and why; events on the way are kept."""
         deadline = self._clock.now() + timeout_s
-        problem = f"no answer within {timeout_s:g} s"
+        problem = Problem(f"no answer within {timeout_s:g} s", _SILENT)
+        parts: list[Message] = []
         while self._clock.now() <= deadline:
             if not self._words.interrupt():
                 self._clock.sleep(_LOOK_S)
@@ -198,25 +244,31 @@ class Link:
                 problem = found
             elif message.kind is Kind.EVENT:
                 self._keep(message)
-            elif message.kind is Kind.NACK or (message.message_id, message.sequence) == (message_id, self._sequence):
-                return message, ""
-            else:
+            elif not _answers(message, asked):
                 self._warn(f"an answer to an earlier message came late (sequence {message.sequence})")
+            elif parts and message.remaining_chunks != parts[-1].remaining_chunks - 1:
+                return None, Problem("parts of the answer are missing", _DISTURBED)
+            else:
+                parts.append(message)
+                if message.remaining_chunks == 0:
+                    return _joined(parts), problem
         return None, problem
 
-    def _receive(self) -> tuple[Message | None, str]:
+    def _receive(self) -> tuple[Message | None, Problem]:
         """One message, now that the interrupt is high; None and why when it cannot be read."""
         self._clock.sleep(SETTLE_S)
         self._write(READY_TO_READ)
         if not self._wait_low():
             self._write(READY_TO_READ)
             if not self._wait_low():
-                return None, "the host interrupt stays high"
+                return None, Problem("the host interrupt stays high", _NOT_CLOCKED)
+        self._clock.sleep(DATA_S)
         head = self._read(SYNC_BYTES)
         searched = 0
-        while head[-SYNC_BYTES:] != b"\xba\xdc\xcd\xab":
+        while head[-SYNC_BYTES:] != DEVICE_SYNC:
             if searched >= _SYNC_SEARCH_BYTES:
-                return None, f"no sync word in {searched} bytes"
+                same = len(set(head)) == 1
+                return None, Problem(f"no sync word in {searched} bytes", _NOT_HEARD if same else _DISTURBED)
             head += self._read(2)
             searched += 2
         head = head[-SYNC_BYTES:] + self._read(HEADER_BYTES)
@@ -224,12 +276,12 @@ class Link:
             header = decode_header(head)
         except ProtocolError as e:
             self._read(_FLUSH_BYTES)
-            return None, e.what
+            return None, Problem(e.what, _DISTURBED)
         body = self._read(header.body_bytes)
         try:
-            return decode(head + body), ""
+            return decode(head + body), Problem("", "")
         except ProtocolError as e:
-            return None, e.what
+            return None, Problem(e.what, _DISTURBED)
 
     def _wait_low(self) -> bool:
         deadline = self._clock.now() + _INTERRUPT_LOW_S
@@ -254,4 +306,19 @@ class Link:
         return struct.pack(f"<{len(words)}H", *words)[:size]
 
     def _warn(self, what: str) -> None:
-        self.warnings.append(f"{self._name}: {what}")
+        if len(self.warnings) < _MOST_WARNINGS:
+            self.warnings.append(f"{self._name}: {what}")
+
+
+def _answers(message: Message, asked: Message) -> bool:
+    """Whether a response or NACK belongs to a command: its id, or the id 0 of a refusal (ICD 4.4), and its number."""
+    if message.kind is Kind.NACK:
+        return True
+    back = {Direction.HOST_TO_RF: Direction.RF_TO_HOST}.get(asked.direction, Direction.MAIN_TO_HOST)
+    known = message.message_id == asked.message_id or (message.error is not None and message.direction is back)
+    return known and message.sequence == asked.sequence
+
+
+def _joined(parts: Sequence[Message]) -> Message:
+    """One answer from its chunks (ICD 2.3.2, REMCHUNKS): the sub-blocks of all."""
+    return parts[0] if len(parts) == 1 else replace(parts[-1], blocks=tuple(b for p in parts for b in p.blocks))

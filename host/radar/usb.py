@@ -1,7 +1,8 @@
 """Word links to a board: the DCA1000's FT4232H over USB, or its four channels over TCP.
 
 `UsbWords` turns words, interrupt, reset and sense lines into MPSSE commands on the chip's four channels. `open_usb`
-opens them by serial number with pyftdi (the extra `radar`); `open_tcp` reaches channels that another program serves.
+opens them by serial number or path on the bus with pyftdi (the extra `radar`); `open_tcp` reaches channels that another
+program serves.
 Not run on hardware yet.
 """
 
@@ -11,12 +12,14 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from importlib import import_module
+from typing import Any, NamedTuple, Protocol
 
 from polysight.shared.errors import ConfigError, DeviceError
 
 # The FT4232H over USB.
 VENDOR, PRODUCT = 0x0451, 0xFD03
+PATH = "usb:"  # before a path on the bus, "usb:1-4.2"; without it, a serial number
 _READ_S = 0.5
 _LATENCY_MS = 1
 _CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists what is there"
@@ -37,7 +40,11 @@ SENSE_DIRECTION, FUNCTIONAL_MODE = 0b1111_1111, 0b0001_0000  # D4 = 1, D3 = D2 =
 _PINS, _READ_PINS, _WRITE_BYTES, _READ_BYTES, _NOW = 0x80, 0x81, 0x11, 0x20, 0x87
 _FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _THREE_PHASE, _DIVISOR = 0x8A, 0x97, 0x8D, 0x8C, 0x86
 _NO_LOOPBACK = 0x85
-SPI_DIVISOR = 2  # 60 MHz / (2 x (2 + 1)) = 10 MHz
+SPI_DIVISOR, SLOW_DIVISOR = 2, 29  # 60 MHz / (2 x (2 + 1)) = 10 MHz; 1 MHz
+# One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; ICD 3.2.4 wants two at least.
+_SELECT_COMMANDS, _IDLE_COMMANDS = 2, 3
+_SLOW_GAP_S = 100e-6
+_DESELECT = bytes((_PINS, IDLE, SPI_DIRECTION)) * _IDLE_COMMANDS
 _RESET_S = 0.01
 
 
@@ -57,9 +64,9 @@ class Port(Protocol):
         ...
 
 
-def set_up_spi() -> bytes:
+def set_up_spi(divisor: int = SPI_DIVISOR) -> bytes:
     """What channel A is told first."""
-    clock = bytes((_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _DIVISOR, SPI_DIVISOR, 0))
+    clock = bytes((_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _DIVISOR, divisor, 0))
     return clock + bytes((_PINS, IDLE, SPI_DIRECTION, _NO_LOOPBACK))
 
 
@@ -70,38 +77,58 @@ def set_up_interrupt() -> bytes:
 
 def write_words(words: Sequence[int]) -> bytes:
     """Words out: chip select low, two bytes on the falling edge, chip select high, for each."""
+    select = bytes((_PINS, SELECTED_WRITE, SPI_DIRECTION)) * _SELECT_COMMANDS
     parts = bytearray()
     for word in words:
-        parts += bytes((_PINS, SELECTED_WRITE, SPI_DIRECTION, _WRITE_BYTES, 1, 0, word >> 8, word & 0xFF))
-        parts += bytes((_PINS, IDLE, SPI_DIRECTION))
+        parts += select + bytes((_WRITE_BYTES, 1, 0, word >> 8, word & 0xFF)) + _DESELECT
     return bytes(parts) + bytes((_NOW,))
 
 
 def read_words(count: int) -> bytes:
     """Words in: chip select low, two bytes on the rising edge, chip select high, for each."""
-    select = bytes((_PINS, SELECTED_READ, SPI_DIRECTION, _READ_BYTES, 1, 0, _PINS, IDLE, SPI_DIRECTION))
-    return select * count + bytes((_NOW,))
+    select = bytes((_PINS, SELECTED_READ, SPI_DIRECTION)) * _SELECT_COMMANDS
+    return (select + bytes((_READ_BYTES, 1, 0)) + _DESELECT) * count + bytes((_NOW,))
 
 
 class UsbWords:
-    """A board behind the four channels of one chip; satisfies :class:`polysight.host.radar.spi.WordLink`."""
+    """A board behind the four channels of one chip; satisfies :class:`polysight.host.radar.spi.WordLink`.
+
+    `slow`: one word a USB transfer, 0.1 ms apart, at 1 MHz.
+    """
 
     def __init__(
-        self, spi: Port, interrupt: Port, reset: Port, sense: Port, sleep: Callable[[float], None] = time.sleep
+        self,
+        spi: Port,
+        interrupt: Port,
+        reset: Port,
+        sense: Port,
+        sleep: Callable[[float], None] = time.sleep,
+        slow: bool = False,
     ) -> None:
         self._spi, self._interrupt, self._reset, self._sense, self._sleep = spi, interrupt, reset, sense, sleep
-        self._spi.write(set_up_spi())
+        self._slow = slow
+        self._spi.write(set_up_spi(SLOW_DIVISOR if slow else SPI_DIVISOR))
         self._interrupt.write(set_up_interrupt())
 
     def write(self, words: Sequence[int]) -> None:
         """Shift words out. Raises DeviceError."""
-        self._spi.write(write_words(words))
+        for part in [[w] for w in words] if self._slow else [words]:
+            self._spi.write(write_words(part))
+            self._pause()
 
     def read(self, count: int) -> list[int]:
         """Shift words in. Raises DeviceError."""
-        self._spi.write(read_words(count))
-        data = _exactly(self._spi, 2 * count)
-        return [int.from_bytes(data[at : at + 2], "big") for at in range(0, 2 * count, 2)]
+        words: list[int] = []
+        for part in [1] * count if self._slow else [count]:
+            self._spi.write(read_words(part))
+            data = _exactly(self._spi, 2 * part)
+            words += [int.from_bytes(data[at : at + 2], "big") for at in range(0, 2 * part, 2)]
+            self._pause()
+        return words
+
+    def _pause(self) -> None:
+        if self._slow:
+            self._sleep(_SLOW_GAP_S)
 
     def interrupt(self) -> bool:
         """Whether the host interrupt is high. Raises DeviceError."""
@@ -130,23 +157,26 @@ def _exactly(port: Port, size: int) -> bytes:
 class FtdiPort:
     """One channel, in MPSSE or bit-bang mode. Errors of the USB library become DeviceError."""
 
-    def __init__(self, serial: str, interface: int, direction: int, bit_bang: bool) -> None:
-        ftdi, self._errors = _library()
-        self._serial = serial
+    def __init__(self, place: str, interface: int, direction: int, bit_bang: bool) -> None:
+        self._library = _library()
+        ftdi = self._library.ftdi
+        self._place = place
         self._ftdi = ftdi()
         try:
             if VENDOR not in ftdi.PRODUCT_IDS:
                 ftdi.add_custom_vendor(VENDOR, "ti")
                 ftdi.add_custom_product(VENDOR, PRODUCT, "devpack")
-            self._ftdi.open(VENDOR, PRODUCT, serial=serial, interface=interface)
+            self._ftdi.open(VENDOR, PRODUCT, interface=interface, **self._library.address_of(place))
             self._ftdi.set_bitmode(0, ftdi.BitMode.RESET)
             self._ftdi.set_latency_timer(_LATENCY_MS)
             self._ftdi.purge_buffers()
             self._ftdi.set_bitmode(direction, ftdi.BitMode.BITBANG if bit_bang else ftdi.BitMode.MPSSE)
-        except self._errors as e:
+        except self._library.errors as e:
+            self.close()
             raise DeviceError(
-                f"radar USB serial {serial}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}",
-                "unplugged, another serial number, no permission (a udev rule for 0451:fd03), or libusb is missing",
+                f"radar USB {place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}",
+                "unplugged, another serial number or path, no permission (a udev rule for 0451:fd03), or libusb is"
+                " missing",
                 _CHECK,
             ) from None
 
@@ -154,7 +184,7 @@ class FtdiPort:
         """Send bytes. Raises DeviceError."""
         try:
             self._ftdi.write_data(data)
-        except self._errors as e:
+        except self._library.errors as e:
             raise self._gone(e) from None
 
     def read(self, size: int) -> bytes:
@@ -163,22 +193,26 @@ class FtdiPort:
         try:
             while len(found) < size and time.monotonic() < deadline:
                 found += self._ftdi.read_data_bytes(size - len(found), attempt=4)
-        except self._errors as e:
+        except self._library.errors as e:
             raise self._gone(e) from None
         return bytes(found)
 
     def close(self) -> None:
-        """Let go of it, its pins as they are."""
-        self._ftdi.close(freeze=True)
+        """Let go of it, its pins as they are; of one that is gone, too."""
+        device = self._ftdi.usb_dev
+        try:
+            self._ftdi.close(freeze=True)
+        except (*self._library.errors, TypeError):  # gone, or pyftdi had opened it halfway
+            self._library.tools.release_device(device)  # which else counts it as open, and gives it to the next
 
     def _gone(self, e: BaseException) -> DeviceError:
-        return DeviceError(
-            f"radar USB serial {self._serial}: {e}", "the cable was pulled, or the board lost power", _CHECK
-        )
+        return DeviceError(f"radar USB {self._place}: {e}", "the cable was pulled, or the board lost power", _CHECK)
 
 
-def open_usb(serial: str) -> UsbWords:
-    """A board by the serial number of its USB chip.
+def open_usb(place: str, slow: bool = False) -> UsbWords:
+    """A board by the serial number of its USB chip, or by `usb:` and its path on the bus.
+
+    The bus is looked at anew each time, so that a chip that was plugged in since is found.
 
     Raises
     ------
@@ -187,6 +221,7 @@ def open_usb(serial: str) -> UsbWords:
     DeviceError
         when the chip cannot be opened.
     """
+    _library().tools.flush_cache()
     ports: list[FtdiPort] = []
     try:
         for interface, (direction, bit_bang) in enumerate(
@@ -198,27 +233,52 @@ def open_usb(serial: str) -> UsbWords:
             ),
             start=1,
         ):
-            ports.append(FtdiPort(serial, interface, direction, bit_bang))
+            ports.append(FtdiPort(place, interface, direction, bit_bang))
         spi, interrupt, reset, sense = ports
-        return UsbWords(spi, interrupt, reset, sense)
+        return UsbWords(spi, interrupt, reset, sense, slow=slow)
     except (ConfigError, DeviceError):
         for port in ports:
             port.close()
         raise
 
 
-def _library() -> tuple[Any, tuple[type[Exception], ...]]:
-    """Class and errors of pyftdi; loaded only here, so that a host without radars does not need it."""
+class _Library(NamedTuple):
+    """What is used of pyftdi and pyusb."""
+
+    ftdi: Any
+    tools: Any
+    errors: tuple[type[Exception], ...]
+    find: Callable[..., Any]
+
+    def address_of(self, place: str) -> dict[str, object]:
+        """How pyftdi names the chip at a place. Raises OSError when there is none at a path."""
+        if not place.startswith(PATH):
+            return {"serial": place}
+        backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)  # pyftdi's, in its order
+        backend = next((b for b in backends if b is not None), None)
+        found = self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend)
+        paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in found}
+        if place.removeprefix(PATH) not in paths:
+            there = f"; there are {', '.join(sorted(paths))}" if paths else "; there is none on the bus"
+            raise OSError(f"no chip 0451:fd03 at this path{there}")
+        device = paths[place.removeprefix(PATH)]
+        return {"bus": device.bus, "address": device.address}
+
+
+def _library() -> _Library:
+    """pyftdi, loaded only here, so that a host without radars does not need it. Raises ConfigError."""
     try:
         from pyftdi.ftdi import Ftdi
-        from pyftdi.usbtools import UsbToolsError
+        from pyftdi.usbtools import UsbTools, UsbToolsError
+        from usb.core import find
     except ImportError:
         raise ConfigError(
             'radar.control = "native" needs pyftdi, which is not installed',
             "it comes with the host's extra `radar`",
             "pip install 'polysight[radar]' (in this repository: .venv/bin/pip install -e '.[radar]')",
         ) from None
-    return Ftdi, (OSError, ValueError, UsbToolsError)  # FtdiError and USBError are OSErrors
+    # FtdiError and USBError are OSErrors
+    return _Library(Ftdi, UsbTools, (OSError, ValueError, UsbToolsError), find)
 
 
 class _TcpPort:
@@ -265,7 +325,7 @@ class _TcpPort:
         )
 
 
-def open_tcp(address: str) -> UsbWords:
+def open_tcp(address: str, slow: bool = False) -> UsbWords:
     """A board by `tcp://address:port`. Raises DeviceError when nobody is there."""
     host, _, port = address.removeprefix(SCHEME).rpartition(":")
     try:
@@ -276,4 +336,4 @@ def open_tcp(address: str) -> UsbWords:
         ) from None
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     spi, interrupt, reset, sense = (_TcpPort(address, connection, c) for c in (b"A", b"B", b"C", b"D"))
-    return UsbWords(spi, interrupt, reset, sense)
+    return UsbWords(spi, interrupt, reset, sense, slow=slow)

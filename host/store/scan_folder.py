@@ -323,7 +323,8 @@ class ScanFolder:
                 "the file was changed, truncated or damaged after the scan",
                 self._remedy(),
             )
-        return RowData(payload, self._missing(path.with_suffix(".idx"), board), board.frames_expected, board.crc32)
+        chirps = board.frames_expected * self.instrument.burst.chirps
+        return RowData(payload, self._missing(path.with_suffix(".idx"), board), chirps, board.crc32)
 
     def _missing(self, path: Path, board: BoardRow) -> list[tuple[int, int]]:
         if board.missing_bytes == 0:

@@ -23,11 +23,11 @@ class RowData:
     Attributes
     ----------
     payload
-        uint8 [frames_expected * frame bytes]: the card's payload as sent, zero where bytes are missing.
+        uint8 [frames_expected * bytes of a chirp]: the card's payload as sent, zero where bytes are missing.
     missing
         Byte ranges (start, stop) of `payload` that never arrived: sorted, not touching, half open.
     frames_expected
-        Frames in `payload`: points of the row x pulses of a burst.
+        Chirps in `payload`: points of the row x chirps of a position. Most frames are one chirp.
     crc32
         Digest the payload was recorded with, hexadecimal; empty where the recording keeps none.
     """

@@ -39,7 +39,7 @@ class BoardSetup:
         """
         model = (model or hpf.high_pass(rig.chirp)) if compensate_filter else hpf.HighPass()
         equaliser = hpf.Equaliser.of(model, rig.chirp, FOLD) if model.corners_hz else None
-        return cls(rig.chirp, rig.burst.pulses, equaliser, direct_path.prepare(rig, board))
+        return cls(rig.chirp, rig.burst.chirps_a_position, equaliser, direct_path.prepare(rig, board))
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class RowSynchroniser:
         """Return one board's row, synchronised, and how many of its frames are whole. Raises DataError."""
         rig = self._source.instrument
         if isinstance(recorded, CubeRow):
-            synced = self._form(board).synced(recorded.cube, rig.burst.pulses)
+            synced = self._form(board).synced(recorded.cube, rig.burst.chirps_a_position)
             return synced, int(synced.valid.sum())
         words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, rig.chirp.samples)
         return synchronise_row(words, valid, self.setups[board]), int(valid.sum())

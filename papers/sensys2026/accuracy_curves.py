@@ -135,7 +135,7 @@ def _gains(share: float) -> Change:
     def change(test: Samples, rng: np.random.Generator, degrees: float) -> Samples:
         _, patch = np.unique(test.patches, return_inverse=True)
         gain = np.exp(share * degrees * rng.choice([-1.0, 1.0], patch.max() + 1))[patch]
-        p = (test.x[:, 2] + 1j * test.x[:, 3]) / gain
+        p = 1 / ((test.x[:, 2] + 1j * test.x[:, 3]) * gain)
         return replace(test, x=feature_matrix(test.x[:, 0], test.x[:, 1] * gain, p))
 
     return change
@@ -151,11 +151,11 @@ def _angle_told(mine: Samples, degrees: float) -> SceneErrors | None:
     patches = np.unique(mine.patches)
     columns = np.zeros((patches.size, 3, 1))
     for i, p in enumerate(patches):
-        q = np.mean(1 / (mine.x[mine.patches == p, 2] + 1j * mine.x[mine.patches == p, 3]))
+        q = np.mean(mine.x[mine.patches == p, 2] + 1j * mine.x[mine.patches == p, 3])
         eps = complex(permittivity_from_ratio(q, angle))
         (s, v), (other_s, other_v) = (fresnel(eps, a) for a in (angle, angle + std))
-        turned = np.angle((s / v) / (other_s / other_v))
-        columns[i, :, 0] = np.log(np.abs(other_s / s)), np.log(np.abs(other_v / v)), -float(turned)
+        turned = float(np.angle((other_s / other_v) / (s / v)))
+        columns[i, :, 0] = np.log(np.abs(other_s / s)), np.log(np.abs(other_v / v)), turned
     return SceneErrors(np.zeros((patches.size, 3, 3)), columns, np.eye(1))
 
 

@@ -281,9 +281,16 @@ class SimulatedCard:
         self._clock_s = clock_s
         network = Network(board.host_address, board.card_address, MAC, board.command_port, board.data_port)
         self.endpoint = CardEndpoint(board.name, network, faults, seed, time_scale, clock_s, pace)
-        dead_s = (rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6  # pulses at a time scale are less regular than real ones
+        self._burst = rig.burst
+        later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
+        dead_s = (
+            later_us + rig.chirp.ramp_end_us + RECOVERY_US
+        ) * 1e-6  # pulses at a time scale are less regular than real ones
         native = rig.radar.control == "native"
-        self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses) if native else None
+        die = 1 + [b.name for b in rig.boards].index(board.name)
+        self.radar = (
+            RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die=die) if native else None
+        )
         self._sync = SyncInput(rig, self.radar)
         self._events = PulseEvents(faults)
         self._pulse_faults = PulseFaults(faults, seed, board.name)
@@ -341,8 +348,12 @@ class SimulatedCard:
 
     def _run(self, run: list[Pulse], track: StageTrack, link_is_up: bool) -> None:
         counts = self.endpoint.counts
-        x_mm, y_mm = track.offsets_mm([p.t_ns for p in run])
-        frames = self._source.chirps(self.board.name, x_mm, y_mm, run[0].number)
+        burst = self._burst
+        x_mm, y_mm = track.offsets_mm(
+            [p.t_ns + round(n * burst.chirp_us * 1e3) for p in run for n in range(burst.chirps)]
+        )
+        chirps = self._source.chirps(self.board.name, x_mm, y_mm, run[0].number * burst.chirps)
+        frames = chirps.reshape(len(run), -1, *chirps.shape[2:])
         counts["frames"] += len(frames)
         for lvds in self._overflow.split(frames):
             self.endpoint.emit(self.card.lvds(lvds.data, self.endpoint.wire_s()), link_is_up)

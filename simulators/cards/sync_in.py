@@ -54,7 +54,8 @@ class SyncInput:
         self._row_frames = rig.grid.columns * rig.burst.pulses
         self._left: int | None = 0 if rig.radar.control == "line_server" else None
         self.rearmed = self.unarmed = 0
-        self._dead_ns = us_to_ns(rig.chirp.ramp_end_us + RECOVERY_US)
+        later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
+        self._dead_ns = us_to_ns(later_us + rig.chirp.ramp_end_us + RECOVERY_US)
         self._last_ns: int | None = None
         self.too_soon = 0
 

@@ -1,33 +1,26 @@
 """A simulated AWR2243 board as its SPI lines show it: words in and out, host interrupt, reset and sense lines, pulses.
 
-It speaks mmWaveLink of its own (nothing is shared with the host's codec) as TI's interface control document says, and
-keeps time by a clock that is passed in. What goes wrong is asked for with :meth:`RadarBoard.inject`. A stand-in: how a
-real device times things is not known here.
+It speaks mmWaveLink of its own (nothing is shared with the host's codec), as TI's interface control document says and
+as real devices were seen to: it answers with a 16-bit CRC, refuses with message id 0, reports a main core fault at
+power-up and then works, comes with an empty flash, and has its data 1 ms after the interrupt. Time is a clock that is
+passed in. What goes wrong is asked for with :meth:`RadarBoard.inject`. A stand-in: how a real device times things is
+not known here.
 """
 
 from __future__ import annotations
 
-import binascii
 import struct
 import zlib
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from enum import Enum
 
 from polysight.shared.errors import DeviceError
+from polysight.simulators.radars.cores import ERASE_S, FRAME_END, RF_FAULT, Cores
+from polysight.simulators.radars.wire import EVENT, NACK, READY, RESPONSE, TO_DEVICE, frame, ones_sum
 
-TO_DEVICE, READY, FROM_DEVICE = bytes.fromhex("34122143"), bytes.fromhex("78566587"), bytes.fromhex("badccdab")
 FUNCTIONAL = 4  # sense-on-power mode
-RESPONSE, NACK, EVENT = 1, 2, 3
-BOOT_S, RF_UP_S, RF_INIT_S, ERASE_S, READY_S, ANSWER_S = 0.05, 0.02, 0.3, 4.0, 1e-3, 1e-4
-_UP_MAIN, _UP_RF, _CALIBRATED, _TRIGGER_READY, _FRAME_END, _CPU_FAULT = 0x5000, 0x5001, 0x1004, 0x100B, 0x100F, 0x1002
-_SIZES = {  # data bytes of each sub-block
-    0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x008D: 16, 0x00C0: 0, 0x0100: 44, 0x0101: 20, 0x0102: 24,
-    0x0140: 4, 0x0220: 0, 0x02CC: 4, 0x02EA: 0, 0x4000: 0, 0x4041: 12, 0x4042: 8, 0x4043: 4, 0x4044: 4, 0x4045: 4,
-    0x404C: 12, 0x40C0: 8, 0x40E0: 0,
-}  # fmt: skip
-_BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, 0x00C0, 0x0100, 0x0101, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045, 0x40C0)
+ANSWER_S, DATA_S = 1e-4, 1e-3
 
 
 class Fault(Enum):
@@ -35,6 +28,7 @@ class Fault(Enum):
 
     NACK = "says that the command came damaged"
     REFUSE = "refuses the command"
+    REFUSE_BARE = "refuses the command without a body"
     BAD_CRC = "one bit of the answer's body flips"
     BAD_CHECKSUM = "one bit of the answer's header flips"
     BAD_SYNC = "words before the answer"
@@ -43,63 +37,109 @@ class Fault(Enum):
     EVENT_BETWEEN = "an event comes first"
 
 
-@dataclass
 class RadarBoard:
     """One board.
 
-    Attributes
+    Parameters
     ----------
     now
         Seconds.
-    patch
-        Whether firmware is in the board's flash.
-    supply_v
-        Of the RF supplies; LDO bypass at 1.3 V destroys the board.
+    flash
+        What is in the serial flash; empty on the first day. `make_image()` is an image that it boots from.
     dead_s
         From a frame's pulse to the next one it bears; the frame period when None.
     fault_pulses
         Pulses since the start, from 0, at which the RF core faults.
-    executed
-        Numbers of the sub-blocks obeyed, in order.
-    settings
-        Data of the last sub-block of each number.
+    die
+        Tells boards apart: part of the die id.
+    supply_v
+        Of the RF supplies; LDO bypass at 1.3 V destroys the board.
+    erase_s
+        How long the flash takes to be erased.
+    fault_at
+        When the main core reports its harmless fault: "power-up", "download" or "never".
+    functional_jumpers
+        SOP0 set, SOP1 and SOP2 open. Without them the sense lines do not reach functional mode.
+    first_generation
+        Boots and refuses as an AWR1243 was seen to.
+    answers_32_bit
+        Answers with a CRC of 32 bits. Reports have one where the host asked for it.
+
+    Attributes
+    ----------
+    cores
+        What the device knows: settings, flash, what it obeyed.
     """
 
-    now: Callable[[], float]
-    patch: bool = True
-    supply_v: float = 1.3
-    erase_s: float = ERASE_S
-    dead_s: float | None = None
-    fault_pulses: tuple[int, ...] = ()
-    executed: list[int] = field(default_factory=list)
-    settings: dict[int, bytes] = field(default_factory=dict)
-    destroyed: bool = False
-    plugged: bool = True
-    armings: int = 0
-
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        now: Callable[[], float],
+        *,
+        flash: bytes = b"",
+        dead_s: float | None = None,
+        fault_pulses: tuple[int, ...] = (),
+        die: int = 1,
+        supply_v: float = 1.3,
+        erase_s: float = ERASE_S,
+        fault_at: str = "power-up",
+        functional_jumpers: bool = True,
+        first_generation: bool = False,
+        answers_32_bit: bool = False,
+    ) -> None:
+        self.now, self._dead_s, self._fault_pulses = now, dead_s, fault_pulses
+        self.functional_jumpers, self._answers_32_bit = functional_jumpers, answers_32_bit
+        self.cores = Cores(
+            now, self._event, flash, die=die, supply_v=supply_v, erase_s=erase_s, fault_at=fault_at,
+            first_generation=first_generation,
+        )  # fmt: skip
+        self.plugged = True
+        self.powered = True
         self._faults: deque[Fault] = deque()
         self._pulses_seen = 0
         self._held, self._mode = True, 0
         self._forget()
 
+    @property
+    def executed(self) -> list[int]:
+        """Numbers of the sub-blocks obeyed, in order."""
+        return self.cores.executed
+
+    @property
+    def settings(self) -> dict[int, bytes]:
+        """Data of the last sub-block of each number."""
+        return self.cores.settings
+
+    @property
+    def armings(self) -> int:
+        """How often frames were started."""
+        return self.cores.armings
+
+    @property
+    def destroyed(self) -> bool:
+        """Whether its supplies have destroyed it."""
+        return self.cores.destroyed
+
     def _forget(self) -> None:
         self._in, self._out = bytearray(), bytearray()
         self._waiting: deque[bytes] = deque()  # messages that the host has not asked for yet
         self._later: list[tuple[float, bytes]] = []
-        self._offered = False
+        self._offered, self._ready_at = False, 0.0
         self._last: tuple[int, bytes] = (-1, b"")
-        self._main_up = self._rf_up = self._calibrated = False
-        self._crc32_events = False
-        self._frames_left, self._armed, self._frame_ends, self._pulse_s = 0, False, -1.0, float("-inf")
-        self._file_left, self._busy_until = 0, -1.0
-        self.settings.clear()
+        self._pulse_s, self._busy_until = float("-inf"), -1.0
+        self.cores.forget()
 
     def inject(self, *faults: Fault) -> None:
         """Let these happen to the next answers, one each, instead of what is left of earlier ones."""
         self._faults = deque(faults)
 
     # lines
+
+    def power(self, on: bool) -> None:
+        """Switch the board's supply; its USB chip has one of its own. What is in the flash stays, finished or not."""
+        self._forget()
+        self.powered = on
+        if on and not self._held:
+            self._boot()
 
     def sense(self, mode: int) -> None:
         """Set the sense-on-power lines, read when the reset is released."""
@@ -109,10 +149,13 @@ class RadarBoard:
         """Drive the reset line."""
         if held:
             self._forget()
-        elif self._held and self._mode == FUNCTIONAL and not self.destroyed:
-            self._main_up = True
-            self._event(_UP_MAIN, struct.pack("<IQQ", 1000, 0, 0), BOOT_S)
+        elif self._held:
+            self._boot()
         self._held = held
+
+    def _boot(self) -> None:
+        if self._mode == FUNCTIONAL and self.functional_jumpers and self.powered and not self.destroyed:
+            self.cores.boot()
 
     @property
     def interrupt(self) -> bool:
@@ -125,7 +168,7 @@ class RadarBoard:
     def ready_for_triggers(self) -> bool:
         """Whether a pulse starts a frame now."""
         self._due()
-        return self._armed and self._frames_left != 0
+        return self.cores.armed and self.cores.frames_left != 0
 
     def trigger(self, pulse_s: float | None = None) -> bool:
         """A rising edge on SYNC_IN, now or at a time of the pulses' own clock; whether it starts a frame.
@@ -136,18 +179,18 @@ class RadarBoard:
         self._pulses_seen += 1
         if not self.ready_for_triggers:
             return False
-        at = self.now() if pulse_s is None else pulse_s
-        period = struct.unpack_from("<I", self.settings[0x0102], 12)[0] * 5e-9
-        too_soon = abs(at - self._pulse_s) < (period if self.dead_s is None else self.dead_s) - 1e-9
-        if too_soon or self._pulses_seen - 1 in self.fault_pulses:
-            self._armed = False
-            self._event(_CPU_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
+        cores, at = self.cores, self.now() if pulse_s is None else pulse_s
+        period = cores.period_s()
+        too_soon = abs(at - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
+        if too_soon or self._pulses_seen - 1 in self._fault_pulses:
+            cores.armed = False
+            self._event(RF_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), 0.0)
             return False
-        self._pulse_s, self._frame_ends = at, self.now() + period
-        self._frames_left -= 1
-        if self._frames_left == 0:
-            self._armed = False
-            self._event(_FRAME_END, b"", period)
+        self._pulse_s, cores.frame_ends = at, self.now() + period
+        cores.frames_left -= 1
+        if cores.frames_left == 0:
+            cores.armed = False
+            self._event(FRAME_END, b"", period)
         return True
 
     def say(self, number: int, data: bytes = b"") -> None:
@@ -167,10 +210,10 @@ class RadarBoard:
             del self._in[:16]
             self._offered = False
             if self._waiting:
-                self._out = bytearray(self._waiting.popleft())
+                self._out, self._ready_at = bytearray(self._waiting.popleft()), self.now() + DATA_S
         elif self._in[:4] == TO_DEVICE and len(self._in) >= 16:
             length = int.from_bytes(self._in[6:8], "little")
-            if _sum(bytes(self._in[4:16])) != 0xFFFF:
+            if ones_sum(bytes(self._in[4:16])) != 0xFFFF:
                 self._in.clear()  # no response at all; the host times out
             elif len(self._in) >= 4 + length:
                 raw = bytes(self._in[4 : 4 + length])
@@ -178,10 +221,10 @@ class RadarBoard:
                 self._message(raw)
 
     def read_word(self) -> int:
-        """A word to the host; all ones when there is none. Raises DeviceError when unplugged."""
+        """A word to the host; all ones when there is none, or it is not ready. Raises DeviceError when unplugged."""
         self._check()
         self._due()
-        if not self._out:
+        if not self._out or self.now() < self._ready_at - 1e-9:
             return 0xFFFF
         word = int.from_bytes(self._out[:2], "little")
         del self._out[:2]
@@ -206,35 +249,40 @@ class RadarBoard:
 
     def _event(self, number: int, data: bytes, delay_s: float) -> None:
         main = number >= 0x4000
-        wide = self._crc32_events if main else True
+        wide = self.cores.crc32_events if main else not self.cores.first_generation
         block = struct.pack("<HH", number, len(data) + 4) + data
-        self._send(_frame(6 if main else 2, EVENT, number // 32, block, 1, 0, wide), delay_s)
+        self._send(frame(6 if main else 2, EVENT, number // 32, block, 1, 0, wide), delay_s)
 
     def _message(self, raw: bytes) -> None:
         opcode, length, flags, remaining, count = struct.unpack_from("<5H", raw)
         fault = self._faults.popleft() if self._faults else None
-        if fault is Fault.NO_ANSWER or self.destroyed or self.now() < self._busy_until:
+        if fault is Fault.NO_ANSWER or self.destroyed or not self.powered or self.now() < self._busy_until:
             return
-        direction, number, sequence = (opcode & 15) + 1, opcode >> 6, flags >> 12
+        direction, number, sequence, wide = (opcode & 15) + 1, opcode >> 6, flags >> 12, self._answers_32_bit
         if fault is Fault.NACK or zlib.crc32(raw[: length - 4]) != int.from_bytes(raw[length - 4 :], "little"):
-            self._send(_frame(direction, NACK, number, b"", 0, sequence, True), 0.0)
+            self._send(frame(direction, NACK, number, b"", 0, sequence, wide), 0.0)
             return
         if flags & 3 == 3 and self._last[0] == sequence and self._last[1]:
             self._send(self._last[1], 0.0)  # the answer was lost: it is given again, nothing is done twice
             return
-        delay = ANSWER_S
-        body, blocks = raw[12 : length - 4], b""
+        delay, error = ANSWER_S, 0
+        body, blocks, block = raw[12 : length - 4], b"", 0
         for _ in range(count):
             block, size = struct.unpack_from("<HH", body)
-            error, data, extra = (6, b"", 0.0) if fault is Fault.REFUSE else self._obey(block, body[4:size], remaining)
+            refused = fault in (Fault.REFUSE, Fault.REFUSE_BARE)
+            error, data, extra = (6, b"", 0.0) if refused else self.cores.obey(block, body[4:size], remaining)
             if error:
-                blocks = struct.pack("<4H", 0, 8, error, block)
                 break
             delay += extra
             blocks += struct.pack("<HH", block, len(data) + 4) + data if data else b""
             body = body[size:]
         self._busy_until = self.now() + delay
-        answer = _frame(direction, RESPONSE, number, blocks, 1 if blocks else 0, sequence, True)
+        if error and (self.cores.first_generation or fault is Fault.REFUSE_BARE):
+            answer = frame(direction, RESPONSE, 0, b"", 1, sequence, wide)  # as an AWR1243 was seen to
+        elif error:
+            answer = frame(direction, RESPONSE, 0, struct.pack("<4H", 0, 8, error, block), 1, sequence, wide)  # ICD 4.4
+        else:
+            answer = frame(direction, RESPONSE, number, blocks, 1 if blocks else 0, sequence, wide)
         self._last = (sequence, answer)
         self._answer(answer, fault, delay)
 
@@ -249,100 +297,3 @@ class RadarBoard:
             answer = b"\xff\xff\x00\x00" + answer
         if fault is not Fault.LOST_INTERRUPT:
             self._send(answer, delay_s)
-
-    def _obey(self, number: int, data: bytes, remaining: int) -> tuple[int, bytes, float]:
-        """Error number (0: none), data of the answer, and how much longer it takes."""
-        if number == 0x4080:
-            return self._file(data, remaining)
-        if number not in _SIZES:
-            return 3, b"", 0.0
-        if len(data) != _SIZES[number]:
-            return 4, b"", 0.0
-        if not self._main_up or (number < 0x4000 and not self._rf_up):
-            return 6, b"", 0.0
-        if number == 0x0140:
-            error = self._start_or_stop(struct.unpack_from("<H", data)[0])
-        elif number == 0x0102 and self._armed:
-            error = 83
-        else:
-            error = 0
-        if error:
-            return error, b"", 0.0
-        self.executed.append(number)
-        self.settings[number] = data
-        return 0, self._effect(number, data), 0.0
-
-    def _effect(self, number: int, data: bytes) -> bytes:
-        if number == 0x404C:
-            self._crc32_events = data[0] == 1
-        elif number == 0x4000:
-            self._rf_up = True
-            self._event(_UP_RF, struct.pack("<4I", 0x07FFFFFF, 2000, 0, 0), RF_UP_S)
-        elif number == 0x00C0:
-            self._calibrated = True
-            self._event(_CALIBRATED, struct.pack("<IIhHII", 0x1FFE, 0x1FFE, 41, 0, 500, 0), RF_INIT_S)
-        elif number == 0x02CC and data[0] & 1 and self.supply_v > 1.1:
-            self.destroyed = True
-        elif number in (0x0220, 0x40E0):
-            patch = (2, 1, 22, 6, 3, 0x11) if self.patch else (0,) * 6
-            return bytes((1, 2, 0, 2, 2, 3, 1, 19, 8, 1, *patch))
-        elif number == 0x02EA:
-            return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
-        return b""
-
-    def _start_or_stop(self, what: int) -> int:
-        if what == 1:
-            if self._armed:
-                return 20
-            if not self._calibrated or any(n not in self.settings for n in _BEFORE_FRAMES):
-                return 22
-            frames = struct.unpack_from("<H", self.settings[0x0102], 8)[0]
-            self._frames_left, self._armed, self._frame_ends = frames or -1, True, -1.0
-            self.armings += 1
-            self._event(_TRIGGER_READY, b"", READY_S)
-            return 0
-        if what not in (0, 4):
-            return 23
-        if not self._armed:
-            return 21
-        if what == 4 and self.now() < self._frame_ends:
-            self._event(_CPU_FAULT, struct.pack("<BBH", 3, 2, 815) + bytes(28), 0.0)
-        self._armed = False
-        self._event(_FRAME_END, b"", READY_S)
-        return 0
-
-    def _file(self, data: bytes, remaining: int) -> tuple[int, bytes, float]:
-        if not self._main_up:
-            return 6, b"", 0.0
-        first = self._file_left == 0
-        if first:
-            kind, self._file_left = struct.unpack_from("<II", data)
-            data = data[8:]
-            if kind not in (0, 4):
-                return 8, b"", 0.0
-        self._file_left -= len(data)
-        if (self._file_left == 0) != (remaining == 0):
-            return 7, b"", 0.0
-        if self._file_left == 0:
-            self.patch = True
-        self.executed.append(0x4080)
-        return 0, b"", self.erase_s if first else 0.0
-
-
-def _sum(head: bytes) -> int:
-    """Ones-complement sum of 16-bit words; 0xFFFF over a header with its checksum."""
-    total = sum(struct.unpack(f"<{len(head) // 2}H", head))
-    while total > 0xFFFF:
-        total = (total & 0xFFFF) + (total >> 16)
-    return total
-
-
-def _frame(direction: int, kind: int, number: int, body: bytes, count: int, sequence: int, wide: bool) -> bytes:
-    """A message's bytes, sync word first, with a CRC of 32 or 16 bits."""
-    flags = sequence << 12 | (1 if wide else 0) << 10
-    head = struct.pack("<5H", direction | kind << 4 | number << 6, 12 + len(body) + (4 if wide else 2), flags, 0, count)
-    head += struct.pack("<H", 0xFFFF - _sum(head))
-    crc = zlib.crc32(head + body).to_bytes(4, "little")
-    if not wide:
-        crc = binascii.crc_hqx(head + body, 0xFFFF).to_bytes(2, "little")
-    return FROM_DEVICE + head + body + crc

@@ -29,6 +29,8 @@ from polysight.simulators.radars.board import RadarBoard
 _CLOCK, _OUT, _SELECT = 1 << 0, 1 << 1, 1 << 3
 _BARE = (0x85, 0x87, 0x8A, 0x8C, 0x8D, 0x97)
 _CHANNELS = "ABCD"
+_PIN_S = 0.2e-6  # one pin command holds its pins so long (FTDI AN_114)
+_CLOCKS_S = 0.2e-6  # two clocks, the least before and between chip selects (ICD 3.2.4); twice that is beyond doubt
 _HEAD = struct.Struct("<ccH")
 LINE = b"Retrigger"
 _LINGER_NONE = struct.pack("ii", 1, 0)  # closing sends a reset
@@ -43,6 +45,7 @@ class UsbChip:
         self.words_written: list[int] = []
         self.spi_hz = 0.0
         self._fast, self._pins, self._latched = False, 0, 0
+        self._high_s, self._low_s = float("inf"), 0.0  # how long chip select has been so
         self._answers = {name: bytearray() for name in _CHANNELS}
         self._pending = {name: bytearray() for name in _CHANNELS}
         self._sense = 0
@@ -62,6 +65,7 @@ class UsbChip:
             for pins in data:
                 self._board.reset(held=not (pins >> 6 & 1 and pins >> 7 & 1))
         else:
+            self._high_s = float("inf") if name == "A" and self._pins & _SELECT else self._high_s  # USB is slow
             self._pending[name] += data
             commands: dict[str, Callable[[bytearray], int]] = {"A": self._spi, "B": self._gpio}
             while self._pending[name]:
@@ -104,6 +108,8 @@ class UsbChip:
             self.errors.append(f"{count} bytes at once, chip select {'high' if self._pins & _SELECT else 'low'}")
         if self._latched:
             self.errors.append("two words under one chip select")
+        elif self._low_s < 2 * _CLOCKS_S - 1e-9:
+            self.errors.append(f"the clock starts {self._low_s * 1e9:.0f} ns after chip select")
         self._latched = 1
         if code == 0x20:
             self._answers["A"] += self._board.read_word().to_bytes(2, "big")
@@ -121,8 +127,14 @@ class UsbChip:
             self.errors.append(f"clock, data or chip select is not driven (direction {direction:08b})")
         if pins & _CLOCK:
             self.errors.append("the clock rests high: not SPI mode 0")
+        was_high = self._pins & _SELECT
         if pins & _SELECT:
             self._latched = 0
+            self._high_s = self._high_s + _PIN_S if was_high else _PIN_S
+        else:
+            if was_high and self._high_s < 2 * _CLOCKS_S - 1e-9:
+                self.errors.append(f"chip select is high for {self._high_s * 1e9:.0f} ns between words")
+            self._low_s = _PIN_S if was_high else self._low_s + _PIN_S
         self._pins = pins
         return 3
 

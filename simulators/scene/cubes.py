@@ -124,7 +124,7 @@ def _burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int, echo_m:
     d, chirp = scene.disturbances, rig.chirp
     if d.direct_snr_db is None:
         return 0.0
-    averaged = 10.0 ** (-d.direct_snr_db / 20) / np.sqrt(rig.burst.pulses)
+    averaged = 10.0 ** (-d.direct_snr_db / 20) / np.sqrt(rig.burst.chirps_a_position)
     if not d.hpf:
         return float(averaged)
     delay_s = (antennas(rig, board).direct_m[0] + echo_m) / 2 / SPEED_OF_LIGHT_M_S

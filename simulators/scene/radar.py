@@ -178,8 +178,8 @@ class SimulatedRig:
         burst, stage, d = self.rig.burst, self.rig.stage, self.scene.disturbances
         lost = d.backlash_mm if direction < 0 else 0.0
         if not d.burst_motion:
-            return np.full(burst.pulses, direction * mean_burst_travel_mm(burst, stage) + lost)
-        after_s = FIRST_PULSE_DELAY_S + np.arange(burst.pulses) * burst.period_us * 1e-6
+            return np.full(burst.chirps_a_position, direction * mean_burst_travel_mm(burst, stage) + lost)
+        after_s = FIRST_PULSE_DELAY_S + np.array(burst.chirp_times_s)
         return direction * stage.speed_mm_s * after_s + lost
 
     def _receiving(self, name: str) -> _ReceivingBoard:
@@ -197,7 +197,8 @@ class SimulatedRig:
         out: NDArray[np.complex64],
     ) -> None:
         d, own, chirp = self.scene.disturbances, self._receiving(board.name), self.rig.chirp
-        delay = sync_delay_s(d, self.seed, board, pulses) - sync_delay_s(d, self.seed, self.rig.transmitter, pulses)
+        frames = pulses // self.rig.burst.chirps  # the chirps of one frame hang on one pulse
+        delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
         turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses) if d.random_phase else 0.0 * delay
         factor, shift = per_chirp(own.receiver, delay, 2 * np.pi * turns, d.hpf)
         inside = own.field.covers(x_m, y_m)

@@ -12,9 +12,10 @@ from docs.check.commands import command_faults, parser_of
 from docs.check.pages import ROOT
 
 MODULES = (
-    "polysight.host.cli.main", "polysight.pi_controller.cli", "polysight.host.radar", "docs.check",
+    "polysight.host.cli.main", "polysight.pi_controller.cli", "docs.check",
     "polysight.simulators", "polysight.simulators.rig", "polysight.simulators.cards", "polysight.simulators.stage",
     "polysight.simulators.wires", "polysight.simulators.uno", "polysight.simulators.replay",
+    "polysight.simulators.radars",
 )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ import signal
 
 import pytest
 
+from polysight.host.store.manifest import decode_line
 from tests.support.paths import RIG_FILE
 
 pytestmark = pytest.mark.xdist_group("rig")
@@ -44,3 +45,19 @@ def test_without_a_compiler(rig_without_compiler):
     assert ended.status == 0, ended.err
     validated = rig.polysight("validate", rig.folder / "scan")
     assert (validated.status, validated.err) == (0, "")
+
+
+def test_from_boards_with_an_empty_flash_to_the_report(bench, scene_file):
+    """The first day: the host loads the boards' firmware, configures and arms them, scans, and reports."""
+    demo = bench.start("polysight", "demo", "--config", RIG_FILE, "--scene", scene_file, "--out", bench.folder / "demo")
+    ended = demo.wait()
+    assert "Traceback" not in ended.err
+    scan = bench.folder / "demo" / "scan"
+    lines = [decode_line(line) for line in (scan / "manifest.jsonl").read_bytes().splitlines(keepends=True)]
+    first = next(line for line in lines if line["fact"] == "radars")
+    for told in first["boards"].values():
+        assert any("no image header" in line for line in told["events"])
+        assert told["main_firmware"].endswith("patch 2.2.2.0")
+        assert told["die_id"]
+    assert (scan / "products" / "report.html").is_file()
+    assert ended.status in (0, 7), ended.err  # 7: a scan as small as this one has no result, and says so

@@ -12,10 +12,11 @@ pytestmark = pytest.mark.xdist_group("rig")
 ROW_PULSES = COLUMNS * PULSES
 
 
-def small_rig(bench, *faults: str):
+def small_rig(bench, *faults: str, burst: dict | None = None):
     """The simulated rig, running, under native control; its rig file."""
     table = small_table()
     table["radar"] = {"control": "native", "native": {b["name"]: {"usb_serial": b["name"]} for b in table["boards"]}}
+    table["burst"] |= burst or {}
     for board in table["boards"]:
         board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else 790e3
     return start_rig(bench, table, *faults)
@@ -32,6 +33,9 @@ def test_rows_come_whole_and_the_manifest_holds_what_the_radars_were_told(bench)
         assert told["state"] == "configured"
         assert told["rf_firmware"] != ""
         assert told["calibration"]["passed"]
+        assert told["boot"] == {"power_up_us": 1856.08, "boot_errors": 0, "tests_failed": 0, "cure": ""}  # from RAM
+    assert len({told["die_id"] for told in first["boards"].values()}) == 3
+    assert any("no image header" in line for line in first["boards"]["RH"]["events"])  # its flash was empty
     assert "direct_if_hz" in first
     assert [r["row"] for r in rows if all(b["state"] == "done" for b in r["boards"].values())] == [0, 1, 2]
     start = "4001080001000000"
@@ -69,4 +73,19 @@ def test_a_transmitter_that_missed_a_pulse_is_noticed_though_nothing_of_it_is_re
     assert rejected["row"] == 0
     assert "LS: the radar still waits for pulses, it missed some" in rejected["reasons"]
     assert validate(bench.folder / "scan") == []
+    rig.end()
+
+
+def test_one_pulse_a_position_makes_a_frame_of_many_chirps(bench):
+    """`[burst] pulses = 1, chirps = 4`: a quarter of the pulses, the same chirps, rows as whole as before."""
+    burst = {"pulses": 1, "chirps": PULSES, "chirp_us": 228.51, "period_us": 1500.0}
+    rig, instrument = small_rig(bench, burst=burst)
+    result = run_scan(instrument, bench.folder / "scan")
+    assert result.exit_status == "success"
+    assert validate(bench.folder / "scan") == []
+    assert {row.pulses for row in result.folder.committed().values()} == {COLUMNS}
+    data = result.folder.read_row("RH", 0)
+    assert data.frames_expected == ROW_PULSES
+    words = data.payload.view("<u4") & 0x0FFFFFFF
+    assert (words == range(words[0], words[0] + words.size)).all()  # the pattern counts on through every chirp
     rig.end()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -164,3 +165,16 @@ def test_proposals_keep_the_time_and_nothing_refuses_them(rig):
 
 def test_too_little_time_has_no_plan(rig):
     assert propose(rig, 1.0) == []
+
+
+def test_one_pulse_of_many_chirps_is_planned_as_such(rig):
+    """Five times the published speed fits; proposals keep the burst."""
+    burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=143.0, period_us=2800.0)
+    rig = msgspec.structs.replace(
+        rig, burst=burst, stage=msgspec.structs.replace(rig.stage, speed_mm_s=100.0, travel_speed_mm_s=120.0)
+    )
+    told = forecast(rig)
+    assert told.possible
+    assert "one chirp a position" not in " ".join(c.text for c in told.warnings)
+    for proposal in propose(rig, minutes=60.0):
+        assert proposal.rig.burst == burst

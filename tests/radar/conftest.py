@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from polysight.shared.config import Instrument
-from polysight.simulators.radars import RadarBoard
+from polysight.simulators.radars import RadarBoard, make_image
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
 
@@ -21,7 +21,8 @@ def clock() -> VirtualClock:
 
 @pytest.fixture
 def board(clock: VirtualClock) -> RadarBoard:
-    return RadarBoard(lambda: clock.time)
+    """One whose flash holds firmware, as on every day but the first."""
+    return RadarBoard(lambda: clock.time, flash=make_image())
 
 
 @pytest.fixture

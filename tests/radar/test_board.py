@@ -11,7 +11,7 @@ from polysight.host.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameC
 from polysight.host.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
 from polysight.host.radar.program import program
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import Fault
+from polysight.simulators.radars import Fault, cores
 from polysight.simulators.radars import board as simulated
 
 FRAMES = 32
@@ -47,7 +47,7 @@ def test_every_step_is_told_in_order_and_once(radar, board):
     radar.configure()
     radar.arm(FRAMES)
     expected = [0x404C, 0x4000, 0x0220, 0x40E0, 0x0080, 0x0082, 0x02CC, 0x4041, 0x0083, 0x008D, 0x0086, 0x00C0]
-    expected += [0x0100, 0x0101, 0x4042, 0x4044, 0x0085, 0x4043, 0x4045, 0x02EA, 0x0102, 0x40C0, 0x0140]
+    expected += [0x0100, 0x0101, 0x4042, 0x4044, 0x0085, 0x4043, 0x4045, 0x0223, 0x02EA, 0x0102, 0x40C0, 0x0140]
     assert board.executed == expected
     start = struct.unpack_from("<I", board.settings[0x0100], 4)[0]
     slope = struct.unpack_from("<h", board.settings[0x0100], 28)[0]
@@ -64,7 +64,7 @@ def test_only_the_transmitter_transmits(rig):
 
 def test_armed_only_when_the_radar_says_so(radar, monkeypatch):
     radar.configure()
-    monkeypatch.setattr(simulated, "READY_S", 1e9)
+    monkeypatch.setattr(cores, "READY_S", 1e9)
     with pytest.raises(DeviceError, match="0x100B"):
         radar.arm(FRAMES)
     assert radar.state is State.FAULT
@@ -168,15 +168,6 @@ def test_unplugged_is_a_fault_and_plugged_in_again_recovers(radar, board):
     assert radar.state is State.ARMED
 
 
-def test_without_firmware_it_is_refused_and_with_it_written_it_runs(radar, board):
-    board.patch = False
-    with pytest.raises(DeviceError, match="no patch"):
-        radar.configure()
-    assert radar.state is State.FAULT
-    radar.configure(on_power=lambda: radar.download(bytes(range(256)) * 4))
-    assert radar.state is State.CONFIGURED
-
-
 def test_a_refused_setting_is_a_fault_that_names_it(radar, board):
     board.inject(Fault.REFUSE)
     with pytest.raises(DeviceError, match="DeviceConfiguration"):
@@ -185,7 +176,7 @@ def test_a_refused_setting_is_a_fault_that_names_it(radar, board):
 
 
 def test_a_board_that_stays_silent_is_named(radar, board):
-    board.destroyed = True
+    board.cores.destroyed = True
     with pytest.raises(DeviceError, match="LS: the radar did not report 0x5000"):
         radar.configure()
 
@@ -194,11 +185,13 @@ def test_the_report_holds_versions_temperatures_calibration_and_every_byte_sent(
     radar.configure()
     radar.arm(FRAMES)
     told = radar.report()
-    assert told["rf_firmware"] == told["main_firmware"] == "2.2.3.1 patch 2.1.1.1"
+    assert (told["rf_firmware"], told["main_firmware"]) == ("2.2.1.7 patch 2.2.4.0", "2.2.1.7 patch 2.2.2.0")
+    assert told["die_id"] == "5eed0001-00000d1e-000008c3-00000001"
     assert told["temperatures_c"]["tx2"] == 46
     assert told["calibration"]["temperature_c"] == 41
     assert told["sent"][0].startswith("78566587")
-    assert told["sent"][1] == "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"
+    first = next(raw for raw in told["sent"] if not raw.startswith("78566587"))
+    assert first == "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"
     assert any("ready for triggers" in line for line in told["events"])
     assert radar.report()["sent"] == []
 
@@ -209,6 +202,66 @@ def test_closing_stops_what_waits(radar, board, words):
     radar.close()
     assert words.closed
     assert not board.ready_for_triggers
+
+
+def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
+    import msgspec
+
+    burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=5000.0)
+    many = msgspec.structs.replace(rig, burst=burst)
+    radar = RadarBoard("LS", words, clock, program(many, many.by_name("LS")))
+    radar.arm(FRAMES)
+    loops, frames = struct.unpack_from("<2H", board.settings[0x0102], 6)
+    chirps = struct.unpack_from("<I", board.settings[0x40C0])[0]
+    assert (loops, frames, chirps) == (16, FRAMES, 16)
+    pulses(board, clock, FRAMES, 5e-3)
+    assert radar.poll() is State.DONE
+
+
+def test_the_main_core_s_fault_is_passed_over_only_until_the_board_is_configured(rig, words, clock, board):
+    radar = RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")))
+    radar.configure()
+    assert any("main core fault" in line for line in radar.report()["events"])
+    board.say(MAIN_CPU_FAULT, struct.pack("<BBH", 5, 0, 0) + bytes(32))
+    assert radar.poll() is State.FAULT
+
+
+def test_a_board_that_starts_anew_by_itself_is_a_fault_and_comes_back(radar, board, clock):
+    radar.arm(FRAMES)
+    board.power(False)
+    board.power(True)
+    clock.sleep(0.1)
+    assert radar.poll() is State.FAULT
+    assert "started anew by itself" in radar.reason
+    radar.arm(FRAMES)
+    assert radar.state is State.ARMED
+
+
+def test_a_failure_after_the_main_core_s_fault_names_it(radar, board):
+    board.inject(Fault.NO_ANSWER, Fault.NO_ANSWER, Fault.NO_ANSWER)
+    with pytest.raises(DeviceError) as caught:
+        radar.configure()
+    assert "it had reported before: main core fault: register read-back error" in caught.value.why
+
+
+def test_another_board_than_the_rig_file_names_is_refused(rig, words, clock):
+    radar = RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")), die_id="5eed0002-0-0-0")
+    with pytest.raises(DeviceError, match=r"die id 5eed0001.*the rig file names 5eed0002"):
+        radar.configure()
+
+
+def test_events_without_end_delay_nothing_for_long(radar, board, clock):
+    radar.arm(FRAMES)
+    for _ in range(5000):
+        board.say(0x1012, bytes(20))
+    began = clock.time
+    assert radar.poll() is State.ARMED
+    assert clock.time - began < 0.5
+    assert any("without a pause" in line for line in radar.warnings)
+    for _ in range(200):
+        radar.poll()
+    assert len(radar.report()["events"]) <= 1000
+    assert radar.poll() is State.ARMED
 
 
 def test_states_without_a_way_out_are_none():

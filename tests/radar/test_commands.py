@@ -42,8 +42,8 @@ from polysight.host.radar.commands import (
     slope_code,
     start_code,
 )
+from polysight.host.radar.firmware import file_chunks
 from polysight.host.radar.messages import command, decode, encode
-from polysight.host.radar.program import file_chunks
 
 PUBLISHED = Profile(76.01e9, 38.816929e12, 100.0, 7.0, 128.5, 256, 2.15e6, 175.0, 350.0, 30, 30)
 OTHER = Profile(76.01087e9, 38.816929e12, 100.0, 6.5, 128.5, 512, 5e6, 350.0, 2800.0, 40, 36, 3)

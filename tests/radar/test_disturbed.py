@@ -12,7 +12,7 @@ from polysight.host.radar.commands import Chirp, LdoBypass, LowPower
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import Fault
+from polysight.simulators.radars import Fault, make_image
 from polysight.simulators.radars import RadarBoard as Simulated
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
@@ -50,7 +50,7 @@ def _faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
 def test_whatever_is_lost_every_command_is_obeyed_in_order_and_once(faults_of_each: list[list[Fault]]):
     """Twice only where the answer was lost and its repetition was then heard damaged: a NACK asks for a new number."""
     clock = VirtualClock()
-    board = Simulated(lambda: clock.time)
+    board = Simulated(lambda: clock.time, flash=make_image())
     radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")))
     radar.configure()
     board.executed.clear()
@@ -72,7 +72,10 @@ def test_whatever_is_lost_every_command_is_obeyed_in_order_and_once(faults_of_ea
 @example(7, 3)
 def test_a_flipped_bit_anywhere_never_makes_another_setting(at: int, bit: int):
     clock = VirtualClock()
-    clean_board, board = Simulated(lambda: clock.time), Simulated(lambda: clock.time)
+    clean_board, board = (
+        Simulated(lambda: clock.time, flash=make_image()),
+        Simulated(lambda: clock.time, flash=make_image()),
+    )
     clean = RadarBoard("LS", BoardWords(clean_board, clock), clock, program(RIG, RIG.by_name("LS")))
     clean.arm(FRAMES)
     radar = RadarBoard("LS", FlippingWords(board, clock, at, bit), clock, program(RIG, RIG.by_name("LS")))

@@ -25,8 +25,8 @@ def usb(chip, clock) -> UsbWords:
 
 
 def test_a_word_is_selected_swapped_and_deselected():
-    assert write_words([0x1234]).hex(" ") == "80 c0 4b 11 01 00 12 34 80 c8 4b 87"
-    assert read_words(1).hex(" ") == "80 c2 4b 20 01 00 80 c8 4b 87"
+    assert write_words([0x1234]).hex(" ") == "80 c0 4b 80 c0 4b 11 01 00 12 34 80 c8 4b 80 c8 4b 80 c8 4b 87"
+    assert read_words(1).hex(" ") == "80 c2 4b 80 c2 4b 20 01 00 80 c8 4b 80 c8 4b 80 c8 4b 87"
 
 
 def test_the_clock_is_10_mhz_and_rests_low(chip, usb):

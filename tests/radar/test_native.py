@@ -14,7 +14,7 @@ from polysight.host.store.manifest import decode_line, encode_line
 from polysight.shared.config import Instrument, NativeRadar, Radar
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.tables import decode, to_builtins
-from polysight.simulators.radars import RadarBoard, UsbChip
+from polysight.simulators.radars import RadarBoard, UsbChip, make_image
 from tests.support.radar.boards import BoardWords
 
 PERIOD_S = 1.5e-3
@@ -26,7 +26,9 @@ class Boards:
 
     def __init__(self, rig: Instrument, clock) -> None:
         self.clock = clock
-        self.by_serial = {b.usb_serial: RadarBoard(lambda: clock.time) for b in rig.radar.native.values()}
+        self.by_serial = {
+            b.usb_serial: RadarBoard(lambda: clock.time, flash=make_image()) for b in rig.radar.native.values()
+        }
         self.words = {s: BoardWords(b, clock) for s, b in self.by_serial.items()}
 
     def pulses(self, count: int, but: str = "") -> None:
@@ -99,7 +101,7 @@ def test_the_report_fits_the_manifest_and_is_told_once(radars):
     told = radars.report()
     assert decode_line(encode_line({"fact": "radars", **told})) == {"fact": "radars", **json.loads(json.dumps(told))}
     assert set(told["boards"]) == {"LS", "RH", "RV"}
-    assert told["boards"]["RV"]["rf_firmware"] == "2.2.3.1 patch 2.1.1.1"
+    assert told["boards"]["RV"]["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
     assert set(told["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
     assert len(told["boards"]["RV"]["sent"]) > 40
     assert 0.9e6 < told["direct_if_hz"]["RH"] < 1.05e6
@@ -129,7 +131,7 @@ def test_ldo_bypass_never_reaches_a_board_without_its_acknowledgement(rig, clock
 
 
 def test_a_board_that_fails_at_the_start_closes_the_others(rig, clock, boards):
-    boards.by_serial["FTRV"].patch = False
+    boards.by_serial["FTRV"].cores.flash = b""
     with pytest.raises(DeviceError, match="RV: its rf firmware has no patch"):
         NativeRadars(rig, boards.words.__getitem__, clock)
     assert all(w.closed for w in boards.words.values())

@@ -7,7 +7,7 @@ import pytest
 from polysight.host.radar.interface import RadarState
 from polysight.host.radar.native import NativeRadars
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import RadarBoard
+from polysight.simulators.radars import RadarBoard, make_image
 from tests.support.radar.boards import BoardWords
 
 FRAMES = 24
@@ -44,7 +44,9 @@ class Usb:
 
     def __init__(self, rig, clock) -> None:
         self.clock = clock
-        self.boards = {n.usb_serial: RadarBoard(lambda: clock.time) for n in rig.radar.native.values()}
+        self.boards = {
+            n.usb_serial: RadarBoard(lambda: clock.time, flash=make_image()) for n in rig.radar.native.values()
+        }
         self.links: dict[str, list[Words]] = {serial: [] for serial in self.boards}
         self.back_at = 0.0
 

@@ -19,7 +19,7 @@ from polysight.host.radar.program import program
 from polysight.host.radar.spi import SystemClock
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import RadarBoard as Simulated
-from polysight.simulators.radars import RadarSocket
+from polysight.simulators.radars import RadarSocket, make_image
 from polysight.simulators.rig import derive
 from polysight.simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import published_rig
@@ -53,7 +53,7 @@ def test_programmed_offsets_make_the_signals_that_the_scene_s_offset_made(tmp_pa
 @pytest.fixture
 def served():
     """A simulated board at a TCP address, served by a thread."""
-    board = Simulated(time.monotonic)
+    board = Simulated(time.monotonic, flash=make_image())
     made = RadarSocket("tcp://127.0.0.1:0", board)
     stop = threading.Event()
 

@@ -7,7 +7,6 @@ import pytest
 from polysight.host.radar.commands import GET_TEMPERATURES, RF_POWER_UP, DeviceConfiguration, LowPower
 from polysight.host.radar.events import CALIBRATION_REPORT, MAIN_POWER_UP, RF_POWER_UP_DONE
 from polysight.host.radar.messages import READY_TO_READ, decode
-from polysight.host.radar.program import ERASE_TIMEOUT_S, TO_FLASH, file_chunks
 from polysight.host.radar.spi import ATTEMPTS, Link
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import Fault
@@ -108,7 +107,9 @@ def test_it_gives_up_after_its_tries(link, board, sent, clock):
     assert clock.time - began == pytest.approx(ATTEMPTS * 1.0, rel=0.05)
 
 
-@pytest.mark.parametrize("fault", [f for f in Fault if f not in (Fault.BAD_SYNC, Fault.EVENT_BETWEEN, Fault.REFUSE)])
+@pytest.mark.parametrize(
+    "fault", [f for f in Fault if f not in (Fault.BAD_SYNC, Fault.EVENT_BETWEEN, Fault.REFUSE, Fault.REFUSE_BARE)]
+)
 def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     link = Link("RH", words, clock, sent.append)
     words.reset(held=True)
@@ -131,29 +132,3 @@ def test_unplugged_is_an_error_at_once(link, board):
 def test_an_event_that_never_comes_is_named(link):
     with pytest.raises(DeviceError, match="did not report 0x100B within 2 s"):
         link.wait_for((0x100B,), 2.0, ignored)
-
-
-def test_firmware_goes_in_parts_and_the_slow_erase_is_waited_for(words, clock, board, sent):
-    board.patch = False
-    link = Link("RH", words, clock, sent.append)
-    words.reset(held=True)
-    words.reset(held=False)
-    link.wait_for((MAIN_POWER_UP,), 1.0, ignored)
-    image = bytes(n % 251 for n in range(1000))
-    for n, (chunk, remaining) in enumerate(file_chunks(image, TO_FLASH)):
-        link.call(chunk, timeout_s=ERASE_TIMEOUT_S if n == 0 else 1.0, remaining=remaining)
-    assert board.patch
-    assert [m.remaining_chunks for m in commands(sent)] == [4, 3, 2, 1, 0]
-    assert clock.time > board.erase_s
-    with pytest.raises(DeviceError, match="no valid answer"):
-        link.call(next(iter(file_chunks(image, TO_FLASH)))[0], remaining=4)
-
-
-@pytest.mark.parametrize("size", [1, 223, 224, 225, 456, 457, 1000])
-def test_parts_of_an_image_join_to_it(size):
-    image = bytes(n % 251 for n in range(size))
-    parts = file_chunks(image)
-    joined = b"".join(chunk.part for chunk, _ in parts)
-    assert joined == bytes((4, 0, 0, 0)) + size.to_bytes(4, "little") + image
-    assert all(len(chunk.part) <= 232 for chunk, _ in parts)
-    assert [remaining for _, remaining in parts] == list(reversed(range(len(parts))))

@@ -1,122 +1,158 @@
-"""Opening the USB chip: the extra that is missing, the chip that is not there, and the four channels' modes."""
+"""Opening the USB chip with the real pyftdi on a simulated bus: modes, replug, late plug, short reads, paths."""
 
 from __future__ import annotations
 
 import sys
-from enum import IntEnum
-from types import ModuleType
 
 import pytest
+from pyftdi.ftdi import Ftdi
+from pyftdi.usbtools import UsbTools
 
-from polysight.host.radar.usb import PRODUCT, VENDOR, open_usb, set_up_interrupt, set_up_spi
+from polysight.host.radar.interface import RadarState
+from polysight.host.radar.native import NativeRadars
+from polysight.host.radar.usb import open_usb
 from polysight.shared.errors import ConfigError, DeviceError
+from polysight.simulators.radars import RadarBoard, UsbChip, make_image
+from tests.support.radar import usb_bus
 
-
-class FakeFtdi:
-    """What is used of pyftdi's class."""
-
-    class BitMode(IntEnum):
-        RESET = 0
-        BITBANG = 1
-        MPSSE = 2
-
-    PRODUCT_IDS: dict = {}  # noqa: RUF012
-    opened: list = []  # noqa: RUF012
-    missing = 0
-
-    def __init__(self) -> None:
-        self.modes, self.sent, self.closed = [], b"", False
-        FakeFtdi.opened.append(self)
-
-    @classmethod
-    def add_custom_vendor(cls, vid: int, name: str) -> None:
-        assert vid not in cls.PRODUCT_IDS
-        del name
-
-    @classmethod
-    def add_custom_product(cls, vid: int, pid: int, name: str) -> None:
-        cls.PRODUCT_IDS[vid] = {name: pid}
-
-    def open(self, vendor: int, product: int, *, serial: str, interface: int) -> None:
-        if interface == FakeFtdi.missing:
-            raise OSError("no such device")
-        self.where = (vendor, product, serial, interface)
-
-    def set_bitmode(self, mask: int, mode: IntEnum) -> None:
-        self.modes.append((mask, mode))
-
-    def set_latency_timer(self, ms: int) -> None:
-        self.latency = ms
-
-    def purge_buffers(self) -> None:
-        self.purged = True
-
-    def write_data(self, data: bytes) -> int:
-        self.sent += data
-        return len(data)
-
-    def read_data_bytes(self, size: int, attempt: int) -> bytes:
-        del attempt
-        return b"\x20"[:size]
-
-    def close(self, freeze: bool) -> None:
-        self.closed = freeze
+FRAMES = 4
 
 
 @pytest.fixture
-def ftdi(monkeypatch):
-    library, tools, package = ModuleType("pyftdi.ftdi"), ModuleType("pyftdi.usbtools"), ModuleType("pyftdi")
-    library.Ftdi = FakeFtdi  # type: ignore[attr-defined]
-    tools.UsbToolsError = type("UsbToolsError", (Exception,), {})  # type: ignore[attr-defined]
-    for name, module in (("pyftdi", package), ("pyftdi.ftdi", library), ("pyftdi.usbtools", tools)):
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setattr(FakeFtdi, "PRODUCT_IDS", {})
-    monkeypatch.setattr(FakeFtdi, "opened", [])
-    monkeypatch.setattr(FakeFtdi, "missing", 0)
-    return FakeFtdi
+def bus(monkeypatch):
+    """An empty bus, and a pyftdi that knows of nothing."""
+    made = usb_bus.Bus()
+    monkeypatch.setattr(usb_bus, "BUS", made)
+    monkeypatch.setattr(UsbTools, "BACKENDS", ("tests.support.radar.usb_bus",))
+    for name in ("Devices", "UsbDevices"):
+        monkeypatch.setattr(UsbTools, name, {})
+    monkeypatch.setattr(Ftdi, "VENDOR_IDS", dict(Ftdi.VENDOR_IDS))
+    monkeypatch.setattr(Ftdi, "PRODUCT_IDS", dict(Ftdi.PRODUCT_IDS))
+    return made
 
 
-def test_four_channels_of_one_serial_number_in_their_modes(ftdi):
+def chip(board: RadarBoard, serial: str, path: tuple[int, ...] = (1,)) -> usb_bus.Chip:
+    return usb_bus.Chip(UsbChip(board), serial, path)
+
+
+@pytest.fixture
+def plugged(bus, board) -> usb_bus.Chip:
+    made = chip(board, "FT1234", (4, 2))
+    bus.plug(made)
+    return made
+
+
+def test_four_channels_in_their_modes(plugged):
     words = open_usb("FT1234")
-    assert [f.where for f in ftdi.opened] == [(VENDOR, PRODUCT, "FT1234", n) for n in (1, 2, 3, 4)]
-    assert [f.modes[-1][1] for f in ftdi.opened] == [2, 2, 1, 1]
-    assert [f.modes[-1][0] for f in ftdi.opened] == [0x4B, 0x5B, 0xF9, 0xFF]
-    assert ftdi.opened[0].sent == set_up_spi()
-    assert ftdi.opened[1].sent == set_up_interrupt()
-    assert words.interrupt()
+    assert plugged.modes == {1: (2, 0x4B), 2: (2, 0x5B), 3: (1, 0xF9), 4: (1, 0xFF)}
+    assert set(plugged.latency_ms.values()) == {1}
+    assert not words.interrupt()
+    words.close()
+    assert plugged.errors == plugged.chip.errors == []
+
+
+@pytest.mark.parametrize("packet", [1, 2, 3, 7, 61, 510])
+@pytest.mark.usefixtures("plugged")
+def test_answers_cut_anywhere_arrive_whole(bus, clock, packet):
+    bus.packet = packet
+    words = open_usb("FT1234")
     words.reset(held=True)
     words.reset(held=False)
-    assert ftdi.opened[2].sent == b"\x80\xc0"
-    assert ftdi.opened[3].sent == b"\x10\x10"
+    clock.sleep(0.1)
+    assert words.interrupt()
+    words.write([0x5678, 0x8765] + [0xFFFF] * 6)
+    clock.sleep(0.1)
+    assert words.read(2) == [0xDCBA, 0xABCD]
     words.close()
-    assert all(f.closed for f in ftdi.opened)
 
 
-def test_a_second_board_needs_no_second_registration(ftdi):
-    open_usb("FT1")
-    open_usb("FT2")
-    assert len(ftdi.opened) == 8
+def test_slow_mode_is_one_word_a_transfer(plugged):
+    words = open_usb("FT1234", slow=True)
+    assert plugged.chip.spi_hz == 1e6
+    before = plugged.transfers
+    words.write([1, 2, 3])
+    assert plugged.transfers == before + 3
+    assert plugged.chip.words_written == [1, 2, 3]
+    words.close()
 
 
-def test_a_chip_that_is_not_there_is_named_and_what_was_opened_is_closed(ftdi, monkeypatch):
-    monkeypatch.setattr(FakeFtdi, "missing", 3)
-    with pytest.raises(DeviceError, match="serial FT9, channel C: cannot be opened: no such device"):
+def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugged):
+    bus.plug(chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3)))  # two with one serial number
+    open_usb("usb:1-4.2").write([0x1234])
+    assert plugged.chip.words_written == [0x1234]
+    with pytest.raises(DeviceError, match=r"usb:1-7.*there are 1-4\.2, 1-4\.3"):
+        open_usb("usb:1-7")
+
+
+@pytest.mark.usefixtures("plugged")
+def test_a_chip_that_is_not_there_is_named():
+    with pytest.raises(DeviceError, match="FT9, channel A: cannot be opened"):
         open_usb("FT9")
-    assert [f.closed for f in ftdi.opened] == [True, True, False]
 
 
-def test_a_pulled_cable_is_an_error_that_names_the_chip(ftdi):
-    words = open_usb("FT1")
+def test_a_late_plug_is_found(bus, board):
+    """pyftdi remembers an empty bus, too."""
+    with pytest.raises(DeviceError):
+        open_usb("FT7")
+    bus.plug(chip(board, "FT7"))
+    open_usb("FT7").close()
 
-    def gone(*_: object, **__: object) -> None:
-        raise OSError("no such device")
 
-    ftdi.opened[0].write_data = gone
-    ftdi.opened[1].read_data_bytes = gone
-    with pytest.raises(DeviceError, match="radar USB serial FT1: no such device"):
-        words.write([1])
-    with pytest.raises(DeviceError, match="FT1"):
-        words.interrupt()
+@pytest.mark.parametrize("closed", ["before", "after"])
+def test_a_replugged_chip_is_found_and_the_dead_one_let_go_of(bus, plugged, closed):
+    words = open_usb("FT1234")
+    if closed == "before":
+        words.close()
+    bus.pull(plugged)
+    if closed == "after":
+        with pytest.raises(DeviceError, match=r"FT1234: .*No such device"):
+            words.write([1])
+        words.close()
+    assert UsbTools.Devices == {}
+    bus.plug(plugged)
+    again = open_usb("FT1234")
+    again.write([0x4321])
+    assert plugged.chip.words_written == [0x4321]
+    again.close()
+    assert UsbTools.Devices == {}
+
+
+def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged):
+    """At each transfer of an opening in turn: an error that names the chip, nothing left open, and it comes back."""
+    words = open_usb("FT1234")
+    whole = plugged.transfers
+    words.close()
+    for at in range(1, whole + 1):
+        bus.plug(plugged)
+        plugged.transfers, plugged.pull_at = 0, at
+        with pytest.raises(DeviceError, match="FT1234"):
+            open_usb("FT1234")
+        assert UsbTools.Devices == {}
+    bus.plug(plugged)
+    open_usb("FT1234").close()
+
+
+def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
+    boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image()) for n in rig.radar.native.values()}
+    chips = {place: chip(b, place, (n,)) for n, (place, b) in enumerate(boards.items(), 1)}
+    for made in chips.values():
+        bus.plug(made)
+
+    def row(radars: NativeRadars) -> set[RadarState]:
+        radars.arm(FRAMES)
+        for _ in range(FRAMES):
+            for board in boards.values():
+                board.trigger()
+            clock.sleep(1.5e-3)
+        return {s.state for s in radars.states().values()}
+
+    with NativeRadars(rig, open_usb, clock) as radars:
+        assert row(radars) == {RadarState.DONE}
+        bus.pull(chips["FTRH"])
+        assert radars.states()["RH"].state is RadarState.FAULT
+        bus.plug(chips["FTRH"])
+        assert row(radars) == {RadarState.DONE}
+    assert [c.errors + c.chip.errors for c in chips.values()] == [[], [], []]
 
 
 def test_without_pyftdi_the_error_names_the_extra(monkeypatch):

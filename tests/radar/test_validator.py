@@ -57,6 +57,7 @@ def test_the_published_chirp_with_centred_receivers_holds(rig):
         ("ramp", "chirp", {"ramp_end_us": 5001.0}),
         ("idle", "radar", {"idle_us": 5300.0}),
         ("RX gain", "radar", {"rx_gain_db": 54}),
+        ("RX gain", "radar", {"rx_gain_db": 30}),
         ("RX gain step", "radar", {"rx_gain_db": 31}),
         ("TX back-off", "radar", {"tx_backoff_db": 21}),
         ("sweep of RH", "chirp", {"ramp_end_us": 128.6}),
@@ -91,6 +92,31 @@ def test_the_shortest_burst_period_is_where_the_chirps_leave_300_us(rig):
     edge = 100.0 + 128.5 + 0.01 + 300.0 + 200.0
     assert "inter-frame time" not in broken(changed(rig, "burst", period_us=edge + 1e-6))
     assert "inter-frame time" in broken(changed(rig, "burst", period_us=edge - 1e-3))
+
+
+@pytest.mark.parametrize(("chirp_us", "holds"), [(228.51, True), (228.5, False), (300.0, False)])
+def test_chirps_of_one_frame_follow_each_other_as_the_radar_makes_them(rig, chirp_us, holds):
+    """idle + ramp + 10 ns is what the radar makes of its profile; the host must know the same."""
+    burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=chirp_us, period_us=6000.0)
+    many = msgspec.structs.replace(rig, burst=burst)
+    assert ("chirp spacing" not in broken(many)) is holds
+    told = next(c for c in constraints(many, FRAMES) if c.name == "chirp spacing")
+    idle = float(told.remedy.split()[3].strip(","))
+    mended = msgspec.structs.replace(many, radar=msgspec.structs.replace(rig.radar, idle_us=idle))
+    assert "chirp spacing" not in broken(mended)
+
+
+def test_a_frame_of_many_chirps_needs_its_time(rig):
+    chirps = 16 * 228.51
+    for period, holds in ((chirps + 500.0 + 1e-3, True), (chirps + 499.0, False)):
+        burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=period)
+        assert ("inter-frame time" not in broken(msgspec.structs.replace(rig, burst=burst))) is holds
+
+
+def test_a_usb_path_acknowledges_no_ldo_bypass(rig):
+    native = {**rig.radar.native, "RH": NativeRadar(usb_path="1-4.2", ldo_bypass=True)}
+    wrong = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
+    assert broken(wrong) == {"LDO bypass of RH"}
 
 
 def test_ldo_bypass_needs_this_boards_serial(rig):

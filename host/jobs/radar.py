@@ -1,0 +1,140 @@
+"""`polysight radar`: one board by itself, for its first days. Not run on hardware yet."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from polysight.host.radar import (
+    Clock,
+    ReplayedWords,
+    Row,
+    SystemClock,
+    TracedWords,
+    WordLink,
+    check_board,
+    firmware_of,
+    open_board,
+    plan_lines,
+    radar_board,
+    read_image,
+    require,
+)
+from polysight.shared import __version__
+from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.errors import ConfigError
+
+_WORDS = {True: "ok", False: "FAILED"}
+
+
+def plan_radars(config: Path) -> int:
+    """Every constraint, and every message that each board would be sent; touches no board. Raises ConfigError."""
+    rig = _native(config)
+    sys.stdout.write("\n".join(plan_lines(rig)) + "\n")
+    return 0
+
+
+def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json: bool) -> int:
+    """One board from USB to one frame, step by step; 0 when every step holds. Raises ConfigError, OSError."""
+    rig = _checked(config, name)
+    clock = SystemClock()
+    return _check(rig, name, clock, lambda: _open(rig, name, clock, trace, slow), as_json)
+
+
+def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
+    """The same check against a trace instead of a board; 0 when every step holds. Raises ConfigError, OSError."""
+    words = ReplayedWords(trace)
+    name = str(words.facts.get("board", ""))
+    if not as_json:
+        sys.stdout.write(f"replayed from {trace}, not a board\n")
+    return _check(_checked(config, name), name, words, lambda: words, as_json)
+
+
+def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path | None, slow: bool) -> int:
+    """Start a board from an image in its RAM, or write its flash and start it from there; verified either way.
+
+    Raises ConfigError, DeviceError, OSError.
+    """
+    rig = _checked(config, name)
+    checked, clock = read_image(image), SystemClock()
+    sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked.patches)}\n")
+    words = _open(rig, name, clock, trace, slow)
+    board = radar_board(rig, name, words, clock, None if flash else checked)
+    try:
+        if flash:
+            sys.stdout.write(f"{name}: {board.write_flash(checked, _progress)}\n")
+        else:
+            board.configure()
+            sys.stdout.write(
+                f"{name}: runs {board.facts['main_firmware']} from RAM, until its next reset; its flash was not"
+                f' written. Set radar.firmware = "{image}" to have it at each start, or use --flash\n'
+            )
+    finally:
+        board.close()
+    return 0
+
+
+def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], WordLink], as_json: bool) -> int:
+    rows: list[Row] = []
+
+    def tell(row: Row) -> None:
+        rows.append(row)
+        if not as_json:
+            sys.stdout.write(_text(name, row))
+            sys.stdout.flush()
+
+    firmware = firmware_of(rig)
+    transmits = rig.transmitter.name == name
+    board = check_board(open_words, lambda w: radar_board(rig, name, w, clock, firmware), transmits, tell)
+    report = board.report() if board else {}
+    if board:
+        board.close()
+    if as_json:
+        steps = [row._asdict() for row in rows]
+        sys.stdout.write(json.dumps({"board": name, "steps": steps, "report": report}, indent=1) + "\n")
+    else:
+        for line in report.get("warnings", []):  # type: ignore[union-attr]
+            sys.stdout.write(f"      note: {line}\n")
+    return 0 if all(row.holds for row in rows) else 1
+
+
+def _text(name: str, row: Row) -> str:
+    lines = [f"{name}  {row.step:12} {_WORDS[row.holds]:6}  {row.came}"]
+    if not row.holds:
+        lines += [f"      expected: {row.expected}", f"      do: {row.do}"]
+    return "\n".join(lines) + "\n"
+
+
+def _progress(sent: int, of: int) -> None:
+    sys.stderr.write(f"\r{sent} of {of} parts written" + ("\n" if sent == of else ""))
+
+
+def _open(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
+    place = rig.radar.native[name].place
+    words = open_board(place, slow or rig.radar.slow_spi)
+    if trace is None:
+        return words
+    facts = {"board": name, "place": place, "rig": rig.name, "polysight": __version__, "unix_s": round(time.time(), 3)}
+    return TracedWords(words, clock, trace, facts)
+
+
+def _native(config: Path) -> Instrument:
+    rig = load_instrument(config)
+    if not rig.radar.native:
+        raise ConfigError(
+            f"{config}: no boards under [radar] native",
+            f'control is "{rig.radar.control}": something else configures these radars',
+            'control = "native", native = { NAME = { usb_serial = "..." } }; see docs/how-to/radar-bring-up.md',
+        )
+    return rig
+
+
+def _checked(config: Path, name: str) -> Instrument:
+    rig = _native(config)
+    if name not in rig.radar.native:
+        raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")
+    require(rig, rig.grid.columns * rig.burst.pulses)
+    return rig

@@ -1,0 +1,216 @@
+"""Everything that passed between host and board, with times, in a file; and such a file played to the host again.
+
+One JSON object a line; the form is in docs/spec/mmwavelink.md ("Traces"). A trace of a day on which something failed is
+all that is needed to look for the cause elsewhere: :class:`ReplayedWords` stands for the board that it was taken from.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from polysight.host.radar.spi import Clock, WordLink
+from polysight.shared.errors import ConfigError, DeviceError
+
+FORM = 1
+INTERRUPT, RESET = "HOST_INTR", "NRST"
+
+
+class TracedWords:
+    """A word link that writes down what passes; satisfies :class:`polysight.host.radar.spi.WordLink`.
+
+    Parameters
+    ----------
+    words, clock
+        The link, and the time that is written.
+    file
+        Written anew, each line at once, so that nothing is missing of a run that was killed.
+    facts
+        For the first line: board, place, and what else helps.
+
+    Raises
+    ------
+    OSError
+        when the file cannot be written.
+    """
+
+    def __init__(self, words: WordLink, clock: Clock, file: Path, facts: dict[str, object]) -> None:
+        self._words, self._clock, self._began = words, clock, clock.now()
+        self._file = file.open("w", encoding="utf-8")
+        self._level: bool | None = None
+        self._write({"trace": FORM, **facts})
+
+    def write(self, words: Sequence[int]) -> None:
+        """Shift words out. Raises DeviceError."""
+        self._put(out=_hex(words))
+        with _Errors(self):
+            self._words.write(words)
+
+    def read(self, count: int) -> list[int]:
+        """Shift words in. Raises DeviceError."""
+        with _Errors(self):
+            words = self._words.read(count)
+        self._put(**{"in": _hex(words)})
+        return words
+
+    def interrupt(self) -> bool:
+        """The host interrupt; written down when it has changed. Raises DeviceError."""
+        with _Errors(self):
+            level = self._words.interrupt()
+        if level is not self._level:
+            self._level = level
+            self._put(line=INTERRUPT, level=int(level))
+        return level
+
+    def reset(self, held: bool) -> None:
+        """Drive the reset. Raises DeviceError."""
+        self._put(line=RESET, level=int(not held))
+        with _Errors(self):
+            self._words.reset(held)
+
+    def close(self) -> None:
+        """Close link and file. Twice is once."""
+        self._words.close()
+        self._file.close()
+
+    def note_error(self, what: str) -> None:
+        """Write down an error of the link."""
+        self._put(error=what)
+
+    def _put(self, **what: object) -> None:
+        self._write({"t": round(self._clock.now() - self._began, 6), **what})
+
+    def _write(self, line: dict[str, object]) -> None:
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+
+
+class _Errors:
+    """A DeviceError that leaves this block is written into the trace."""
+
+    def __init__(self, trace: TracedWords) -> None:
+        self._trace = trace
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if isinstance(error, DeviceError):
+            self._trace.note_error(error.what)
+
+
+class ReplayedWords:
+    """A board as a trace shows it, and its clock: a word link, and time that passes by waiting.
+
+    The host must do what it did then: the first thing that differs is a DeviceError that names both.
+
+    Attributes
+    ----------
+    facts
+        The trace's first line.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.facts, self._records = read_trace(file)
+        self._at, self._time, self._level = 0, 0.0, False
+
+    def now(self) -> float:
+        """Seconds of the trace's time."""
+        self._time += 1e-6
+        return self._time
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self._time += seconds
+
+    @property
+    def done(self) -> bool:
+        """True when all of the trace was played."""
+        return self._at >= len(self._records)
+
+    def write(self, words: Sequence[int]) -> None:
+        """What the host writes must be what it wrote then. Raises DeviceError."""
+        self._expect("out", _hex(words))
+
+    def read(self, count: int) -> list[int]:
+        """What the board said then. Raises DeviceError."""
+        said = str(self._expect("in", None))
+        if len(said) != 4 * count:
+            raise self._differs(f"reads {count} words", f"{len(said) // 4} words")
+        return list(struct.unpack(f"<{count}H", bytes.fromhex(said)))
+
+    def interrupt(self) -> bool:
+        """The line as it was at this time. Raises DeviceError."""
+        while not self.done and self._records[self._at].get("line") == INTERRUPT:
+            record = self._records[self._at]
+            if record["t"] > self.now():
+                break
+            self._level, self._at = bool(record["level"]), self._at + 1
+        self._raise_error()
+        return self._level
+
+    def reset(self, held: bool) -> None:
+        """The reset must move as it did then. Raises DeviceError."""
+        self._skip_interrupts()
+        self._expect("level", int(not held))
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _skip_interrupts(self) -> None:
+        while not self.done and self._records[self._at].get("line") == INTERRUPT:
+            self._level, self._at = bool(self._records[self._at]["level"]), self._at + 1
+
+    def _raise_error(self) -> None:
+        if not self.done and "error" in self._records[self._at]:
+            self._at += 1
+            raise DeviceError(self._records[self._at - 1]["error"], "as in the trace", "the trace's own remedy")
+
+    def _expect(self, key: str, value: object) -> object:
+        self._skip_interrupts()
+        self._raise_error()
+        if self.done:
+            raise DeviceError("the trace ends here", "the run it was taken from ended, or was killed", "")
+        record = self._records[self._at]
+        if key not in record or (value is not None and record[key] != value):
+            raise self._differs(f"{key} {value}", json.dumps(record))
+        self._at, self._time = self._at + 1, max(self._time, record["t"])
+        self._raise_error()
+        return record[key]
+
+    def _differs(self, now: str, then: str) -> DeviceError:
+        return DeviceError(
+            f"line {self._at + 2} of the trace: the host does {now}, then it was {then}",
+            "another version of this program, another rig file or board, or another trace",
+            "replay it with the rig file and the version that it was taken with",
+        )
+
+
+def read_trace(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """A trace's first line, and the others; a last line that was cut off is left out. Raises ConfigError, OSError."""
+    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    found = []
+    for number, line in enumerate(lines, 1):
+        try:
+            found.append(json.loads(line) if line else None)
+        except ValueError:
+            if number < len(lines):
+                raise _no_trace(file, f"line {number} is no JSON") from None
+    records = [r for r in found if isinstance(r, dict)]
+    if not records or records[0].get("trace") != FORM:
+        raise _no_trace(file, f"its first line is not that of a trace of form {FORM}")
+    if not all(isinstance(r.get("t"), int | float) for r in records[1:]):
+        raise _no_trace(file, "a line has no time")
+    return records[0], records[1:]
+
+
+def _no_trace(file: Path, what: str) -> ConfigError:
+    return ConfigError(f"{file}: {what}", "another file", "take one that `polysight radar --trace FILE` wrote")
+
+
+def _hex(words: Sequence[int]) -> str:
+    return struct.pack(f"<{len(words)}H", *words).hex()

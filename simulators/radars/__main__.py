@@ -1,0 +1,83 @@
+"""`python -m polysight.simulators.radars TRACE`: play the host's side of a trace to a simulated board.
+
+Says where the simulated board answers otherwise than the one the trace was taken from: what the stand-in does not know,
+or what was broken that day. The trace's form: docs/spec/mmwavelink.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from polysight.simulators.radars.board import FUNCTIONAL, RadarBoard
+from polysight.simulators.radars.image import make_image
+
+_LOOK_S, _PATIENCE_S = 1e-4, 15.0
+
+
+class _Time:
+    def __init__(self) -> None:
+        self.s = 0.0
+
+    def now(self) -> float:
+        return self.s
+
+
+def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> list[str]:
+    """Lines that say where the board answers otherwise; none when it is the same. Raises OSError, ValueError."""
+    time = _Time()
+    board, differences = make(time.now), []
+    for number, line in enumerate(trace.read_text(encoding="utf-8").splitlines(), 1):
+        record = json.loads(line)
+        time.s = max(time.s, record.get("t", 0.0))
+        if record.get("line") == "NRST":
+            board.sense(FUNCTIONAL)
+            board.reset(held=not record["level"])
+        elif record.get("line") == "HOST_INTR" and record["level"]:
+            until = time.s + _PATIENCE_S
+            while not board.interrupt and time.s < until:
+                time.s += _LOOK_S
+            if not board.interrupt:
+                differences.append(f"line {number}: the simulated board has nothing to say here")
+        elif "out" in record:
+            for word in _words(record["out"]):
+                board.write_word(word)
+        elif "in" in record:
+            said = [board.read_word() for _ in _words(record["in"])]
+            if said != _words(record["in"]):
+                here = b"".join(w.to_bytes(2, "little") for w in said).hex()
+                differences.append(f"line {number}: the board said {record['in']}, the simulated one {here}")
+    return differences
+
+
+def _words(text: str) -> list[int]:
+    raw = bytes.fromhex(text)
+    return [int.from_bytes(raw[at : at + 2], "little") for at in range(0, len(raw), 2)]
+
+
+def main() -> int:
+    """Exit status 0 when the simulated board answers the same."""
+    parser = argparse.ArgumentParser(
+        prog="python -m polysight.simulators.radars",
+        description=__doc__,
+        epilog="example:\n  python -m polysight.simulators.radars first-day.jsonl",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("trace", type=Path, metavar="TRACE", help="a file that `polysight radar --trace FILE` wrote")
+    parser.add_argument("--empty-flash", action="store_true", help="a board on its first day")
+    args = parser.parse_args()
+    flash = b"" if args.empty_flash else make_image()
+    try:
+        differences = replay(args.trace, lambda now: RadarBoard(now, flash=flash))
+    except (OSError, ValueError) as e:
+        sys.stderr.write(f"{args.trace}: {e}\n")
+        return 2
+    sys.stdout.write("\n".join(differences or ["the simulated board answers the same"]) + "\n")
+    return 1 if differences else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

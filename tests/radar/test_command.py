@@ -1,0 +1,211 @@
+"""`polysight radar`: the plan without a board, a board checked step by step, firmware, traces and their replay."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import msgspec
+import pytest
+import tomli_w
+
+from polysight.host.cli.main import main
+from polysight.host.radar.messages import decode
+from polysight.host.radar.program import program
+from polysight.shared.tables import to_builtins
+from polysight.simulators.radars import RadarBoard, make_image
+from polysight.simulators.radars.__main__ import replay
+
+STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
+STEPS += ["one frame", "read back"]
+
+
+@pytest.fixture
+def rig_file(rig, tmp_path):
+    def write(changed=rig):
+        path = tmp_path / "rig.toml"
+        path.write_text(tomli_w.dumps(to_builtins(changed)), encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def opened(words, clock, monkeypatch):
+    """The command reaches the simulated board `RH`, in virtual time."""
+    places = []
+
+    def open_board(place, slow):
+        places.append((place, slow))
+        return words
+
+    monkeypatch.setattr("polysight.host.jobs.radar.open_board", open_board)
+    monkeypatch.setattr("polysight.host.jobs.radar.SystemClock", lambda: clock)
+    return places
+
+
+def run(path, *args: str) -> int:
+    return main(["radar", "--config", str(path), *args])
+
+
+def test_the_plan_is_every_message_of_every_board(rig, rig_file, capsys):
+    assert run(rig_file(), "plan") == 0
+    out = capsys.readouterr().out
+    assert "BROKEN" not in out
+    sent = [decode(bytes.fromhex(line.split()[-1])).blocks for line in out.splitlines() if "34122143" in line]
+    expected = []
+    for board in rig.boards:
+        made = program(rig, board)
+        expected += [(c.block(),) for c in (*made.basic, *made.waveform, *made.frames(5600))]
+    assert sent == expected
+
+
+def test_a_broken_constraint_shows_in_the_plan_and_keeps_boards_untouched(rig, rig_file, opened, capsys):
+    path = rig_file(msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=33)))
+    assert run(path, "plan") == 0
+    assert "BROKEN  RX gain step" in capsys.readouterr().out
+    assert run(path, "check", "RH") == 2
+    assert "RX gain step" in capsys.readouterr().err
+    assert opened == []
+
+
+def test_a_sound_board_passes_every_step(rig_file, opened, capsys):
+    assert run(rig_file(), "check", "RH", "--json", "--slow") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [s["step"] for s in told["steps"]] == STEPS
+    assert all(s["holds"] for s in told["steps"])
+    assert told["report"]["die_id"].startswith("5eed0001")
+    assert opened == [("FTRH", True)]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "step", "said"),
+    [
+        (lambda board: setattr(board, "functional_jumpers", False), "reset", ("SOP0 set", "[ o=o ]", "5 V")),
+        (lambda board: board.power(False), "reset", ("no power",)),
+        (lambda board: setattr(board.cores, "flash", b""), "versions", ("no patch", "radar.firmware")),
+        (lambda board: setattr(board.cores, "hardware_bits", 1 << 55), "firmware", ("memory not initialised",)),
+        (lambda board: setattr(board, "plugged", False), "reset", ("unplugged",)),
+    ],
+)
+@pytest.mark.usefixtures("opened")
+def test_a_step_that_fails_says_what_was_expected_and_what_to_do(rig_file, board, capsys, spoil, step, said):
+    spoil(board)
+    assert run(rig_file(), "check", "RH") == 1
+    out = capsys.readouterr().out
+    failed = [line for line in out.splitlines() if "FAILED" in line]
+    assert len(failed) == 1
+    assert step in failed[0]
+    assert "expected: " in out
+    assert "do: " in out
+    assert all(w in out for w in said)
+
+
+@pytest.mark.usefixtures("opened")
+def test_firmware_is_tried_from_ram_and_written_only_when_asked(rig_file, words, board, capsys, tmp_path):
+    board.cores.flash = b""
+    image = tmp_path / "image.bin"
+    image.write_bytes(make_image())
+    assert run(rig_file(), "firmware", "RH", str(image)) == 0
+    assert "not written" in capsys.readouterr().out
+    assert board.cores.flash == b""
+    assert run(rig_file(), "firmware", "RH", str(image), "--flash") == 0
+    assert "patch 2.2.2.0 from flash" in capsys.readouterr().out
+    assert board.cores.flash == make_image()
+    assert words.closed
+
+
+def test_a_file_that_is_no_image_touches_no_board(rig_file, opened, capsys, tmp_path):
+    image = tmp_path / "notes.txt"
+    image.write_text("not firmware")
+    for more in ((), ("--flash",)):
+        assert run(rig_file(), "firmware", "RH", str(image), *more) == 2
+        assert "is no firmware" in capsys.readouterr().err
+    assert opened == []
+
+
+def test_an_unknown_board_is_named(rig_file, capsys):
+    assert run(rig_file(), "check", "XX") == 2
+    assert "no board 'XX'" in capsys.readouterr().err
+
+
+def test_a_rig_without_native_boards_is_told_what_to_set(rig, rig_file, capsys):
+    path = rig_file(msgspec.structs.replace(rig, radar=type(rig.radar)()))
+    for what in (("plan",), ("check", "RH")):
+        assert run(path, *what) == 2
+        assert "usb_serial" in capsys.readouterr().err
+
+
+SPOILT = [
+    lambda board: setattr(board, "plugged", True),
+    lambda board: setattr(board.cores, "flash", b""),
+    lambda board: setattr(board, "functional_jumpers", False),
+]
+
+
+@pytest.mark.parametrize("spoil", SPOILT, ids=["sound", "flash empty", "jumpers"])
+@pytest.mark.usefixtures("opened")
+def test_a_replayed_trace_comes_to_the_same_end(rig_file, board, capsys, tmp_path, spoil):
+    spoil(board)
+    trace = str(tmp_path / "day.jsonl")
+    status = run(rig_file(), "check", "RH", "--trace", trace)
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
+    assert run(rig_file(), "replay", trace) == status
+    again = capsys.readouterr().out.splitlines()
+    assert [line for line in again if line.startswith("RH")] == told
+    assert again[0].startswith("replayed from")
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_trace_holds_both_directions_and_every_change_of_a_line(rig_file, tmp_path):
+    trace = tmp_path / "day.jsonl"
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
+    lines = [json.loads(line) for line in trace.read_text().splitlines()]
+    assert (lines[0]["trace"], lines[0]["board"], lines[0]["place"]) == (1, "RH", "FTRH")
+    assert [r["level"] for r in lines if r.get("line") == "NRST"] == [0, 1]
+    levels = [r["level"] for r in lines if r.get("line") == "HOST_INTR"]
+    assert levels == [n % 2 for n in range(len(levels))]  # each a change
+    said = "".join(r.get("in", "") for r in lines)
+    assert said.count("badccdab") == levels.count(1)
+    assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_replay_against_another_rig_names_the_line_where_they_differ(rig, rig_file, capsys, tmp_path):
+    trace = str(tmp_path / "day.jsonl")
+    assert run(rig_file(), "check", "RH", "--trace", trace) == 0
+    path = rig_file(msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=40)))
+    assert run(path, "replay", trace) == 1
+    assert "of the trace: the host does" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "text", ["", "hello\n", "{}\n", '{"trace": 2}\n', '{"trace": 1, "board": "RH"}\n{"out": "00"}\n']
+)
+def test_what_is_no_trace_is_named(rig_file, capsys, tmp_path, text):
+    (tmp_path / "a").write_text(text)
+    assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
+    assert "--trace FILE" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_trace_cut_off_anywhere_replays_to_its_end(rig_file, capsys, tmp_path):
+    trace = tmp_path / "day.jsonl"
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
+    data = trace.read_bytes()
+    for size in range(200, len(data), len(data) // 15):
+        (tmp_path / "cut").write_bytes(data[:size])
+        capsys.readouterr()
+        assert run(rig_file(), "replay", str(tmp_path / "cut")) == 1
+        assert "the trace ends here" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_trace_is_played_to_a_simulated_board(rig_file, tmp_path):
+    trace = tmp_path / "day.jsonl"
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
+    same = replay(trace, lambda now: RadarBoard(now, flash=make_image()))
+    assert same == []
+    other = replay(trace, RadarBoard)  # its flash is empty
+    assert other
+    assert "board said" in other[0]

@@ -1,0 +1,254 @@
+"""Firmware that cannot brick a board: refused before a byte is sent, verified, and cut off anywhere recovered from."""
+
+from __future__ import annotations
+
+import zlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from polysight.host.radar.board import RadarBoard, State
+from polysight.host.radar.firmware import CHUNK_S, TO_FLASH, TO_RAM, check_image, file_chunks, read_image
+from polysight.host.radar.program import program
+from polysight.shared.errors import ConfigError, DeviceError
+from polysight.simulators.radars import Fault, make_image
+from polysight.simulators.radars import RadarBoard as Simulated
+from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+
+RIG = native_rig()
+DATA = make_image()
+IMAGE = check_image(DATA, "image.bin")
+FIRST_GENERATION = make_image(rom=bytes((1, 2, 5, 0, 18, 1, 1)))
+
+
+def with_crc(data: bytes) -> bytes:
+    return data + zlib.crc32(data).to_bytes(4, "little")
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "begins with 'nothing'"),
+        (b"Index: mmwave_dfp\n" * 400, "begins with 'Index: mmwav'"),
+        (bytes(7940), "begins with"),
+        (b"MSTR", "too few"),
+        (DATA[: len(DATA) // 2], "its header says 7940"),
+        (DATA + b"\0", "its header says 7940"),
+        (DATA[:-4], "CRC is missing"),
+        (DATA[:5000] + bytes((DATA[5000] ^ 4,)) + DATA[5001:], "CRC-32"),
+        (with_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
+        (with_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
+        (FIRST_GENERATION, "for devices of generation 1"),
+        (with_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
+    ],
+)
+def test_what_is_no_image_is_refused_with_the_reason(data, why):
+    with pytest.raises(ConfigError, match=why) as caught:
+        check_image(data, "image.bin")
+    assert "nothing was sent" in str(caught.value)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 8 * len(DATA) - 1))
+def test_no_flipped_bit_passes(bit):
+    data = bytearray(DATA)
+    data[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(ConfigError):
+        check_image(bytes(data), "image.bin")
+
+
+@settings(deadline=None)
+@given(st.integers(0, len(DATA) - 1))
+def test_no_part_of_an_image_passes(size):
+    with pytest.raises(ConfigError):
+        check_image(DATA[:size], "image.bin")
+
+
+def test_an_image_tells_what_it_patches_and_to_what(tmp_path):
+    (tmp_path / "a.bin").write_bytes(DATA)
+    image = read_image(tmp_path / "a.bin")
+    assert (image.name, image.rom, image.patches) == ("a.bin", (2, 2, 1, 7), ("2.2.2.0", "2.2.4.0"))
+
+
+@pytest.mark.parametrize("size", [1, 223, 224, 225, 456, 457, 1000])
+def test_parts_of_an_image_join_to_it(size):
+    image = bytes(n % 251 for n in range(size))
+    parts = file_chunks(image)
+    joined = b"".join(chunk.part for chunk, _ in parts)
+    assert joined == bytes((4, 0, 0, 0)) + size.to_bytes(4, "little") + image
+    assert all(len(chunk.part) <= 232 for chunk, _ in parts)
+    assert [remaining for _, remaining in parts] == list(reversed(range(len(parts))))
+
+
+def test_ti_s_image_begins_with_the_bytes_that_a_user_sent_to_ram():
+    """TI E2E 1267477: 35 parts, the first with type 0, length 7940 and the magic."""
+    first, remaining = file_chunks(DATA, TO_RAM)[0]
+    assert remaining == 0x22
+    assert first.part[:12].hex() == "00000000041f00004d535452"
+
+
+class PowerCut(BoardWords):
+    """Switches the board off when its host has written so many messages."""
+
+    def __init__(self, board, clock, after: int) -> None:
+        super().__init__(board, clock)
+        self.left = after
+
+    def write(self, words):
+        if words[0] == 0x1234:
+            self.left -= 1
+            if self.left == 0:
+                self.board.power(False)
+        super().write(words)
+
+
+def made(board: Simulated, clock: VirtualClock, firmware=None, words=None) -> RadarBoard:
+    return RadarBoard("RH", words or BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")), firmware)
+
+
+def ignored(sent: int, of: int) -> None: ...
+
+
+@pytest.fixture
+def new(clock) -> Simulated:
+    """A board on its first day: its flash is empty, and it reports the harmless fault."""
+    return Simulated(lambda: clock.time)
+
+
+@pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
+def test_a_new_board_works_from_ram_and_its_flash_is_left_alone(clock, fault_at):
+    board = Simulated(lambda: clock.time, fault_at=fault_at)
+    radar = made(board, clock, IMAGE)
+    radar.configure()
+    assert radar.state is State.CONFIGURED
+    assert board.cores.flash == b""
+    assert board.cores.ram == DATA
+    radar.arm(4)
+    radar.fail("asked to")
+    radar.arm(4)  # a reset empties the RAM
+    assert board.executed.count(0x4080) == 2 * len(file_chunks(DATA))
+
+
+def test_without_an_image_a_new_board_is_refused_and_the_remedy_named(new, clock):
+    radar = made(new, clock)
+    with pytest.raises(DeviceError, match="no patch") as caught:
+        radar.configure()
+    assert "image header" in caught.value.why  # what it said of itself
+    assert "polysight radar firmware" in caught.value.remedy
+
+
+def test_a_flash_that_holds_the_image_is_not_loaded_again(board, clock):
+    made(board, clock, IMAGE).configure()
+    assert 0x4080 not in board.executed
+
+
+@pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
+def test_the_flash_is_written_and_verified_by_a_start_from_it(clock, fault_at):
+    board = Simulated(lambda: clock.time, fault_at=fault_at)
+    radar = made(board, clock)
+    told: list[tuple[int, int]] = []
+    assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: told.append((sent, of)))
+    assert board.cores.flash == DATA
+    assert told[-1] == (35, 35)
+    radar.configure()
+    assert radar.state is State.CONFIGURED
+
+
+def test_the_slow_erase_is_waited_for(clock):
+    board = Simulated(lambda: clock.time, erase_s=0.9 * CHUNK_S)
+    made(board, clock).write_flash(IMAGE, ignored)
+    assert board.cores.flash == DATA
+
+
+def test_a_device_of_another_generation_is_sent_nothing(clock, monkeypatch):
+    board = Simulated(lambda: clock.time)
+    effect = board.cores._effect
+    monkeypatch.setattr(
+        board.cores, "_effect", lambda n, d: bytes((1, 2, 0, 1)) + effect(n, d)[4:] if n == 0x40E0 else effect(n, d)
+    )
+    for use in (lambda r: r.write_flash(IMAGE, ignored), lambda r: r.configure()):
+        with pytest.raises(ConfigError, match="generation 1"):
+            use(made(board, clock, IMAGE))
+    assert 0x4080 not in board.executed
+
+
+@pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])
+def test_whatever_the_flash_holds_a_download_cures_it(clock, broken):
+    board = Simulated(lambda: clock.time, flash=broken)
+    made(board, clock).write_flash(IMAGE, ignored)
+    made(board, clock).configure()
+
+
+@pytest.mark.parametrize("part", range(1, 37))
+def test_power_lost_at_any_part_is_recovered_from(clock, part):
+    """Part 36 is the version question after the last part; the first two messages are questions too."""
+    board = Simulated(lambda: clock.time, flash=make_image(4000))
+    radar = made(board, clock, words=PowerCut(board, clock, part + 1))
+    with pytest.raises(DeviceError):
+        radar.write_flash(IMAGE, ignored)
+    board.power(True)
+    rescued = made(board, clock, IMAGE)
+    rescued.configure()  # from RAM, whatever the flash holds
+    assert rescued.state is State.CONFIGURED
+    made(board, clock).write_flash(IMAGE, ignored)
+    made(board, clock).configure()
+
+
+def test_a_part_that_is_refused_is_named(new, clock, monkeypatch):
+    obey = new.cores._download
+    seen = []
+
+    def refuse_seventh(data, remaining):
+        seen.append(remaining)
+        return (7, b"", 0.0) if len(seen) == 7 else obey(data, remaining)
+
+    monkeypatch.setattr(new.cores, "_download", refuse_seventh)
+    with pytest.raises(DeviceError, match=r"part 7 of 35 of image.bin was not taken.*file CRC"):
+        made(new, clock).write_flash(IMAGE, ignored)
+
+
+def test_a_flash_that_does_not_keep_what_it_was_sent_is_noticed(new, clock, monkeypatch):
+    obey = new.cores._download
+
+    def forget(data, remaining):
+        told = obey(data, remaining)
+        new.cores.flash = new.cores.flash[:-1] + b"\xff"
+        return told
+
+    monkeypatch.setattr(new.cores, "_download", forget)
+    with pytest.raises(DeviceError, match="not from its flash"):
+        made(new, clock).write_flash(IMAGE, ignored)
+
+
+@pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
+def test_what_the_board_reports_afterwards_is_compared(new, clock, monkeypatch, reported, warned):
+    """Another patch than the file's is told; the old one, or none, is an error."""
+    effect = new.cores._effect
+
+    def answer(number, data):
+        told = effect(number, data)
+        return told[:10] + bytes(reported) if number == 0x40E0 and any(told[10:]) else told
+
+    monkeypatch.setattr(new.cores, "_effect", answer)
+    radar = made(new, clock, IMAGE)
+    if warned:
+        radar.configure()
+        assert any("reports patch 2.9.3.0 after the download" in line for line in radar.warnings)
+        return
+    with pytest.raises(DeviceError, match="no patch"):
+        radar.configure()
+    with pytest.raises(DeviceError, match=r"reports patch 0\.0\.0\.0"):
+        radar.write_flash(IMAGE, ignored)
+
+
+@pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.LOST_INTERRUPT, Fault.NACK, Fault.BAD_CHECKSUM])
+def test_a_disturbed_download_arrives_whole(new, clock, fault):
+    radar = made(new, clock)
+    radar._words.board.inject(fault, fault)
+    radar.write_flash(IMAGE, ignored)
+    assert new.cores.flash == DATA
+
+
+def test_types_of_places_are_the_document_s():
+    assert (TO_RAM, TO_FLASH) == (0, 4)

@@ -1,0 +1,86 @@
+"""Whatever fails, and whenever: no hang, no traceback, nothing accepted that is not so, and the right cause named."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections import Counter
+
+import pytest
+
+from polysight.host.radar.board import State
+from polysight.simulators.radars import RadarBoard as Simulated
+from tests.support.radar.boards import VirtualClock
+from tests.support.radar.faults import FRAMES, IMAGE, Case, Outcome, draw, run
+
+LONGEST_S = 45.0  # of virtual time: a bring-up whose every command is sent three times would be given up long before
+NAMED = 0.95
+
+
+@pytest.fixture(scope="module")
+def clean() -> Simulated:
+    """A board after a row without any fault."""
+    found = run(Case("none", ""), 10**9)
+    assert found.error is None
+    return found.board
+
+
+def accepted_rightly(found: Outcome, clean: Simulated) -> bool:
+    """A row that counts as done: the board was told what a sound one was, and made its frames."""
+    same = found.board.settings == clean.settings
+    return same and found.radar.state is State.DONE and found.board.cores.frames_left == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_random_faults(clean, request):
+    cases = 10_000 if request.config.getoption("--long") else 300
+    failed, unnamed = 0, []
+    kinds: Counter[str] = Counter()
+    for number in range(cases):
+        case, at = draw(random.Random(number))
+        found = run(case, at)
+        assert found.seconds < LONGEST_S, (number, case.name, at)
+        kinds[case.name.split(" 0x")[0]] += 1
+        if found.error is None:
+            assert accepted_rightly(found, clean), (number, case.name, at)
+            continue
+        failed += 1
+        said = f"{found.error.what} {found.error.why} {' '.join(found.radar.warnings)}"
+        if not re.search(case.cause, said, re.DOTALL):
+            unnamed.append((number, case.name, at, said))
+    print(f"{cases} faults, {failed} ended in an error, {len(unnamed)} of these without the right cause", dict(kinds))  # noqa: T201
+    for line in unnamed[:20]:
+        print(line)  # noqa: T201
+    assert failed > cases / 4
+    assert len(unnamed) <= (1 - NAMED) * failed
+
+
+OF_THE_BOARD = ("flash", "another board", "jumpers")
+
+
+def test_whatever_failed_between_them_the_next_row_runs_once_it_is_mended():
+    """A reset and a configuration bring every board back that is sound itself."""
+    for number in range(60):
+        case, at = draw(random.Random(number))
+        if case.name.startswith(OF_THE_BOARD):
+            continue
+        found = run(case, at)
+        found.heal()
+        found.radar.arm(FRAMES)
+        assert found.radar.state is State.ARMED, (number, case.name, at)
+
+
+def test_the_faults_strike(clean):
+    """Of the faults that are drawn most happen within the run: the law above is not one of faults that never come."""
+    del clean
+    struck = [run(*draw(random.Random(number))).struck for number in range(40)]
+    assert sum(struck) > 24
+
+
+def test_a_clean_run_is_done(clean):
+    assert len(clean.executed) > 20
+    assert clean.cores.flash == IMAGE.data
+    assert clean.armings == 1
+    assert FRAMES > 0
+    assert VirtualClock().now() > 0

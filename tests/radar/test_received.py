@@ -1,0 +1,160 @@
+"""Every message that a real device is known to have sent is understood."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+
+import pytest
+
+from polysight.host.radar.commands import GET_MAIN_VERSION, RF_POWER_UP, DeviceConfiguration, LowPower
+from polysight.host.radar.events import BOOT_STATUS, MAIN_CPU_FAULT, MAIN_POWER_UP, decode_event
+from polysight.host.radar.messages import Direction, Kind, SubBlock, decode, decode_header
+from polysight.host.radar.spi import Link
+from polysight.shared.errors import DeviceError
+from polysight.simulators.radars.wire import frame, ones_sum
+from tests.support.radar import received
+from tests.support.radar.boards import VirtualClock
+
+
+class Said:
+    """A device that says given messages: one after each command, or all at once."""
+
+    def __init__(self, *messages: bytes) -> None:
+        self.messages, self.out, self.waiting = list(messages), b"", False
+        self.written: list[bytes] = []
+
+    def write(self, words: Sequence[int]) -> None:
+        raw = b"".join(w.to_bytes(2, "little") for w in words)
+        self.written.append(raw)
+        if raw[:4] == bytes.fromhex("78566587"):
+            self.out, self.waiting = self.messages.pop(0), False
+        self.waiting = bool(self.messages) and (self.waiting or raw[:4] != bytes.fromhex("78566587"))
+
+    def read(self, count: int) -> list[int]:
+        part, self.out = self.out[: 2 * count].ljust(2 * count, b"\xff"), self.out[2 * count :]
+        if not self.out and self.messages:
+            self.waiting = True
+        return [int.from_bytes(part[n : n + 2], "little") for n in range(0, len(part), 2)]
+
+    def interrupt(self) -> bool:
+        return self.waiting
+
+    def reset(self, held: bool) -> None:
+        self.waiting = not held
+
+    def close(self) -> None: ...
+
+
+def link(*messages: bytes) -> tuple[Link, Said]:
+    said = Said(*messages)
+    return Link("RH", said, VirtualClock(), [].append), said
+
+
+@pytest.mark.parametrize("raw", received.ALL.values(), ids=received.ALL.keys())
+def test_every_received_message_is_decoded(raw):
+    message = decode(raw)
+    assert decode_header(raw).crc_bytes == (4 if raw is received.AWR2243_ERROR else 2)
+    assert message.kind in (Kind.RESPONSE, Kind.EVENT)
+
+
+def test_an_error_carries_message_id_0_and_names_error_and_sub_block():
+    message = decode(received.AWR2243_ERROR)
+    assert (message.message_id, message.sequence, message.direction) == (0, 10, Direction.RF_TO_HOST)
+    assert message.error == (62, 0x0105)
+
+
+def test_an_error_without_a_body_is_an_error():
+    message = decode(received.AWR1243_ERROR)
+    assert message.blocks == ()
+    assert message.error == (None, None)
+
+
+def test_an_acknowledgement_without_a_body_is_none():
+    assert decode(received.AWR1243_RF_UP).error is None
+
+
+@pytest.mark.parametrize("raw", [received.AWR1243_UP_EMPTY, received.AWR1243_UP_WRITTEN])
+def test_power_up_events_of_either_length_report_no_boot_error(raw):
+    event = decode_event(decode(raw).blocks[0])
+    assert (event.id, event.fatal, event.values["boot_errors"], event.values["tests_failed"]) == (
+        MAIN_POWER_UP,
+        False,
+        0,
+        0,
+    )
+    assert 1000 < event.values["power_up_us"] < 5000
+
+
+def test_the_fault_during_loading_is_a_register_that_read_back_wrong():
+    event = decode_event(decode(received.AWR2243_FAULT).blocks[0])
+    assert event.id == MAIN_CPU_FAULT
+    assert "register read-back" in event.detail
+
+
+def test_a_refusal_without_a_body_ends_the_command_at_once():
+    asked, said = link(received.AWR1243_ERROR)
+    with pytest.raises(DeviceError, match=r"refuses DeviceConfiguration.*does not say why"):
+        asked.call(DeviceConfiguration())
+    assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
+
+
+def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
+    asked, said = link(received.AWR2243_ERROR)
+    asked.sequence = 10
+    with pytest.raises(DeviceError, match=r"refuses LowPower.*error 62, sub-block 0x0105"):
+        asked.call(LowPower())
+    assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
+
+
+def test_an_acknowledgement_with_a_16_bit_crc_is_taken():
+    asked, _ = link(received.AWR1243_RF_UP)
+    assert asked.call(RF_POWER_UP).blocks == ()
+
+
+def test_a_refusal_of_another_sequence_is_late():
+    asked, _ = link(received.AWR2243_ERROR)
+    with pytest.raises(DeviceError, match="no valid answer"):
+        asked.call(DeviceConfiguration())
+    assert "late" in asked.warnings[0]
+
+
+def chunk(remaining: int, block: int, data: bytes) -> bytes:
+    """One of an answer's chunks, from the simulated device's encoder."""
+    raw = bytearray(frame(6, 1, 0x207, struct.pack("<2H", block, len(data) + 4) + data, 1, 0, True))
+    raw[10:12] = remaining.to_bytes(2, "little")
+    raw[14:16] = b"\0\0"
+    raw[14:16] = (0xFFFF - ones_sum(bytes(raw[4:14]))).to_bytes(2, "little")
+    return bytes(raw[:-4]) + zlib.crc32(bytes(raw[4:-4])).to_bytes(4, "little")
+
+
+def test_an_answer_in_chunks_is_joined():
+    asked, _ = link(chunk(2, 0x40E0, bytes(16)), chunk(1, 0x40E1, b"abcd"), chunk(0, 0x40E2, b"efgh"))
+    assert [b.data for b in asked.call(GET_MAIN_VERSION).blocks] == [bytes(16), b"abcd", b"efgh"]
+
+
+def test_a_chunk_that_is_missing_is_no_answer():
+    asked, _ = link(chunk(2, 0x40E0, bytes(16)), chunk(0, 0x40E2, b"efgh"))
+    with pytest.raises(DeviceError, match="parts of the answer are missing"):
+        asked.call(GET_MAIN_VERSION)
+
+
+@pytest.mark.parametrize(
+    ("bits", "meaning", "cure"),
+    [
+        (1 << 6, "no image header", "firmware"),
+        (1 << 30, "image header damaged", "firmware"),
+        (1 << 28, "main core's image not found", "firmware"),
+        (1 << 48, "crystal", "hardware"),
+        (1 << 55, "memory", "hardware"),
+        (1 << 9, "certificate", ""),
+        (1 << 47, "bit 47", ""),
+    ],
+)
+@pytest.mark.parametrize("number", [MAIN_POWER_UP, BOOT_STATUS])
+def test_boot_bits_are_told_by_what_they_mean(number, bits, meaning, cure):
+    event = decode_event(SubBlock(number, bytes(4) + bits.to_bytes(8, "little") + bytes(8)))
+    assert meaning in event.detail
+    assert event.values["cure"] == cure
+    assert not event.fatal

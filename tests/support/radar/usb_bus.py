@@ -1,0 +1,182 @@
+# ruff: noqa: ARG002 - pyusb names the arguments
+"""A USB bus with FT4232H chips, as a backend of pyusb: the real pyftdi and pyusb run on it.
+
+By the USB 2.0 descriptors, FTDI's vendor requests (as pyftdi and libftdi send them) and the data sheet: four interfaces
+of 512-byte packets, each packet from the chip begins with two status bytes, a read without data returns these alone. A
+chip that was pulled fails every transfer of handles opened before; plugged in again it has another address.
+"""
+
+from __future__ import annotations
+
+import errno
+from array import array
+from types import SimpleNamespace
+
+from usb.backend import IBackend
+from usb.core import USBError
+
+from polysight.simulators.radars import UsbChip
+
+VENDOR, PRODUCT = 0x0451, 0xFD03
+_PACKET = 512
+_STATUS = b"\x31\x60"
+_RESET, _SET_BITMODE, _SET_LATENCY = 0x00, 0x0B, 0x09
+BIT_BANG, MPSSE = 1, 2
+
+
+class Chip:
+    """One chip at a place of the bus."""
+
+    def __init__(self, chip: UsbChip, serial: str, path: tuple[int, ...] = (1,), bus: int = 1) -> None:
+        self.chip, self.serial, self.path, self.bus = chip, serial, path, bus
+        self.address, self.plugged = 0, False
+        self.modes: dict[int, tuple[int, int]] = {}
+        self.latency_ms: dict[int, int] = {}
+        self.errors: list[str] = []
+        self.transfers = 0
+        self.pull_at: int | None = None  # the transfer at which it is pulled
+
+
+class Bus(IBackend):
+    """The bus.
+
+    Attributes
+    ----------
+    packet
+        Bytes of data a read returns at most, to cut answers anywhere.
+    enumerations
+        How often the bus was looked at.
+    """
+
+    def __init__(self) -> None:
+        self.chips: list[Chip] = []
+        self.packet, self.enumerations, self._addresses = _PACKET - 2, 0, 1
+
+    def plug(self, chip: Chip) -> None:
+        """Plug a chip in, at an address that no chip had before."""
+        self._addresses += 1
+        chip.address, chip.plugged, chip.pull_at = self._addresses, True, None
+        chip.modes.clear()
+        if chip not in self.chips:
+            self.chips.append(chip)
+
+    def pull(self, chip: Chip) -> None:
+        """Pull it out."""
+        chip.plugged = False
+
+    # what pyusb calls
+
+    def enumerate_devices(self):
+        self.enumerations += 1
+        return iter([(chip, chip.address) for chip in self.chips if chip.plugged])
+
+    def get_device_descriptor(self, dev):
+        chip, address = dev
+        return SimpleNamespace(
+            bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=0, bDeviceSubClass=0, bDeviceProtocol=0,
+            bMaxPacketSize0=64, idVendor=VENDOR, idProduct=PRODUCT, bcdDevice=0x0800, iManufacturer=1, iProduct=2,
+            iSerialNumber=3, bNumConfigurations=1, address=address, bus=chip.bus, port_number=chip.path[-1],
+            port_numbers=chip.path, speed=3,
+        )  # fmt: skip
+
+    def get_configuration_descriptor(self, dev, config):
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=2, wTotalLength=9, bNumInterfaces=4, bConfigurationValue=1, iConfiguration=0,
+            bmAttributes=0x80, bMaxPower=50, extra_descriptors=[],
+        )  # fmt: skip
+
+    def get_interface_descriptor(self, dev, intf, alt, config):
+        if intf >= 4 or alt:
+            raise IndexError("no such interface")
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0, bNumEndpoints=2,
+            bInterfaceClass=0xFF, bInterfaceSubClass=0xFF, bInterfaceProtocol=0xFF, iInterface=2, extra_descriptors=[],
+        )  # fmt: skip
+
+    def get_endpoint_descriptor(self, dev, ep, intf, alt, config):
+        if ep >= 2:
+            raise IndexError("no such endpoint")
+        return SimpleNamespace(
+            bLength=7, bDescriptorType=5, bEndpointAddress=(0x81 + 2 * intf, 0x02 + 2 * intf)[ep], bmAttributes=2,
+            wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
+        )  # fmt: skip
+
+    def open_device(self, dev):
+        self._check(dev)
+        return dev
+
+    def close_device(self, dev_handle) -> None: ...
+
+    def set_configuration(self, dev_handle, config_value) -> None:
+        self._check(dev_handle)
+
+    def get_configuration(self, dev_handle) -> int:
+        self._check(dev_handle)
+        return 1
+
+    def claim_interface(self, dev_handle, intf) -> None:
+        self._check(dev_handle)
+
+    def release_interface(self, dev_handle, intf) -> None:
+        self._check(dev_handle)
+
+    def is_kernel_driver_active(self, dev_handle, intf) -> bool:
+        self._check(dev_handle)
+        return False
+
+    def attach_kernel_driver(self, dev_handle, intf) -> None:
+        self._check(dev_handle)
+
+    def ctrl_transfer(self, dev_handle, bmRequestType, bRequest, wValue, wIndex, data, timeout):
+        chip = self._check(dev_handle)
+        if bmRequestType & 0x80:
+            return self._string(chip, wValue & 0xFF, data) if bRequest == 6 else self._fill(data, _STATUS)
+        channel = wIndex & 0xFF
+        if bRequest == _SET_BITMODE:
+            chip.modes[channel] = (wValue >> 8, wValue & 0xFF)
+        elif bRequest == _SET_LATENCY:
+            chip.latency_ms[channel] = wValue
+        elif bRequest == _RESET and wValue in (0, 1, 2):
+            chip.chip.give("ABCD"[channel - 1], 1 << 20)
+        return len(data)
+
+    def bulk_write(self, dev_handle, ep, intf, data, timeout) -> int:
+        chip, channel = self._check(dev_handle), (ep + 1) // 2
+        wanted = MPSSE if channel <= 2 else BIT_BANG
+        if chip.modes.get(channel, (0, 0))[0] != wanted:
+            chip.errors.append(f"written to channel {channel} in mode {chip.modes.get(channel)}")
+        chip.chip.take("ABCD"[channel - 1], bytes(data))
+        return len(data)
+
+    def bulk_read(self, dev_handle, ep, intf, buff, timeout) -> int:
+        chip, channel = self._check(dev_handle), (ep - 0x81) // 2 + 1
+        room = min(self.packet, _PACKET - 2, len(buff) - 2)
+        return self._fill(buff, _STATUS + chip.chip.give("ABCD"[channel - 1], room))
+
+    def _check(self, dev) -> Chip:
+        chip, address = dev
+        chip.transfers += 1
+        if chip.pull_at is not None and chip.transfers >= chip.pull_at:
+            chip.plugged = False
+        if not chip.plugged or chip.address != address:
+            raise USBError("No such device (it may have been disconnected)", -4, errno.ENODEV)
+        return chip
+
+    def _string(self, chip: Chip, number: int, data: array) -> int:
+        text = {1: "TI", 2: "AR-DevPack-EVM-012", 3: chip.serial}.get(number)
+        raw = b"\x04\x03\x09\x04" if text is None else bytes((2 + 2 * len(text), 3)) + text.encode("utf-16-le")
+        return self._fill(data, raw)
+
+    @staticmethod
+    def _fill(data: array, raw: bytes) -> int:
+        count = min(len(data), len(raw))
+        data[:count] = array("B", raw[:count])
+        return count
+
+
+BUS = Bus()
+
+
+def get_backend() -> Bus:
+    """What pyftdi asks its backends' modules for."""
+    return BUS

@@ -1,0 +1,82 @@
+"""One pulse of many chirps a position: what it does to synchronisation, in simulation."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from polysight.host.capture import row_words
+from polysight.host.sync import BoardSetup, synchronise_row
+from polysight.shared.raster import Burst, plan_raster
+from polysight.simulators.scene import SimulatedRig, decode_scene
+from polysight.simulators.scene.simulated_scan import row_offsets_mm
+from tests.support.rigs import published_rig
+
+COLUMNS = 24
+MANY = Burst(pulses=16, period_us=1500.0)
+ONE = Burst(pulses=1, chirps=16, chirp_us=143.0, period_us=2800.0)
+SCENE = decode_scene({"name": "the direct path and its disturbances", "seed": 7}, "test")
+
+
+def rig_with_burst(burst: Burst, speed_mm_s: float):
+    rig = published_rig()
+    return msgspec.structs.replace(
+        rig,
+        burst=burst,
+        grid=msgspec.structs.replace(rig.grid, columns=COLUMNS, rows=1),
+        stage=msgspec.structs.replace(rig.stage, speed_mm_s=speed_mm_s, travel_speed_mm_s=120.0),
+    )
+
+
+def direct_hz(burst: Burst, speed_mm_s: float):
+    """IF of the direct path as each chirp has it, and what synchronisation finds, [position]."""
+    rig = rig_with_burst(burst, speed_mm_s)
+    radar = SimulatedRig(rig, SCENE)
+    row = plan_raster(rig.grid).row(0)
+    x, y = row_offsets_mm(radar, row)
+    words = radar.chirps("RH", x, y, 0)
+    payload = words.reshape(-1).view(np.uint8)
+    decoded, valid = row_words(payload, [], len(x), rig.chirp.samples)
+    return synchronise_row(decoded, valid, BoardSetup.of(rig, rig.by_name("RH"))), rig
+
+
+@pytest.mark.parametrize(("burst", "speed_mm_s"), [(MANY, 20.0), (ONE, 20.0), (ONE, 100.0)])
+def test_every_position_is_synchronised(burst, speed_mm_s):
+    synced, _ = direct_hz(burst, speed_mm_s)
+    assert synced.valid.all()
+    assert synced.valid.size == COLUMNS
+
+
+def test_the_trigger_s_uncertainty_is_drawn_once_a_frame():
+    """Chirps of one frame share their timing; those of frames of their own differ by up to 5 ns a board."""
+    spread = {}
+    for name, burst in (("many", MANY), ("one", ONE)):
+        rig = rig_with_burst(burst, 20.0)
+        scene = decode_scene({"name": "x", "seed": 7, "disturbances": {"direct_snr_db": 60.0}}, "test")
+        radar = SimulatedRig(rig, scene)
+        chirps = radar.signals("RH", np.zeros(16 * 4), np.zeros(16 * 4), 0)[:, 0]
+        peak = np.abs(np.fft.fft(chirps * np.hanning(chirps.shape[1]), 1 << 16)).argmax(axis=1).reshape(4, 16)
+        spread[name] = peak.std(axis=1).mean() * rig.chirp.sample_rate_hz / (1 << 16)
+    assert spread["many"] > 30e3  # hertz; 5 ns at 38.8 MHz/us are 194 kHz
+    assert spread["one"] < 1e3
+
+
+def test_sixteen_chirps_in_one_frame_fit_five_times_the_speed():
+    """2 mm at 100 mm/s are 20 ms; sixteen pulses 1.5 ms apart last 24 ms."""
+    assert MANY.chirps_a_position == ONE.chirps_a_position == 16
+    assert len(ONE.chirp_times_s) == 16
+    assert ONE.chirp_times_s[-1] == pytest.approx(15 * 143e-6)
+    assert MANY.chirp_times_s[-1] == pytest.approx(15 * 1500e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "rule"),
+    [
+        ({"chirps": 16}, "need chirp_us"),
+        ({"chirps": 16, "chirp_us": 143.0, "period_us": 2000.0}, "period_us must be at least 2588 us"),
+    ],
+)
+def test_a_frame_that_does_not_fit_its_period_is_refused(values, rule):
+    with pytest.raises(ValueError, match=rule):
+        Burst(**{"pulses": 1, "period_us": 2800.0, **values})

@@ -77,7 +77,7 @@ pi-install: $(VENV)/installed  ## install or update the Pi half on a Pi: make pi
 	rm -rf $(OUT)/pi && mkdir -p $(OUT)/pi/sources
 	tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=build shared pi_controller | tar -x -C $(OUT)/pi/sources
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/pi_controller
-	cp pi_controller/install.sh pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
+	cp pi_controller/install.sh pi_controller/requirements.txt pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
 	tar -c -C $(OUT)/pi/copied . | ssh $(HOST) 'rm -rf $(ON_PI) && mkdir -p $(ON_PI) && tar -x -C $(ON_PI)'
 	ssh -t $(HOST) sudo $(ON_PI)/install.sh
 

@@ -170,7 +170,8 @@ class RowEnding:
         self._states.go(state)
 
     def emit(self, kind: Any, **fields: Any) -> None:
-        """Add an event to the ledger."""
+        """Add an event to the ledger; words are cut to what a reader takes."""
+        fields = {k: v[: m.MOST_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
         self._ledger.add(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
 
     def _finish_when_complete(self, row: RunningRow) -> None:

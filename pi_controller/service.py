@@ -6,11 +6,12 @@ import signal
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from polysight.pi_controller import realtime
 from polysight.pi_controller.executor import Executor
-from polysight.pi_controller.journal import JournalFolder, JournalFullError
+from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, JournalFullError
 from polysight.pi_controller.ledger import Ledger
 from polysight.pi_controller.lines_gpiod import GpiodLines, load_gpiod
 from polysight.pi_controller.lines_gpiomem import GpiomemLines
@@ -110,7 +111,9 @@ class Service:
             )
             opened.callback(loop.stop)
             self._loop = loop
-            self.executor = Executor(stage, loop, self._ledger, check_width=not pi.one_shot)
+            turned = partial(realtime.notify_systemd, "WATCHDOG=1")
+            self.executor = Executor(stage, loop, self._ledger, not pi.one_shot, turned)
+            folder.write_secret(TAKE_OVER_KEY, self.executor.take_over_key)
             stage.connect()
             self._opened = opened.pop_all()
 
@@ -169,6 +172,7 @@ def run(instrument: Instrument, options: Options) -> int:
             signal.signal(number, lambda *_: service.stop())
         sys.stdout.write(f"ready {service.server.command_address}\nevents {service.server.event_address}\n")
         sys.stdout.flush()
+        realtime.notify_systemd("READY=1")
         service.serve()
     finally:
         service.close()

@@ -58,6 +58,8 @@ class PiFault(IntEnum):
     BAD_REQUEST = 112
     ABORTED = 113
     VERSION = 114
+    NOT_OWNER = 115
+    PROGRAM = 116
 
 
 EXPLANATIONS: dict[int, Explanation] = {
@@ -185,6 +187,16 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the peer speaks another major version",
         "host and Pi are of different releases",
         "install the same release on both",
+    ),
+    PiFault.NOT_OWNER: Explanation(
+        "the run belongs to another program",
+        "only the program that began the run may command it",
+        "command it there; a person at the Pi takes over with `polysight-pi take-over hold|resume|abort|end`",
+    ),
+    PiFault.PROGRAM: Explanation(
+        "the Pi's program failed at this command",
+        "a fault of this program, or it hangs",
+        "see `journalctl -u polysight-pi` and report it; systemd starts a hanging program again",
     ),
 }
 

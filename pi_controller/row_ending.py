@@ -115,7 +115,7 @@ class RowEnding:
         counts = self._loop.disarm()
         if row.status is None and not row.judge(counts):
             self._tell_fault(row.fault, row.reason)
-        self.emit(m.RowFinished, **row.outcome(counts))
+        self.emit(m.RowFinished, **row.outcome(counts), timed_by=self._loop.timed_by(row.job.spec))
         self.row = None
         self._go("fault" if row.latch else "ready" if self.homed else "idle")  # a row has a run
         self._row_ended(row)

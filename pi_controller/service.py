@@ -15,7 +15,8 @@ from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, Journa
 from polysight.pi_controller.ledger import Ledger
 from polysight.pi_controller.lines_gpiod import GpiodLines, load_gpiod
 from polysight.pi_controller.lines_gpiomem import GpiomemLines
-from polysight.pi_controller.lines_wires import WireLines
+from polysight.pi_controller.lines_spi import SpiLines
+from polysight.pi_controller.lines_wires import SpiWireLines, WireLines
 from polysight.pi_controller.server import Server
 from polysight.pi_controller.stage_driver import StageDriver
 from polysight.pi_controller.stage_link import StageNews
@@ -45,9 +46,10 @@ def log(text: str) -> None:
     sys.stderr.flush()
 
 
-def gpio_lines(instrument: Instrument) -> type[GpiodLines]:
+def gpio_lines(instrument: Instrument) -> type[GpiodLines | SpiLines]:
     """Which lines drive the pins of this rig."""
-    return GpiomemLines if instrument.pi.wiring == "gpiomem" else GpiodLines
+    kinds: dict[str, type[GpiodLines | SpiLines]] = {"gpiomem": GpiomemLines, "spi": SpiLines}
+    return kinds.get(instrument.pi.wiring, GpiodLines)
 
 
 def open_lines(instrument: Instrument, wires: Path | None, model: str | None = None) -> TriggerLines:
@@ -59,7 +61,7 @@ def open_lines(instrument: Instrument, wires: Path | None, model: str | None = N
         when they cannot be had, or this wiring cannot work on this computer (`model`: what it calls itself).
     """
     if wires is not None:
-        return WireLines(wires, instrument.pi)
+        return (SpiWireLines if instrument.pi.wiring == "spi" else WireLines)(wires, instrument.pi)
     warning = check_wiring(instrument, read_model() if model is None else model)
     if warning:
         log(warning)

@@ -149,7 +149,7 @@ EXPLANATIONS: dict[int, Explanation] = {
     PiFault.PULSE_TOO_LONG: Explanation(
         "a SYNC_IN pulse may have been longer than 4 us",
         "the Pi was interrupted inside a pulse",
-        "fit a one-shot after the line; see docs/how-to/wiring.md",
+        'use wiring = "spi", or fit a one-shot after the line; see docs/how-to/wiring.md',
     ),
     PiFault.PERIOD_TOO_SHORT: Explanation(
         "two SYNC_IN pulses came closer than the radar allows",
@@ -191,7 +191,7 @@ EXPLANATIONS: dict[int, Explanation] = {
     PiFault.NOT_OWNER: Explanation(
         "the run belongs to another program",
         "only the program that began the run may command it",
-        "command it there; a person at the Pi takes over with `polysight-pi take-over hold|resume|abort|end`",
+        "command it there; a person at the Pi uses `polysight-pi take-over`",
     ),
     PiFault.PROGRAM: Explanation(
         "the Pi's program failed at this command",

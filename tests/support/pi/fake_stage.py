@@ -100,7 +100,7 @@ class FakeStage:
                 self.moving = False
                 if self.banner:
                     time.sleep(0.05)  # a boot, and the port's flush on opening
-                    self.say(Reply("banner", fields={"fw": "fake", "proto": "1"}))
+                    self.say(Reply("banner", fields={"fw": "fake", "proto": "2"}))
             open_before = is_open
             if not is_open:
                 time.sleep(0.005)

@@ -110,6 +110,9 @@ def _home(args: argparse.Namespace) -> int:
     status = home_by_service(instrument)
     if status is not None:
         _tell_position(args, status.x_mm, status.y_mm)
+        if status.lost_x_mm or status.lost_y_mm:
+            lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
+            sys.stderr.write(f"polysight-pi: steps were lost since the homing before: {lost}; look at the drive\n")
         return 0
     with bench_stage(instrument.stage, _port(args, instrument)) as stage:
         here = stage.home()

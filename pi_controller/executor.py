@@ -391,6 +391,8 @@ class Executor:
                 last_seq=self._ledger.last_seq,
                 fault=machine.fault,
                 reason=machine.reason,
+                lost_x_mm=machine.lost_mm[0],
+                lost_y_mm=machine.lost_mm[1],
             ),
             machine.stage.firmware,
             self._run is not None,

@@ -292,7 +292,9 @@ class Refused(_Message, frozen=True, kw_only=True):
 
 
 class StatusReply(_Message, frozen=True, kw_only=True):
-    """Everything the Pi knows about itself. `row_index` is -1 when no row runs."""
+    """Everything the Pi knows about itself. `row_index` is -1 when no row runs. `lost_x_mm`, `lost_y_mm`: how far the
+    motors were off when the last homing met the switches, since the homing before it.
+    """
 
     state: State
     homed: bool
@@ -306,6 +308,8 @@ class StatusReply(_Message, frozen=True, kw_only=True):
     last_seq: Seq
     fault: Number
     reason: Text
+    lost_x_mm: Place = 0.0
+    lost_y_mm: Place = 0.0
 
 
 class ReplayReply(_Message, frozen=True, kw_only=True):

@@ -27,9 +27,9 @@ test: $(VENV)/installed  ## install what is missing, then run every test
 	@./tests/install-tools.sh
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
 
-test-long: $(VENV)/installed  ## tests at full length: 10,000 random rows, 10,000 faults of a radar link, 50 kills (an hour)
+test-long: $(VENV)/installed  ## tests at full length: 10,000 random rows, 100,000 messages, 10,000 faults of a radar link, 50 kills (hours)
 	@./tests/install-tools.sh
-	$(BIN)/python -m pytest tests/stage tests/store tests/calibration/test_metal.py tests/e2e/test_killed_processes.py tests/radar/test_random_faults.py -n $(JOBS) --dist loadgroup --long
+	$(BIN)/python -m pytest tests/stage tests/store tests/pi/test_hostile_messages.py tests/calibration/test_metal.py tests/e2e/test_killed_processes.py tests/radar/test_random_faults.py -n $(JOBS) --dist loadgroup --long
 
 test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode Linux built from Debian's source (10 minutes, once)
 	@./tests/install-tools.sh kernel
@@ -77,7 +77,7 @@ pi-install: $(VENV)/installed  ## install or update the Pi half on a Pi: make pi
 	rm -rf $(OUT)/pi && mkdir -p $(OUT)/pi/sources
 	tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=build shared pi_controller | tar -x -C $(OUT)/pi/sources
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/pi_controller
-	cp pi_controller/install.sh pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
+	cp pi_controller/install.sh pi_controller/requirements.txt pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
 	tar -c -C $(OUT)/pi/copied . | ssh $(HOST) 'rm -rf $(ON_PI) && mkdir -p $(ON_PI) && tar -x -C $(ON_PI)'
 	ssh -t $(HOST) sudo $(ON_PI)/install.sh
 

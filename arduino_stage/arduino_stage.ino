@@ -11,8 +11,11 @@ void setup() {
 }
 
 void loop() {
+  uno_alive();
+  // At most one line a turn, and none while its answer has no room: whatever comes, the stage is looked after.
   uint8_t byte;
-  while (uno_read(byte)) protocol.receive(byte);
-  if (uno_lost()) protocol.lost();
+  bool line = false;
+  while (!line && Protocol::ready() && uno_read(byte)) line = protocol.receive(byte);
+  if (Protocol::ready() && uno_lost()) protocol.lost();
   protocol.poll(millis());
 }

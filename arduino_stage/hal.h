@@ -17,6 +17,8 @@ void hal_directions(bool x_positive, bool y_positive);
 
 void hal_enable(bool on);
 void hal_trigger_width(uint16_t us);
+// Room for so many bytes more; hal_write() of no more than that returns at once.
+uint8_t hal_room();
 void hal_write(const char* text, uint8_t length);
 uint16_t hal_steps_per_mm();
 

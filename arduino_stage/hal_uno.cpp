@@ -3,6 +3,7 @@
 
 #include <Arduino.h>
 #include <avr/interrupt.h>
+#include <avr/wdt.h>
 
 #include "motion_step.h"
 
@@ -20,6 +21,7 @@ constexpr uint16_t PULSE_TICKS = board::TICK_HZ / 1000000 * board::STEP_PULSE_US
 // Bytes between an interrupt and the main program; one side puts, the other takes.
 class Ring {
  public:
+  uint8_t room() const { return (uint8_t)(tail_ - head_ - 1) & (SIZE - 1); }
   bool empty() const { return head_ == tail_; }
   bool put(uint8_t byte) {
     const uint8_t next = (head_ + 1) & (SIZE - 1);
@@ -93,7 +95,11 @@ void uno_begin() {
   UBRR0 = (uint16_t)((F_CPU / 4 / board::BAUD - 1) / 2);
   UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);  // 8 data bits, no parity, one stop bit
   UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
+  MCUSR = 0;
+  wdt_enable(WDTO_250MS);
 }
+
+void uno_alive() { wdt_reset(); }
 
 bool uno_read(uint8_t& byte) {
   if (received.empty()) return false;
@@ -110,7 +116,7 @@ bool uno_lost() {
 ISR(USART_RX_vect) {
   const bool damaged = UCSR0A & (_BV(FE0) | _BV(DOR0));
   const uint8_t byte = UDR0;
-  if (!damaged && stage.immediate(byte)) return;
+  if (stage.immediate(damaged ? 0 : byte)) return;
   if (!received.put(damaged ? 0 : byte)) overflowed = true;
 }
 
@@ -122,7 +128,7 @@ ISR(USART_UDRE_vect) {
   }
 }
 
-// Measured worst case: 740 cycles from entry to reti (a ramp step of both axes; avr-gcc 5.4, emulated UNO), of the 800
+// Measured worst case: 755 cycles from entry to reti (a ramp step of both axes; avr-gcc 5.4, emulated UNO), of the 800
 // between two steps at MAX_RATE. Where other interrupts come in between, later steps catch up.
 ISR(TIMER1_COMPA_vect) {
   const uint8_t out = motion.step(pressed());
@@ -181,6 +187,8 @@ void hal_trigger_width(uint16_t us) {
   InterruptLock lock;
   trigger_ticks = us < 4 ? 8 : us * 2;  // a compare value nearer than this might pass before its flag is cleared
 }
+
+uint8_t hal_room() { return to_send.room(); }
 
 void hal_write(const char* text, uint8_t length) {
   while (length--) {

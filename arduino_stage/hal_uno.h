@@ -11,6 +11,9 @@ extern Stage stage;
 // Set up pins, timer 1 and the serial line.
 void uno_begin();
 
+// The main program lives: without this for 250 ms the watchdog resets the board, which stops the motors.
+void uno_alive();
+
 // The next received byte that is not an immediate one; false when there is none.
 bool uno_read(uint8_t& byte);
 

@@ -26,6 +26,7 @@ int8_t sign(int32_t v) { return v > 0 ? 1 : v < 0 ? -1 : 0; }
 void Motion::reset() {
   stepping_ = hold_ = reached_ = cruise_ = false;
   x_ = y_ = 0;
+  stable_ = looks_ = 0;
   left_ = ramp_ = ramp_full_ = 0;
   major_ = minor_ = error_ = 0;
   points_left_ = 0;
@@ -78,6 +79,11 @@ void Motion::start(const Leg& leg) {
   if (left_ == 0) return;
   hal_directions(leg.dx >= 0, leg.dy >= 0);
   resume_leg();
+}
+
+void Motion::look_at_switches() {
+  InterruptLock lock;
+  look(hal_inputs());
 }
 
 void Motion::resume() {

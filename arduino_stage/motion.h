@@ -35,6 +35,12 @@ class Motion {
   // Plan a leg and start the step timer.
   void start(const Leg& leg);
 
+  // Look at the switches: what differs from before counts after board::LOOKS looks. step() does it by itself; the main
+  // program does it each millisecond while the stage rests.
+  void look_at_switches();
+  // The switches that count as pressed.
+  uint8_t inputs() const { return seen(stable_); }
+
   // In the step interrupt: make the step that is due. Returns bits of Output: what to pulse now.
   uint8_t step(uint8_t inputs);
 
@@ -66,6 +72,7 @@ class Motion {
 
  private:
   void resume_leg();
+  void look(uint8_t inputs);
 
   // The main program's look at what the step interrupt writes: read anew each time. More than a byte: under a lock.
   template <class T>
@@ -75,6 +82,7 @@ class Motion {
 
   // The step interrupt's own while stepping_, the main program's otherwise. The first ones are the nearest to the
   // object's address, which the AVR reaches fastest.
+  uint8_t stable_, looks_;
   uint32_t left_;  // steps
   uint32_t ramp_;  // steps to a stop from the present speed
   uint32_t speed_q16_, accel_q20_;  // steps/s x 2^16; steps/s per tick x 2^20

@@ -35,8 +35,19 @@ IN_INTERRUPT uint16_t ticks_of(uint16_t v) {
   return quotient;
 }
 
+IN_INTERRUPT void Motion::look(uint8_t inputs) {
+  if (inputs == stable_) {
+    looks_ = 0;
+  } else if (++looks_ >= board::LOOKS) {
+    stable_ = inputs;
+    looks_ = 0;
+  }
+}
+
 IN_INTERRUPT uint8_t Motion::step(uint8_t inputs) {
   if (!stepping_ || left_ == 0) return 0;
+  look(inputs);
+  inputs = stable_;
   if (inputs & EMERGENCY) {
     fault_ = ERROR_EMERGENCY_STOP;
   } else if (!until_ && (inputs & SWITCHES)) {

@@ -59,7 +59,7 @@ static void send(Line& line) {
 
 void Protocol::reset() {
   length_ = 0;
-  overlong_ = greeted_ = fresh_ = last_is_motion_ = false;
+  overlong_ = greeted_ = fresh_ = last_is_motion_ = end_due_ = alarm_due_ = false;
   last_sequence_ = last_crc_ = motion_sequence_ = 0;
   last_error_ = outcome_alarm_ = ERROR_NONE;
   outcome_ = PENDING;
@@ -71,7 +71,7 @@ void Protocol::banner() {
   send(line);
 }
 
-void Protocol::receive(uint8_t byte) {
+bool Protocol::receive(uint8_t byte) {
   if (byte == '\n') {
     if (overlong_) {
       send_error(ERROR_LINE_TOO_LONG);
@@ -80,11 +80,14 @@ void Protocol::receive(uint8_t byte) {
     }
     length_ = 0;
     overlong_ = false;
-  } else if (length_ < MAX_LINE_BYTES - 1) {
+    return true;
+  }
+  if (length_ < MAX_LINE_BYTES - 1) {
     line_[length_++] = (char)byte;
   } else {
     overlong_ = true;
   }
+  return false;
 }
 
 void Protocol::take_line() {
@@ -197,23 +200,30 @@ StageError Protocol::execute(const Request& request, bool& motion) {
 void Protocol::repeat() {
   if (last_error_ != ERROR_NONE) return send_error(last_error_, last_sequence_);
   send_ok(last_sequence_, false);
-  if (last_is_motion_ && outcome_ == DONE) send_done();
-  if (last_is_motion_ && outcome_ == ALARMED) send_alarm(outcome_alarm_);
+  end_due_ = last_is_motion_ && outcome_ != PENDING;
 }
 
 void Protocol::poll(uint32_t now_ms) {
   const Event event = stage_.service(now_ms);
   if (event == EVENT_DONE) {
     outcome_ = DONE;
-    send_done();
+    end_due_ = true;
   } else if (event == EVENT_ALARM) {
     if (outcome_ == PENDING) {
       outcome_ = ALARMED;
       outcome_alarm_ = stage_.alarm();
     }
+    alarm_due_ = true;
+  }
+  if (end_due_ && ready()) {
+    end_due_ = false;
+    outcome_ == DONE ? send_done() : send_alarm(outcome_alarm_);
+  }
+  if (alarm_due_ && ready()) {
+    alarm_due_ = false;
     send_alarm(stage_.alarm());
   }
-  if (stage_.take_status_request()) send_status();
+  if (ready() && stage_.take_status_request()) send_status();
 }
 
 void Protocol::send_ok(uint16_t sequence, bool hello) {
@@ -244,6 +254,7 @@ void Protocol::send_done() {
   if (stage_.in_row()) line.field("points", m.points()).field("pulses", m.pulses());
   line.field("x", m.x()).field("y", m.y());
   if (stage_.in_row()) line.field("held", stage_.held());
+  if (stage_.homing()) line.field("lostx", stage_.lost_x()).field("losty", stage_.lost_y());
   send(line);
 }
 

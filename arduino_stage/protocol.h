@@ -4,7 +4,7 @@
 
 #include "stage.h"
 
-constexpr uint8_t PROTOCOL_VERSION = 1;
+constexpr uint8_t PROTOCOL_VERSION = 2;
 constexpr uint8_t MAX_LINE_BYTES = 96;  // with checksum and line end
 #define FIRMWARE_VERSION "0.1.0"
 
@@ -34,8 +34,10 @@ class Protocol {
   void reset();
   void banner();
 
-  // One received byte that is not an immediate one.
-  void receive(uint8_t byte);
+  // One received byte that is not an immediate one. True when it ended a line.
+  bool receive(uint8_t byte);
+  // Whether the answer to a line would find room: only then is one taken, so that no reply keeps the program waiting.
+  static bool ready() { return hal_room() >= MAX_LINE_BYTES; }
   // Received bytes were lost before they came here: whatever they were, the host hears of it.
   void lost() { send_error(ERROR_LINE_TOO_LONG); }
   void poll(uint32_t now_ms);
@@ -74,5 +76,6 @@ class Protocol {
   uint16_t motion_sequence_;  // of the last motion command
   bool last_is_motion_;
   Outcome outcome_;
+  bool end_due_, alarm_due_;  // what has not found room yet: how the last motion ended, an alarm
   StageError outcome_alarm_;
 };

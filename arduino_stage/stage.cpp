@@ -2,9 +2,11 @@
 
 void Stage::reset() {
   heard_ = status_requested_ = resume_requested_ = stop_requested_ = false;
+  byte_seen_ = resume_begun_ = false;
+  quiet_ = true;
   activity_ = IDLE;
   alarm_ = stopping_ = ERROR_NONE;
-  enabled_ = homed_ = held_ = row_command_ = started_ = false;
+  enabled_ = homed_ = held_ = row_command_ = homing_command_ = started_ = knew_ = false;
   phase_ = 0;
   row_ = Leg();
   row_y_ = 0;
@@ -14,7 +16,9 @@ void Stage::reset() {
   travel_rate_ = board::DEFAULT_TRAVEL_RATE;
   heartbeat_ms_ = board::DEFAULT_HEARTBEAT_MS;
   trigger_us_ = board::DEFAULT_TRIGGER_US;
-  heard_ms_ = 0;
+  heard_ms_ = byte_ms_ = looked_ms_ = 0;
+  accel_ = board::DEFAULT_ACCEL;
+  lost_x_ = lost_y_ = 0;
 }
 
 StageError Stage::set(int32_t parameter, int32_t value) {
@@ -24,6 +28,7 @@ StageError Stage::set(int32_t parameter, int32_t value) {
   switch (parameter) {
     case PARAMETER_ACCEL:
       if (v < board::MIN_ACCEL || v > board::MAX_ACCEL) return ERROR_OUT_OF_RANGE;
+      accel_ = v;
       motion_.set_accel(v);
       return ERROR_NONE;
     case PARAMETER_HEARTBEAT:
@@ -76,6 +81,7 @@ void Stage::begin(Activity activity) {
   activity_ = activity;
   held_ = started_ = false;
   row_command_ = activity == TRAVEL;
+  homing_command_ = activity == HOMING;
   motion_.abandon();
   motion_.clear_counts();
   heard_ = true;
@@ -93,6 +99,8 @@ StageError Stage::home() {
   const StageError refused = ready();
   if (refused != ERROR_NONE) return refused;
   begin(HOMING);
+  motion_.set_accel(board::HOME_ACCEL);
+  knew_ = homed_;
   homed_ = false;
   phase_ = 0;
   return ERROR_NONE;
@@ -149,19 +157,26 @@ StageError Stage::row(int32_t x0, int32_t pitch, int32_t points, int32_t y, int3
 
 StageError Stage::clear() {
   if (busy()) return ERROR_BUSY;
-  if (hal_inputs() & EMERGENCY) return ERROR_EMERGENCY_STOP;
+  if ((hal_inputs() | motion_.inputs()) & EMERGENCY) return ERROR_EMERGENCY_STOP;
   alarm_ = ERROR_NONE;
   return ERROR_NONE;
 }
 
 bool Stage::immediate(uint8_t byte) {
+  const bool alone = quiet_, confirmed = resume_begun_;
+  quiet_ = false;
+  byte_seen_ = true;
+  resume_begun_ = byte == IMMEDIATE_RESUME;
   switch (byte) {
     case IMMEDIATE_HOLD:
       motion_.hold();
       resume_requested_ = false;
       break;
     case IMMEDIATE_RESUME:
-      resume_requested_ = true;
+      if (confirmed) {
+        resume_begun_ = false;
+        resume_requested_ = true;
+      }
       break;
     case IMMEDIATE_STATUS:
       status_requested_ = true;
@@ -173,8 +188,27 @@ bool Stage::immediate(uint8_t byte) {
     default:
       return false;
   }
-  heard_ = true;
+  if (alone) heard_ = true;
   return true;
+}
+
+void Stage::listen(uint32_t now_ms) {
+  if (byte_seen_) {
+    byte_seen_ = false;
+    byte_ms_ = now_ms;
+  } else if (now_ms - byte_ms_ >= board::QUIET_MS) {
+    quiet_ = true;
+  }
+  if (heard_) {
+    heard_ = false;
+    heard_ms_ = now_ms;
+  }
+}
+
+void Stage::look_at_switches(uint32_t now_ms) {
+  if (now_ms == looked_ms_ || motion_.stepping()) return;
+  looked_ms_ = now_ms;
+  motion_.look_at_switches();
 }
 
 bool Stage::take_status_request() {
@@ -185,6 +219,7 @@ bool Stage::take_status_request() {
 
 Event Stage::raise(StageError alarm, bool position_lost) {
   motion_.abandon();
+  motion_.set_accel(accel_);
   activity_ = IDLE;
   stopping_ = ERROR_NONE;
   stop_requested_ = resume_requested_ = false;
@@ -194,15 +229,13 @@ Event Stage::raise(StageError alarm, bool position_lost) {
 }
 
 Event Stage::service(uint32_t now_ms) {
-  if (heard_) {
-    heard_ = false;
-    heard_ms_ = now_ms;
-  }
+  listen(now_ms);
+  look_at_switches(now_ms);
   // The step interrupt tells a fault before it stops: look in the opposite order, or a fault passes for a normal end.
   const bool stepping = motion_.stepping(), finished = motion_.finished();
   const StageError fault = motion_.fault();
   if (fault != ERROR_NONE) return raise(fault, true);
-  if ((hal_inputs() & EMERGENCY) && alarm_ != ERROR_EMERGENCY_STOP) return raise(ERROR_EMERGENCY_STOP, true);
+  if ((motion_.inputs() & EMERGENCY) && alarm_ != ERROR_EMERGENCY_STOP) return raise(ERROR_EMERGENCY_STOP, true);
 
   if (!busy()) {
     if (stop_requested_) {
@@ -257,7 +290,13 @@ Event Stage::next_homing_leg() {
     if (started_) {
       const bool as_wanted = motion_.reached() == (step != 2);
       if (!as_wanted) return raise(ERROR_HOMING_FAILED, true);
-      if (step == 2) phase_ < 3 ? motion_.set_x(0) : motion_.set_y(0);
+      if (phase_ == 2) {
+        lost_x_ = knew_ ? -motion_.x() : 0;
+        motion_.set_x(0);
+      } else if (phase_ == 5) {
+        lost_y_ = knew_ ? -motion_.y() : 0;
+        motion_.set_y(0);
+      }
       phase_++;
     }
     if (phase_ < 6) {
@@ -289,6 +328,7 @@ Event Stage::next_homing_leg() {
     motion_.set_x(0);
     motion_.set_y(0);
   }
+  motion_.set_accel(accel_);
   homed_ = true;
   activity_ = IDLE;
   motion_.abandon();

@@ -19,7 +19,7 @@ enum Parameter : uint8_t {
 // Bytes that act at once; shared/stage_line.py has the same list.
 enum Immediate : uint8_t {
   IMMEDIATE_HOLD = 0x81,
-  IMMEDIATE_RESUME = 0x82,
+  IMMEDIATE_RESUME = 0x9D,  // twice; three bits away from every other byte of the line
   IMMEDIATE_STATUS = 0x84,
   IMMEDIATE_STOP = 0x88,
 };
@@ -39,7 +39,7 @@ class Stage {
   StageError row(int32_t x0, int32_t pitch, int32_t points, int32_t y, int32_t rate);
   StageError clear();
 
-  // True when the byte was one of Immediate. Safe in the receive interrupt.
+  // Every received byte. True when it was one of Immediate. Safe in the receive interrupt.
   bool immediate(uint8_t byte);
   bool take_status_request();
   void heard() { heard_ = true; }  // the host is alive
@@ -53,6 +53,9 @@ class Stage {
   bool held() const { return held_; }  // the row was interrupted by HOLD
   bool in_row() const { return row_command_; }  // the last motion command was a row
   StageError alarm() const { return alarm_; }
+  bool homing() const { return homing_command_; }  // the last motion command was a homing
+  int32_t lost_x() const { return lost_x_; }  // steps lost since the homing before, found by this one
+  int32_t lost_y() const { return lost_y_; }
   const Motion& motion() const { return motion_; }
 
  private:
@@ -64,15 +67,21 @@ class Stage {
   bool within(int32_t x, int32_t y) const;
   void begin(Activity activity);
   void go(int32_t x, int32_t y, uint16_t rate);
+  void look_at_switches(uint32_t now_ms);
+  void listen(uint32_t now_ms);
 
   Motion& motion_;
   volatile bool heard_, status_requested_, resume_requested_, stop_requested_;
+  volatile bool byte_seen_, quiet_;  // quiet_: no byte came for QUIET_MS
+  volatile bool resume_begun_;       // the byte before was a RESUME
   Activity activity_;
   StageError alarm_, stopping_;  // stopping_: alarm to raise when the stage has slowed down
-  bool enabled_, homed_, held_, row_command_, started_;
+  bool enabled_, homed_, held_, row_command_, homing_command_, started_, knew_;  // knew_: was homed before this homing
   uint8_t phase_;  // of homing
   Leg row_;
   int32_t row_y_, travel_x_, travel_y_, backlash_;
   uint16_t travel_rate_, heartbeat_ms_, trigger_us_;
-  uint32_t heard_ms_;
+  uint32_t heard_ms_, byte_ms_, looked_ms_;
+  uint32_t accel_;
+  int32_t lost_x_, lost_y_;
 };

@@ -8,9 +8,11 @@ checked before a pulse is made, and the width after.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
-from polysight.pi_controller.trigger_lines import TriggerLines
+from polysight.pi_controller.spi_pulses import SpiBurst, longest_pause_ns, spi_burst
+from polysight.pi_controller.trigger_lines import BitLines, TriggerLines
 from polysight.shared.config import Burst
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, MAX_WIDTH_NS, MIN_PERIOD_NS
@@ -19,6 +21,10 @@ from polysight.shared.units import us_to_ns
 # From edge to first pulse. A fixed delay longer than the usual wake-up keeps the pulses of all positions at the same
 # place behind their edges; 200 us are 4 um of travel at 20 mm/s.
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
+
+
+# A transfer that is over sooner than this part of its length was clocked too fast: the frames came too soon.
+SHORTEST_PART = 0.98
 
 
 class BurstSpec(NamedTuple):
@@ -72,15 +78,13 @@ def send_burst(
 ) -> BurstRecord:
     """Send the pulses at `start_ns + k * period`, k = 0 .. pulses - 1.
 
-    When `start_ns` has passed already, all deadlines move with the first pulse: the period matters, not the phase.
-    Deadlines are computed from the first, so that lateness of one pulse never shifts the next.
+    When `start_ns` has passed already, all deadlines move with the first pulse: the period matters, not the phase. They
+    are computed from the first, so that lateness of one pulse never shifts the next.
 
     Parameters
     ----------
-    lines
-        The lines and their clock.
-    spec
-        How many pulses, how far apart, how wide.
+    lines, spec
+        The lines and their clock; how many pulses, how far apart, how wide.
     start_ns
         Deadline of the first pulse.
     previous_rise_ns
@@ -91,9 +95,11 @@ def send_burst(
     Returns
     -------
     BurstRecord
-        with `fault` PERIOD_TOO_SHORT when a pulse was left out because it would have come too early for the radar, or
-        PULSE_TOO_LONG when one may have been longer than 4 us. Either ends the burst.
+        `fault`: PERIOD_TOO_SHORT when a pulse was left out that would have come too early for the radar, or
+        PULSE_TOO_LONG when one may have been longer than 4 us.
     """
+    if isinstance(lines, BitLines):
+        return _send_bits(lines, spec, start_ns, previous_rise_ns, stop)
     start_ns = max(start_ns, lines.now_ns())
     sent = width_max = jitter = 0
     first = last = end = start_ns
@@ -122,3 +128,45 @@ def send_burst(
             break
     lines.flush()
     return BurstRecord(sent, first, last, end, width_max, jitter, int(fault))
+
+
+@lru_cache(maxsize=16)
+def bits_of(spec: BurstSpec, bufsiz: int) -> SpiBurst:
+    """The transfer of a burst, made once. Raises ConfigError when spidev does not take it."""
+    return spi_burst(spec.pulses, spec.period_ns, spec.width_ns, bufsiz)
+
+
+def _send_bits(
+    lines: BitLines, spec: BurstSpec, start_ns: int, previous_rise_ns: int | None, stop: Callable[[], bool]
+) -> BurstRecord:
+    """Send the burst as one transfer; once begun it goes to its end.
+
+    The clock is measured by each transfer: a bit lasts at most the time that the system call took, by the number of its
+    bits. A clock that is not the one asked for (a Pi whose core clock changes) is a fault before it spoils a scan.
+    """
+    burst = bits_of(spec, lines.bufsiz)
+    lead_ns = round(burst.bits[0] * burst.bit_ns)
+    begin_ns = max(start_ns - lead_ns, lines.now_ns())
+    if previous_rise_ns is not None and begin_ns + lead_ns - previous_rise_ns < MIN_PERIOD_NS:
+        return BurstRecord(0, start_ns, start_ns, start_ns, 0, 0, int(PiFault.PERIOD_TOO_SHORT))
+    lines.sleep_until(begin_ns)
+    if stop():
+        return BurstRecord(0, start_ns, start_ns, start_ns, 0, 0)
+    before_ns, after_ns = lines.transfer(burst)
+    lines.flush()
+    took_ns = after_ns - before_ns
+    spare_ns = max(0, took_ns - round(burst.duration_ns))  # somewhere in it the controller began
+    first_ns = before_ns + spare_ns // 2 + lead_ns
+    last_ns = first_ns + round((burst.bits[-1] - burst.bits[0]) * burst.bit_ns)
+    width_ns = round(max(burst.bit_ns, took_ns / (8 * len(burst.data))))
+    jitter_ns = before_ns - begin_ns + (spare_ns + 1) // 2
+    if any(
+        round(k * spec.period_ns * burst.clock_hz / 1e9) * 1e9 != k * spec.period_ns * burst.clock_hz for k in (1, 2)
+    ):
+        jitter_ns += longest_pause_ns(burst)
+    fault = 0
+    if took_ns < SHORTEST_PART * burst.duration_ns:
+        fault = int(PiFault.PERIOD_TOO_SHORT)
+    elif spec.check_width and width_ns > MAX_WIDTH_NS:
+        fault = int(PiFault.PULSE_TOO_LONG)
+    return BurstRecord(spec.pulses, first_ns, last_ns, after_ns, width_ns, jitter_ns, fault)

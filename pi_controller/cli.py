@@ -110,6 +110,9 @@ def _home(args: argparse.Namespace) -> int:
     status = home_by_service(instrument)
     if status is not None:
         _tell_position(args, status.x_mm, status.y_mm)
+        if status.lost_x_mm or status.lost_y_mm:
+            lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
+            sys.stderr.write(f"polysight-pi: steps were lost since the homing before: {lost}; look at the drive\n")
         return 0
     with bench_stage(instrument.stage, _port(args, instrument)) as stage:
         here = stage.home()
@@ -137,12 +140,30 @@ def _events(args: argparse.Namespace) -> int:
 
 
 def _keys(args: argparse.Namespace) -> int:
-    from polysight.pi_controller.keys import COPY, make_keys
+    from polysight.pi_controller.keys import COPY, allow, make_keys, read_allowed, revoke
 
     folder = args.dir or Path(load_instrument(args.config).pi.key_dir)
+    if args.revoke:
+        revoke(folder, args.revoke)
+    if args.client:
+        for path in allow(folder, args.client):
+            _write(str(path))
+        _write(f"copy them to that client as host.key and host.key_secret, with {folder / 'pi.key'}")
+    if args.revoke or args.client or args.list:
+        for key, name in read_allowed(folder).items():
+            _write(f"allowed: {key} {name}")
+        return 0
     for path in make_keys(folder, args.replace):
         _write(str(path))
     _write(COPY)
+    return 0
+
+
+def _take_over(args: argparse.Namespace) -> int:
+    from polysight.pi_controller.client import take_over
+
+    instrument = load_instrument(args.config)
+    _write(f"the state is {take_over(instrument, args.what, args.journal or Path(instrument.pi.journal_dir))}")
     return 0
 
 
@@ -175,6 +196,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_bench(add)
     _add_events(add)
     _add_keys(add)
+    _add_take_over(add)
     return parser
 
 
@@ -246,6 +268,15 @@ def _add_keys(add: AddCommand) -> None:
     p = add("keys", _keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys")
     p.add_argument("--dir", type=Path, metavar="DIR", help="folder, instead of pi.key_dir")
     p.add_argument("--replace", action="store_true", help="replace keys that are there already")
+    p.add_argument("--client", metavar="NAME", help="make keys for one more client, and allow it")
+    p.add_argument("--revoke", metavar="NAME", help="allow this client no more, at once")
+    p.add_argument("--list", action="store_true", help="list the clients that are allowed")
+
+
+def _add_take_over(add: AddCommand) -> None:
+    p = add("take-over", _take_over, "command a run that another program began, as a person at the Pi", "abort")
+    p.add_argument("what", choices=("hold", "resume", "abort", "end"), help="what to do with it")
+    _journal(p)
 
 
 def _positive(text: str) -> int:

@@ -11,16 +11,21 @@ import msgspec
 import zmq
 
 from polysight.pi_controller.bringup import MOTION_LIMIT_S
+from polysight.pi_controller.finding import AS_THE_SERVICE
+from polysight.pi_controller.journal import TAKE_OVER_KEY
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument
-from polysight.shared.errors import DeviceError, PolysightError
+from polysight.shared.errors import DeviceError, PolysightError, os_error
 from polysight.shared.sockets import Socket, requester, subscriber
 
 HELLO_LIMIT_MS = 500
 
 
 def _ask(socket: Socket, command: m.AnyCommand, limit_ms: float) -> m.AnyReply | None:
-    socket.send(m.pack(command))
+    try:
+        socket.send(m.pack(command))
+    except zmq.Again:  # nobody to send to
+        return None
     return m.unpack_reply(socket.recv()) if socket.poll(round(limit_ms)) else None
 
 
@@ -76,6 +81,41 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
         raise DeviceError("homing has not ended", "the motors stall", "look at the stage")
     finally:
         context.destroy(linger=0)
+
+
+def take_over(instrument: Instrument, what: str, journal: Path) -> str:
+    """Hold, resume, abort or end the run that is begun, whoever began it; returns the state after it.
+
+    Raises
+    ------
+    DeviceError
+        when the service refuses or is silent, or the key of the person at the Pi cannot be read.
+    """
+    try:
+        owner = (journal / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
+    except OSError as e:
+        raise os_error(e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE) from None
+    context: zmq.Context[Socket] = zmq.Context()
+    limit_ms = instrument.limits.command_timeout_s * 1e3
+    try:
+        socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
+        status = _ask(socket, m.Status(), limit_ms)
+        if not isinstance(status, m.StatusReply):
+            raise _silent(instrument.pi.command_address)
+        reason = "a person at the Pi took over"
+        commands: dict[str, m.AnyCommand] = {
+            "hold": m.Hold(owner=owner), "resume": m.Resume(owner=owner), "abort": m.Abort(reason=reason, owner=owner),
+        }  # fmt: skip
+        if what == "end":
+            commands["end"] = m.EndRun(scan_id=status.scan_id, exit_status="abort", reason=reason, owner=owner)
+        reply = _ask(socket, commands[what], limit_ms)
+    finally:
+        context.destroy(linger=0)
+    if isinstance(reply, m.Accepted):
+        return reply.state
+    if isinstance(reply, m.Refused):
+        raise DeviceError(f"{what} was refused: {reply.what}", reply.why, reply.remedy)
+    raise _silent(instrument.pi.command_address)
 
 
 def follow_events(instrument: Instrument, limit_s: float) -> Iterator[Any]:

@@ -7,7 +7,10 @@ command does in each state.
 from __future__ import annotations
 
 import queue
+import secrets
 import threading
+import time
+import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,14 +26,18 @@ from polysight.pi_controller.stage_link import StageLost, StageNews
 from polysight.pi_controller.states import MOVING
 from polysight.pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
 from polysight.shared import messages as m
-from polysight.shared.errors import DataError, ProtocolError
+from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.stage_line import Reply
 from polysight.shared.units import us_to_ns
 
 EVENTS_PER_TURN = 256
+TURN_S = 1.0  # the executor turns at least so often: whoever sees it stand still for HUNG_S knows that it hangs
+HUNG_S = 10.0
+WAITING = 64  # commands that may wait for the executor
 REPLAYED_IN_A_ROW = 20  # events a reply while a row runs: many are long calls that keep the trigger thread waiting
-OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # only the run's host sends these; anybody may send the others
+OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # name the run: its host lives
+OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # refused to whom the run does not belong
 
 
 class Request(NamedTuple):
@@ -49,6 +56,13 @@ class Snapshot(NamedTuple):
     placing: dict[str, float]
 
 
+def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
+    """A refusal in words of bounded length; what is not said is the table's."""
+    table = explain(number)
+    words = (what, why or table.why, remedy or table.remedy)
+    return m.Refused(number=int(number), **dict(zip(("what", "why", "remedy"), (w[:1000] for w in words), strict=True)))
+
+
 class Executor:
     """Runs in a thread of its own; :meth:`post` and :attr:`snapshot` are for all threads.
 
@@ -58,10 +72,26 @@ class Executor:
         The stage, the trigger loop and the events.
     check_width
         Whether a pulse that may have been too long is a fault (no hardware one-shot).
+    turned
+        Called with every turn, once a second at least: feeds the watchdog.
+
+    Attributes
+    ----------
+    take_over_key
+        Owner that every run obeys besides its own: of the person at the Pi.
     """
 
-    def __init__(self, stage: StageDriver, loop: TriggerLoop, ledger: Ledger, check_width: bool = True) -> None:
-        self._loop, self._ledger, self._check_width = loop, ledger, check_width
+    def __init__(
+        self,
+        stage: StageDriver,
+        loop: TriggerLoop,
+        ledger: Ledger,
+        check_width: bool = True,
+        turned: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._loop, self._ledger, self._check_width, self._turned = loop, ledger, check_width, turned
+        self.take_over_key = secrets.token_hex(16)
+        self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._machine = Machine(Parts(stage, loop, ledger, self._inbox.put, self._row_ended))
         self._run: m.BeginRun | None = None
@@ -80,14 +110,22 @@ class Executor:
         """Hand something over; returns at once."""
         self._inbox.put(item)
 
-    def host_alive(self, scan_id: str) -> m.Accepted | m.Refused:
+    def full(self) -> bool:
+        """Whether so many commands wait that another one is not taken."""
+        return self._inbox.qsize() > WAITING
+
+    @property
+    def stands_still_s(self) -> float:
+        """For how long the executor has not turned; below :data:`HUNG_S` unless it hangs."""
+        return time.monotonic() - self._turned_s
+
+    def host_alive(self, scan_id: str, owner: str) -> m.Accepted | m.Refused:
         """The host of this run was heard. Answers at once, whatever the executor does."""
         run = self._run
         if run is None or run.scan_id != scan_id:
-            e = explain(PiFault.NOT_READY)
-            return m.Refused(
-                number=int(PiFault.NOT_READY), what=f"run {scan_id} is not begun", why=e.why, remedy="BeginRun"
-            )
+            return refused(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
+        if run.owner != owner:
+            return refused(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
         self._machine.hear_host()
         return m.Accepted(state=self.snapshot.status.state)
 
@@ -113,7 +151,8 @@ class Executor:
 
     def _turn(self) -> None:
         try:
-            item = self._inbox.get(timeout=self._machine.seconds_left())
+            left_s = self._machine.seconds_left()
+            item = self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S))
             for _ in range(EVENTS_PER_TURN):
                 self._take(item)
                 item = self._inbox.get_nowait()
@@ -131,10 +170,14 @@ class Executor:
         for request, reply in replies:
             self._hear(request.command)
             request.answer(reply)
+        self._turned_s = time.monotonic()
+        self._turned()
 
     def _hear(self, command: m.AnyCommand) -> None:
         """A command of this run's host is being answered: until its reply is out, no `Alive` can come."""
-        if isinstance(command, OF_THE_RUN) and self._run is not None and command.scan_id == self._run.scan_id:
+        run = self._run
+        mine = run is not None and (run.scan_id, run.owner)
+        if isinstance(command, OF_THE_RUN) and (command.scan_id, command.owner) == mine:
             self._machine.hear_host()
 
     def _take(self, item: Any) -> None:
@@ -147,15 +190,11 @@ class Executor:
             self._pulsing.clear()
         elif isinstance(item, LoopFault):
             self._machine.take_loop_fault(item)
-            lost = explain(item.number)
-            refused = m.Refused(number=item.number, what=item.detail, why=lost.why, remedy=lost.remedy)
-            self._replies += [(request, refused) for request in self._pulsing]  # REP owes every request a reply
+            reply = refused(item.number, item.detail)
+            self._replies += [(request, reply) for request in self._pulsing]  # every request gets a reply
             self._pulsing.clear()
         elif isinstance(item, Request):
-            try:
-                reply = self._on_command(item)
-            except RefusedError as e:
-                reply = m.Refused(number=e.number, what=e.what, why=e.why, remedy=e.remedy)
+            reply = self._reply_to(item)
             self._hear(item.command)  # before the limits are looked at: it may have taken long
             if reply is not None:
                 self._replies.append((item, reply))
@@ -168,12 +207,28 @@ class Executor:
 
     # --- commands ---------------------------------------------------------------------------------------------------
 
+    def _reply_to(self, request: Request) -> m.AnyReply | None:
+        """Whatever a command leads to, it ends in a reply: no message ends this program."""
+        try:
+            return self._on_command(request)
+        except RefusedError as e:
+            return refused(e.number, e.what, e.why, e.remedy)
+        except PolysightError as e:
+            return refused(PiFault.BAD_REQUEST, e.what, e.why, e.remedy)
+        except OSError as e:
+            return refused(PiFault.BAD_REQUEST, os_error(e).what, "the system refuses it", "look at the Pi's disk")
+        except Exception as e:  # noqa: BLE001 - told to the client, and in the log
+            traceback.print_exc()
+            return refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
+
     def _on_command(self, request: Request) -> m.AnyReply | None:
         command = request.command
         if isinstance(command, m.Replay):
             return self._replay(command)
         if self._ending:
             raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
+        if isinstance(command, OWNED):
+            self._check_owner(command.owner)
         if isinstance(command, m.BeginRun):
             return self._begin(request, command)
         if isinstance(command, m.EndRun):
@@ -193,6 +248,11 @@ class Executor:
             return self._accept()
         raise RefusedError(PiFault.BAD_REQUEST, f"{type(command).__name__} is not answered here")
 
+    def _check_owner(self, owner: str) -> None:
+        """Refuse who neither began the run nor stands at the Pi. Raises RefusedError."""
+        if self._run is not None and owner not in (self._run.owner, self.take_over_key):
+            raise RefusedError(PiFault.NOT_OWNER, f"run {self._run.scan_id} is another program's")
+
     def _replay(self, command: m.Replay) -> m.ReplayReply:
         limit = command.limit
         if self._machine.row is not None:
@@ -204,10 +264,7 @@ class Executor:
                     "ask again when the row has ended",
                 )
             limit = min(limit, REPLAYED_IN_A_ROW)
-        try:
-            return self._ledger.replay(command.scan_id, command.from_seq, limit)
-        except (DataError, ProtocolError) as e:
-            raise RefusedError(PiFault.BAD_REQUEST, e.what, e.why, e.remedy) from None
+        return self._ledger.replay(command.scan_id, command.from_seq, limit)
 
     def _accept(self) -> m.Accepted:
         return m.Accepted(state=self._machine.state)
@@ -222,18 +279,15 @@ class Executor:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
         spec = check_pulses(command.pulses, command.period_us, command.width_us, self._check_width)
         if spec.pulses * spec.period_ns > m.MOST_PULSES_S * 1e9:
-            raise RefusedError(
-                PiFault.NOT_READY,
-                f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MOST_PULSES_S:g} s",
-                "nothing else is answered meanwhile",
-                "ask for fewer pulses",
-            )
+            lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MOST_PULSES_S:g} s"
+            raise RefusedError(PiFault.NOT_READY, lasts, "the lines are busy meanwhile", "ask for fewer pulses")
         self._pulsing.append(request)
         self._loop.send(spec)
 
     def _begin(self, request: Request, run: m.BeginRun) -> m.AnyReply | None:
         check_run(run, self._machine.stage.config)
-        if self._run is not None and run.scan_id != self._run.scan_id and self._machine.host_lives:
+        other = self._run is not None and (run.scan_id, run.owner) != (self._run.scan_id, self._run.owner)
+        if self._run is not None and other and self._machine.host_lives:
             raise RefusedError(
                 PiFault.NOT_READY,
                 f"run {self._run.scan_id} is begun, and its host lives",
@@ -256,8 +310,6 @@ class Executor:
             resumed, lost = self._ledger.open(run.scan_id, run.plan, run.last_seq)
         except JournalFullError as e:
             raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
-        except (DataError, ProtocolError) as e:
-            raise RefusedError(PiFault.BAD_REQUEST, e.what, e.why, e.remedy) from None
         self._run, self._last_row = None, None  # whichever was begun: the ledger is this scan's now
         self._machine.end_run()
         self._keep(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
@@ -339,6 +391,8 @@ class Executor:
                 last_seq=self._ledger.last_seq,
                 fault=machine.fault,
                 reason=machine.reason,
+                lost_x_mm=machine.lost_mm[0],
+                lost_y_mm=machine.lost_mm[1],
             ),
             machine.stage.firmware,
             self._run is not None,

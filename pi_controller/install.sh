@@ -1,29 +1,67 @@
 #!/usr/bin/env bash
 # Installs or updates the Pi half on a Raspberry Pi: `make pi-install HOST=user@address` builds its wheel, copies
 # it with this file and runs it there with sudo. May be run again; the rig file and the keys that are there stay.
-# The first run fetches the libraries from the internet; later ones need none, unless a release needs another library.
+# The first run fetches the libraries from the internet, in the versions of requirements.txt; later ones need none, unless
+# a release needs another library. Each release has a folder of its own, /opt/polysight/releases/N, and
+# /opt/polysight/venv is a link to the one in use: `install.sh --roll-back` goes back to the one before it.
 # Not run on hardware yet.
 set -euo pipefail
 copied=$(cd "$(dirname "$0")" && pwd)
 root=${ROOT:-} # another place than /, to try it out
-pip="$root/opt/polysight/venv/bin/pip"
+opt="$root/opt/polysight"
 export PIP_DISABLE_PIP_VERSION_CHECK=1
+
+use() { # make a release the one in use, in one step
+  ln -sfn "releases/$1" "$opt/venv.new"
+  mv -T "$opt/venv.new" "$opt/venv"
+}
+in_use() { basename "$(readlink "$opt/venv")"; }
+
+if [ "${1:-}" = --roll-back ]; then
+  before=$(find "$opt/releases" -mindepth 1 -maxdepth 1 -printf '%f\n' | sort -n | awk -v n="$(in_use)" '$1 < n' | tail -n 1)
+  [ -n "$before" ] || { echo "There is no release before the one in use." >&2; exit 5; }
+  use "$before"
+  systemctl try-restart polysight-pi
+  echo "Release $before is in use again."
+  exit
+fi
 
 python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
   echo "Python 3.11 or newer is needed: Raspberry Pi OS 12 (bookworm) or newer" >&2
   exit 2
 }
-getent group gpio >/dev/null || groupadd --system gpio
+for group in gpio spi; do
+  getent group "$group" >/dev/null || groupadd --system "$group"
+done
 getent passwd polysight >/dev/null ||
-  useradd --system --user-group --groups gpio,dialout --no-create-home --shell /usr/sbin/nologin polysight
+  useradd --system --user-group --groups gpio,spi,dialout --no-create-home --shell /usr/sbin/nologin polysight
 
-mkdir -p "$root/opt/polysight" "$root/etc/polysight/keys" "$root/etc/udev/rules.d" "$root/etc/systemd/system"
-[ -x "$pip" ] || python3 -m venv "$root/opt/polysight/venv"
-"$pip" install --quiet --retries 1 "$copied"/*.whl || {
+mkdir -p "$opt/releases" "$root/etc/polysight/keys" "$root/etc/udev/rules.d" "$root/etc/systemd/system"
+if [ -d "$opt/venv" ] && [ ! -L "$opt/venv" ]; then # installed before there were releases
+  mv "$opt/venv" "$opt/releases/0"
+  use 0
+fi
+last=$(find "$opt/releases" -mindepth 1 -maxdepth 1 -name '[0-9]*' -printf '%f\n' | sort -n | tail -n 1)
+new="$opt/releases/$((${last:-0} + 1))"
+rm -rf "$opt/releases/unfinished"
+if [ -n "$last" ]; then
+  cp -a "$opt/venv/." "$opt/releases/unfinished" # with its libraries
+else
+  python3 -m venv "$opt/releases/unfinished"
+fi
+mv "$opt/releases/unfinished" "$new"
+python="$new/bin/python"
+"$python" -m pip install --quiet --retries 1 --constraint "$copied/requirements.txt" "$copied"/*.whl || {
+  rm -rf "$new"
   echo "A library is missing and cannot be fetched: connect this Pi to the internet once, and run this again." >&2
   exit 5
 }
-"$pip" install --quiet --no-index --no-deps --force-reinstall "$copied"/*.whl # the same version may have other content
+# The same version may have other content.
+"$python" -m pip install --quiet --no-index --no-deps --force-reinstall "$copied"/*.whl
+use "$(basename "$new")"
+find "$opt/releases" -mindepth 1 -maxdepth 1 -name '[0-9]*' -printf '%f\n' | sort -n | head -n -3 |
+  while read -r old; do rm -rf "${opt:?}/releases/$old"; done # three are kept
+
 [ -e "$root/etc/polysight/instrument.toml" ] || cp "$copied/instrument.toml" "$root/etc/polysight/instrument.toml"
 chown polysight: "$root/etc/polysight/keys"
 chmod 700 "$root/etc/polysight/keys"
@@ -36,7 +74,7 @@ systemctl daemon-reload
 systemctl enable polysight-pi
 systemctl try-restart polysight-pi # a running one goes on with the new release; one that is not running stays so
 
-echo "Installed. After the first time, on the Pi:"
+echo "Installed as release $(in_use); back to the one before: sudo $0 --roll-back. After the first time, on the Pi:"
 echo "  edit /etc/polysight/instrument.toml, or copy the host's"
 echo "  sudo -u polysight /opt/polysight/venv/bin/polysight-pi keys --dir /etc/polysight/keys"
 echo "  sudo -u polysight /opt/polysight/venv/bin/polysight-pi check --config /etc/polysight/instrument.toml"

@@ -28,6 +28,7 @@ MAX_RECORD_BYTES = 1 << 20
 CAPTURE_BYTES = 320  # a position's record takes less
 SPARE_BYTES = 4 << 20  # faults, rows taken again
 SEARCHED_BYTES = 1 << 20  # behind damage, for a good record
+TAKE_OVER_KEY = "take-over-key"  # file beside the journals: owner of every run, for the person at the Pi
 DAMAGED = ".damaged"  # suffix of the copy that is kept of a damaged journal
 _HEAD = struct.Struct("<III")
 
@@ -271,6 +272,16 @@ class JournalFolder:
     def open(self, scan_id: str) -> Journal:
         """The journal of a scan, made when absent."""
         return Journal(self.path_of(scan_id))
+
+    def write_secret(self, name: str, secret: str) -> None:
+        """Write a file that this program's user alone can read. Raises ConfigError."""
+        path = self.path / name
+        try:
+            path.unlink(missing_ok=True)
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as file:
+                file.write(secret)
+        except OSError as e:
+            raise ConfigError(f"{path}: {e.strerror}", "the disk is full or read-only", "free space there") from None
 
     def check_room(self, scan_id: str, positions: int) -> None:
         """Refuse a scan for whose journal, or the rest of it, the disk has no room. Raises JournalFullError."""

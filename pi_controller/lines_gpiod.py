@@ -151,6 +151,39 @@ class MonotonicClock:
             pass
 
 
+class TriggerInput:
+    """The trigger input: rising edges with kernel time stamps, on their clock.
+
+    Raises
+    ------
+    DeviceError
+        when the chip or the line cannot be had.
+    """
+
+    def __init__(self, pi: Pi, gpiod: Any, chip_path: str | None = None, clock: Clock | None = None) -> None:
+        clock = clock or MonotonicClock()
+        self.now_ns, self.sleep_until = clock.now_ns, clock.sleep_until
+        self._events: deque[Any] = deque()
+        path = chip_path or find_chip(pi.gpio_chip, gpiod)
+        self._input = request(gpiod, path, (pi.trigger_in,), trigger_settings(pi, gpiod), EVENT_BUFFER)
+
+    def wait_edge(self, limit_s: float) -> Edge | None:
+        """The next rising edge. Raises DeviceError when the line is gone."""
+        try:
+            if not self._events and self._input.wait_edge_events(timedelta(seconds=limit_s)):
+                self._events.extend(self._input.read_edge_events())
+        except OSError as e:
+            raise _gone(e) from None
+        if not self._events:
+            return None
+        event = self._events.popleft()
+        return Edge(event.timestamp_ns, event.line_seqno)
+
+    def close(self) -> None:
+        """Release the line."""
+        self._input.release()
+
+
 class GpiodLines:
     """Trigger input with kernel time stamps, SYNC_IN outputs with a defined inactive level.
 
@@ -177,31 +210,21 @@ class GpiodLines:
     name: str = GPIOD
 
     def __init__(self, pi: Pi, gpiod: Any, chip_path: str | None = None, clock: Clock | None = None) -> None:
-        clock = clock or MonotonicClock()
-        self.now_ns, self._clock = clock.now_ns, clock
         path = chip_path or find_chip(pi.gpio_chip, gpiod)
         line = gpiod.line
-        self._events: deque[Any] = deque()
         self._on = dict.fromkeys(pi.sync_out, line.Value.ACTIVE)
         self._off = dict.fromkeys(pi.sync_out, line.Value.INACTIVE)
         self._output = request(gpiod, path, pi.sync_out, output_settings(gpiod))
         try:
-            self._input = request(gpiod, path, (pi.trigger_in,), trigger_settings(pi, gpiod), EVENT_BUFFER)
+            self._input = TriggerInput(pi, gpiod, path, clock)
         except DeviceError:
             self._output.release()
             raise
+        self.now_ns = self._input.now_ns
 
     def wait_edge(self, limit_s: float) -> Edge | None:
         """The next rising edge. Raises DeviceError when the line is gone."""
-        try:
-            if not self._events and self._input.wait_edge_events(timedelta(seconds=limit_s)):
-                self._events.extend(self._input.read_edge_events())
-        except OSError as e:
-            raise _gone(e) from None
-        if not self._events:
-            return None
-        event = self._events.popleft()
-        return Edge(event.timestamp_ns, event.line_seqno)
+        return self._input.wait_edge(limit_s)
 
     def sleep_until(self, t_ns: int) -> None:
         """Return at `t_ns`, never before it.
@@ -210,9 +233,9 @@ class GpiodLines:
         processor's caches (measured on a busy machine: periods off by 0.8 instead of 5 us, pulses of 3.5 instead of 5).
         """
         if t_ns - self.now_ns() > SPIN_NS + WARM_NS:
-            self._clock.sleep_until(t_ns - WARM_NS)
+            self._input.sleep_until(t_ns - WARM_NS)
             self.set_output(False)
-        self._clock.sleep_until(t_ns)
+        self._input.sleep_until(t_ns)
 
     def set_output(self, active: bool) -> None:
         """Set all SYNC_IN lines in one call. Raises DeviceError when they are gone."""
@@ -230,7 +253,7 @@ class GpiodLines:
             self.set_output(False)
         finally:
             self._output.release()
-            self._input.release()
+            self._input.close()
 
 
 def _gone(e: OSError) -> DeviceError:

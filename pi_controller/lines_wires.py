@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from polysight.pi_controller.spi_pulses import DEFAULT_BUFSIZ, SpiBurst
 from polysight.pi_controller.trigger_lines import Edge
 from polysight.shared.config import Pi
 from polysight.shared.messages import WIRES
@@ -79,3 +80,20 @@ class WireLines:
             self.flush()
         finally:
             self._client.close()
+
+
+class SpiWireLines(WireLines):
+    """Simulated wires whose SYNC_IN is MOSI: the bits of a transfer become edges, each at its bit's wire time."""
+
+    bufsiz = DEFAULT_BUFSIZ
+
+    def transfer(self, burst: SpiBurst) -> tuple[int, int]:
+        """Play a transfer, most significant bit first; the line stays as the last bit left it."""
+        begin_ns = self._now_ns
+        for i, byte in enumerate(burst.data):
+            if byte or self._active:
+                for k in range(8):
+                    self._now_ns = begin_ns + round((8 * i + k) * burst.bit_ns)
+                    self.set_output(bool(byte << k & 0x80))
+        self._now_ns = begin_ns + round(burst.duration_ns)
+        return begin_ns, self._now_ns

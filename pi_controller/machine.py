@@ -40,6 +40,7 @@ class Machine(RowEnding):
         self._homing_underway = False
         self._resting, self._trigger = RestWatch(), TriggerWatch()
         self._dead_lines = False
+        self.lost_mm = (0.0, 0.0)
         self._status_told = 0.0
 
     # --- commands ---------------------------------------------------------------------------------------------------
@@ -198,6 +199,8 @@ class Machine(RowEnding):
             self.fail(PiFault.STAGE_ALARM, f"stage alarm {reply.number}: {e.what} ({e.why}); {e.remedy}")
         elif reply.kind == "done" and self._homing is not None and reply.sequence == self._homing:
             self.stage.note_position(reply)
+            k = self.stage.config.steps_per_mm
+            self.lost_mm = (_number(reply, "lostx") / k, _number(reply, "losty") / k)
             self._homing, self.homed = None, True
             self._limit.clear()
             self.stage.at_rest()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import socket
 import sys
+from contextlib import suppress
 
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
@@ -53,6 +55,14 @@ def _schedule(priority: int) -> list[str]:
         remedy = "set LimitRTPRIO=99 in the service"
         return [f"no real-time scheduling ({e.strerror}): other programs can delay a pulse; {remedy}"]
     return []
+
+
+def notify_systemd(state: str) -> None:
+    """Tell the service manager, if there is one (sd_notify(3)): `READY=1`, or `WATCHDOG=1` to be left alive."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if address:
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as s:
+            s.sendto(state.encode("ascii"), "\0" + address[1:] if address.startswith("@") else address)
 
 
 def die_with_parent(signal_number: int) -> None:

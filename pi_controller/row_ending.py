@@ -115,7 +115,7 @@ class RowEnding:
         counts = self._loop.disarm()
         if row.status is None and not row.judge(counts):
             self._tell_fault(row.fault, row.reason)
-        self.emit(m.RowFinished, **row.outcome(counts))
+        self.emit(m.RowFinished, **row.outcome(counts), timed_by=self._loop.timed_by(row.job.spec))
         self.row = None
         self._go("fault" if row.latch else "ready" if self.homed else "idle")  # a row has a run
         self._row_ended(row)
@@ -170,7 +170,8 @@ class RowEnding:
         self._states.go(state)
 
     def emit(self, kind: Any, **fields: Any) -> None:
-        """Add an event to the ledger."""
+        """Add an event to the ledger; words are cut to what a reader takes."""
+        fields = {k: v[: m.MOST_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
         self._ledger.add(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
 
     def _finish_when_complete(self, row: RunningRow) -> None:

@@ -1,7 +1,7 @@
-"""The Pi's two ZeroMQ sockets: events out (PUB), commands in and replies out (REP), in one thread.
+"""The Pi's two ZeroMQ sockets: events out (PUB), commands in and replies out (ROUTER), in one thread.
 
-Only this thread touches the sockets; others hand over bytes and wake it. One command is outstanding at a time, as REP
-wants it. Specification: docs/spec/wire.md.
+Only this thread touches the sockets; others hand over bytes and wake it. A ROUTER keeps each command's envelope, so
+that `Hello`, `Status` and `Alive` are answered while the executor works, or hangs. Specification: docs/spec/wire.md.
 """
 
 from __future__ import annotations
@@ -10,19 +10,23 @@ import math
 import os
 import queue
 import time
+import traceback
 from pathlib import Path
 from typing import Protocol
 
 import zmq
 
-from polysight.pi_controller.executor import Request, Snapshot
+from polysight.pi_controller.executor import HUNG_S, Request, Snapshot, refused
+from polysight.pi_controller.keys import AllowedKeys
 from polysight.shared import __version__
 from polysight.shared import messages as m
 from polysight.shared.errors import PolysightError, ProtocolError, VersionError
-from polysight.shared.faults import PiFault, explain
-from polysight.shared.sockets import EVENT_TOPIC, publisher, replier
+from polysight.shared.faults import PiFault
+from polysight.shared.sockets import EVENT_TOPIC, authenticator, is_loopback, publisher, replier
 
 LINGER_MS = 200
+REPLIES_WAITING = 1000  # for clients that do not read; what is more is dropped, and its client asks again
+Envelope = tuple[bytes, ...]
 
 
 class Answerer(Protocol):
@@ -31,11 +35,20 @@ class Answerer(Protocol):
     snapshot: Snapshot
     crash: BaseException | None
 
+    @property
+    def stands_still_s(self) -> float:
+        """For how long it has not turned."""
+        ...
+
+    def full(self) -> bool:
+        """Whether too many commands wait."""
+        ...
+
     def post(self, item: Request, /) -> None:
         """Take a command; its reply comes by the request's `answer`."""
         ...
 
-    def host_alive(self, scan_id: str, /) -> m.Accepted | m.Refused:
+    def host_alive(self, scan_id: str, owner: str, /) -> m.Accepted | m.Refused:
         """Take a sign of life."""
         ...
 
@@ -48,7 +61,7 @@ class Server:
     command_address, event_address
         `tcp://host:port`; the port may be `*`.
     key_dir
-        CURVE keys, for addresses that are not loopback.
+        CURVE keys, and which clients' are allowed, for addresses that are not loopback.
     heartbeat_ms
         Interval of heartbeat events.
     backend
@@ -65,7 +78,10 @@ class Server:
     ) -> None:
         self._heartbeat_ms, self._backend = heartbeat_ms, backend
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._allowed = AllowedKeys(key_dir)
+        self._secret = not is_loopback(command_address)
         try:
+            self._door = authenticator(self._context)  # before the others are bound: it is asked for each connection
             self._commands = replier(self._context, command_address, key_dir)
             self._events = publisher(self._context, event_address, key_dir)
         except PolysightError:
@@ -74,13 +90,13 @@ class Server:
         self.command_address = self._commands.getsockopt_string(zmq.LAST_ENDPOINT)
         self.event_address = self._events.getsockopt_string(zmq.LAST_ENDPOINT)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._out: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+        self._out: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._stop = False
 
     def publish(self, events: list[bytes]) -> None:
         """Send packed events, in order. From any thread; returns at once."""
         for raw in events:
-            self._out.put(("event", raw))
+            self._out.put(((), raw))
         os.eventfd_write(self._wake, 1)
 
     def stop(self) -> None:
@@ -93,22 +109,54 @@ class Server:
         poller = zmq.Poller()
         poller.register(self._wake, zmq.POLLIN)
         poller.register(self._commands, zmq.POLLIN)
+        poller.register(self._door, zmq.POLLIN)
         next_beat = time.monotonic()
         while not self._stop and executor.crash is None:
             now = time.monotonic()
             if now >= next_beat:
-                self._beat(executor.snapshot)
+                self._beat(executor)
                 next_beat = max(next_beat + self._heartbeat_ms / 1e3, now)
             ready = dict(poller.poll(max(0, math.ceil((next_beat - now) * 1e3))))
             if self._wake in ready:
                 os.eventfd_read(self._wake)
                 self._drain()
+            if self._door in ready:
+                self._admit()
             if self._commands in ready:
-                self._take(b"".join(self._commands.recv_multipart()), executor)
+                self._receive(executor)
 
     def drain(self) -> None:
         """Send what was handed over. For the end, after :meth:`run`."""
         self._drain()
+
+    def _admit(self) -> None:
+        """Answer ZeroMQ's question (ZAP, RFC 27) whether a client with this public key may connect."""
+        version, number, _, _, _, mechanism, *credentials = self._door.recv_multipart()
+        key = bytes(credentials[0]) if mechanism == b"CURVE" and credentials else b""
+        name = self._allowed.name_of(key) if key else ""
+        code, text = (b"200", b"OK") if name else (b"400", b"this key is not allowed")
+        self._door.send_multipart([version, number, code, text, key.hex().encode(), b""])
+
+    def _receive(self, executor: Answerer) -> None:
+        """Take one command: its envelope (who sent it, up to the empty frame), and one frame of content."""
+        frames = self._commands.recv_multipart(copy=False)
+        parts = [f.bytes for f in frames]
+        if b"" not in parts[1:-1]:
+            return  # no client's framing: nobody waits for a reply
+        end = parts.index(b"", 1) + 1
+        envelope = tuple(parts[:end])
+        if self._secret and not self._allowed.name_of(bytes.fromhex(str(frames[-1].get("User-Id")))):
+            reply = refused(PiFault.NOT_OWNER, "this client's key was revoked", "see `polysight-pi keys --list`")
+        else:
+            reply = self._take(b"".join(parts[end:]), envelope, executor)
+        if reply is not None:
+            self._reply(envelope, m.pack(reply))
+
+    def _reply(self, envelope: Envelope, raw: bytes) -> None:
+        try:
+            self._commands.send_multipart([*envelope, raw], zmq.NOBLOCK)
+        except zmq.ZMQError:
+            return  # the client is gone, or reads nothing: it asks again
 
     def close(self) -> None:
         """Close the sockets, giving sent messages a moment to leave."""
@@ -118,35 +166,39 @@ class Server:
     def _drain(self) -> None:
         while True:
             try:
-                kind, raw = self._out.get_nowait()
+                envelope, raw = self._out.get_nowait()
             except queue.Empty:
                 return
-            if kind == "event":
-                self._events.send_multipart([EVENT_TOPIC, raw])
+            if envelope:
+                self._reply(envelope, raw)
             else:
-                self._commands.send(raw)
+                self._events.send_multipart([EVENT_TOPIC, raw])
 
-    def _take(self, raw: bytes, executor: Answerer) -> None:
+    def _take(self, raw: bytes, envelope: Envelope, executor: Answerer) -> m.AnyReply | None:
+        """The reply to a command; None when the executor will give it. Nothing that arrives here ends the program."""
         try:
             command = m.unpack_command(raw)
         except ProtocolError as e:
-            number = int(PiFault.VERSION if isinstance(e, VersionError) else PiFault.BAD_REQUEST)
-            table = explain(number)
-            refused = m.Refused(number=number, what=e.what, why=e.why or table.why, remedy=e.remedy or table.remedy)
-            self._commands.send(m.pack(refused))
-            return
-        snapshot = executor.snapshot
+            number = PiFault.VERSION if isinstance(e, VersionError) else PiFault.BAD_REQUEST
+            return refused(number, e.what, e.why, e.remedy)
+        except Exception as e:  # noqa: BLE001 - told to the client, and in the log
+            traceback.print_exc()
+            return refused(PiFault.BAD_REQUEST, f"a command of {len(raw)} bytes cannot be read: {type(e).__name__}")
+        if executor.stands_still_s > HUNG_S:
+            return refused(PiFault.PROGRAM, f"the executor has stood still for {executor.stands_still_s:.0f} s")
         if isinstance(command, m.Hello):
-            self._commands.send(m.pack(self._hello(snapshot)))
-        elif isinstance(command, m.Status):
-            self._commands.send(m.pack(snapshot.status))
-        elif isinstance(command, m.Alive):
-            self._commands.send(m.pack(executor.host_alive(command.scan_id)))
-        else:
-            executor.post(Request(command, self._answer))
+            return self._hello(executor.snapshot)
+        if isinstance(command, m.Status):
+            return executor.snapshot.status
+        if isinstance(command, m.Alive):
+            return executor.host_alive(command.scan_id, command.owner)
+        if executor.full():
+            return refused(PiFault.NOT_READY, "too many commands wait to be carried out", "", "wait for replies")
+        executor.post(Request(command, lambda reply: self._answer(envelope, reply)))
+        return None
 
-    def _answer(self, reply: m.AnyReply) -> None:
-        self._out.put(("reply", m.pack(reply)))
+    def _answer(self, envelope: Envelope, reply: m.AnyReply) -> None:
+        self._out.put((envelope, m.pack(reply)))
         os.eventfd_write(self._wake, 1)
 
     def _hello(self, snapshot: Snapshot) -> m.HelloReply:
@@ -163,7 +215,11 @@ class Server:
             stage=snapshot.placing,
         )
 
-    def _beat(self, snapshot: Snapshot) -> None:
+    def _beat(self, executor: Answerer) -> None:
+        """Tell that this program lives; while the executor hangs, it does not."""
+        if executor.stands_still_s > HUNG_S:
+            return
+        snapshot = executor.snapshot
         # Everything up to the snapshot's number has been handed over before the snapshot was taken, so draining first
         # keeps a heartbeat from announcing an event that has not been sent.
         self._drain()

@@ -6,15 +6,17 @@ import signal
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from polysight.pi_controller import realtime
 from polysight.pi_controller.executor import Executor
-from polysight.pi_controller.journal import JournalFolder, JournalFullError
+from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, JournalFullError
 from polysight.pi_controller.ledger import Ledger
 from polysight.pi_controller.lines_gpiod import GpiodLines, load_gpiod
 from polysight.pi_controller.lines_gpiomem import GpiomemLines
-from polysight.pi_controller.lines_wires import WireLines
+from polysight.pi_controller.lines_spi import SpiLines
+from polysight.pi_controller.lines_wires import SpiWireLines, WireLines
 from polysight.pi_controller.server import Server
 from polysight.pi_controller.stage_driver import StageDriver
 from polysight.pi_controller.stage_link import StageNews
@@ -44,9 +46,10 @@ def log(text: str) -> None:
     sys.stderr.flush()
 
 
-def gpio_lines(instrument: Instrument) -> type[GpiodLines]:
+def gpio_lines(instrument: Instrument) -> type[GpiodLines | SpiLines]:
     """Which lines drive the pins of this rig."""
-    return GpiomemLines if instrument.pi.wiring == "gpiomem" else GpiodLines
+    kinds: dict[str, type[GpiodLines | SpiLines]] = {"gpiomem": GpiomemLines, "spi": SpiLines}
+    return kinds.get(instrument.pi.wiring, GpiodLines)
 
 
 def open_lines(instrument: Instrument, wires: Path | None, model: str | None = None) -> TriggerLines:
@@ -58,7 +61,7 @@ def open_lines(instrument: Instrument, wires: Path | None, model: str | None = N
         when they cannot be had, or this wiring cannot work on this computer (`model`: what it calls itself).
     """
     if wires is not None:
-        return WireLines(wires, instrument.pi)
+        return (SpiWireLines if instrument.pi.wiring == "spi" else WireLines)(wires, instrument.pi)
     warning = check_wiring(instrument, read_model() if model is None else model)
     if warning:
         log(warning)
@@ -110,7 +113,9 @@ class Service:
             )
             opened.callback(loop.stop)
             self._loop = loop
-            self.executor = Executor(stage, loop, self._ledger, check_width=not pi.one_shot)
+            turned = partial(realtime.notify_systemd, "WATCHDOG=1")
+            self.executor = Executor(stage, loop, self._ledger, not pi.one_shot, turned)
+            folder.write_secret(TAKE_OVER_KEY, self.executor.take_over_key)
             stage.connect()
             self._opened = opened.pop_all()
 
@@ -169,6 +174,7 @@ def run(instrument: Instrument, options: Options) -> int:
             signal.signal(number, lambda *_: service.stop())
         sys.stdout.write(f"ready {service.server.command_address}\nevents {service.server.event_address}\n")
         sys.stdout.flush()
+        realtime.notify_systemd("READY=1")
         service.serve()
     finally:
         service.close()

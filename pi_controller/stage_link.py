@@ -179,7 +179,7 @@ class StageLink:
 
     def send_byte(self, byte: Immediate) -> None:
         """Send an immediate byte. Raises StageLostError when the port is gone."""
-        self._write(bytes([byte]))
+        self._write(byte.sent)
 
     def repeat(self) -> None:
         """Send the last line again: the stage repeats its answer, and how the motion ended, without moving.

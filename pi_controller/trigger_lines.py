@@ -1,11 +1,13 @@
 """What the trigger loop needs of the lines and their clock.
 
-Backends: lines_gpiod.py (GPIO) and lines_wires.py (simulated wires).
+Backends: lines_gpiod.py (GPIO), lines_spi.py (bursts by an SPI controller) and lines_wires.py (simulated wires).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from polysight.pi_controller.spi_pulses import SpiBurst
 
 
 class Edge(NamedTuple):
@@ -49,4 +51,15 @@ class TriggerLines(Clock, Protocol):
 
     def close(self) -> None:
         """Outputs low, lines released."""
+        ...
+
+
+@runtime_checkable
+class BitLines(TriggerLines, Protocol):
+    """Lines whose bursts hardware clocks out, each in one piece."""
+
+    bufsiz: int
+
+    def transfer(self, burst: SpiBurst) -> tuple[int, int]:
+        """Send a burst; the times before and after. Raises DeviceError."""
         ...

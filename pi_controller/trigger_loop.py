@@ -11,9 +11,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstRecord, BurstSpec, send_burst
-from polysight.pi_controller.trigger_lines import Edge, TriggerLines
+from polysight.pi_controller.trigger_lines import BitLines, Edge, TriggerLines
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
+from polysight.shared.messages import Timing
 
 # How often the loop looks whether it shall end. Edges are not delayed by it.
 LOOK_UP_S = 0.1
@@ -101,6 +102,12 @@ class TriggerLoop:
             self._job = job = job._replace(armed_ns=self._lines.now_ns())
             self._counts = Counts()
             return job
+
+    def timed_by(self, spec: BurstSpec) -> Timing:
+        """What times the pulses of a burst."""
+        if isinstance(self._lines, BitLines):
+            return "spi"
+        return "program" if spec.check_width else "one-shot"
 
     def send(self, spec: BurstSpec) -> None:
         """Send one burst that no edge asks for, when the loop next looks up. Only while no row is armed."""

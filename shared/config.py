@@ -18,6 +18,7 @@ GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
 Vector = tuple[float, float, float]
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
 DEBOUNCE_TICKS_US = 5_000
+_MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}  # GPIO lines of a Pi's header
 HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 
 
@@ -74,7 +75,7 @@ class Pi(Section, frozen=True):
     gpio_chip: str = "pinctrl-bcm2711"
     trigger_in: GpioLine = 26
     sync_out: tuple[GpioLine, ...] = (22,)
-    wiring: Literal["fanout", "lines", "gpiomem"] = "fanout"
+    wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"
     one_shot: bool = False  # a hardware one-shot makes the width of the pulses, so that the line's own does not matter
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
@@ -84,14 +85,18 @@ class Pi(Section, frozen=True):
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
     gpiomem: str = "/dev/gpiomem"
+    spi_device: str = "/dev/spidev0.0"
     host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # how often the host says that it lives; 0: never
 
     def __post_init__(self) -> None:
         require(len(self.sync_out) > 0, "sync_out needs at least one line")
         require(self.trigger_in not in self.sync_out, "trigger_in must not be one of sync_out")
         require(
-            self.wiring != "fanout" or len(self.sync_out) == 1, 'wiring = "fanout" drives exactly one line in sync_out'
+            self.wiring not in ("fanout", "spi") or len(self.sync_out) == 1,
+            f'wiring = "{self.wiring}" drives exactly one line in sync_out',
         )
+        if self.wiring == "spi" and (mosi := _MOSI.get(self.spi_device.rpartition(".")[0])) is not None:
+            require(self.sync_out == (mosi,), f"MOSI of {self.spi_device} is GPIO {mosi}: sync_out = [{mosi}]")
         require(
             self.wiring != "gpiomem" or max(self.sync_out) < 32, 'wiring = "gpiomem" drives lines 0..31 of one register'
         )

@@ -58,6 +58,8 @@ class PiFault(IntEnum):
     BAD_REQUEST = 112
     ABORTED = 113
     VERSION = 114
+    NOT_OWNER = 115
+    PROGRAM = 116
 
 
 EXPLANATIONS: dict[int, Explanation] = {
@@ -147,7 +149,7 @@ EXPLANATIONS: dict[int, Explanation] = {
     PiFault.PULSE_TOO_LONG: Explanation(
         "a SYNC_IN pulse may have been longer than 4 us",
         "the Pi was interrupted inside a pulse",
-        "fit a one-shot after the line; see docs/how-to/wiring.md",
+        'use wiring = "spi", or fit a one-shot after the line; see docs/how-to/wiring.md',
     ),
     PiFault.PERIOD_TOO_SHORT: Explanation(
         "two SYNC_IN pulses came closer than the radar allows",
@@ -185,6 +187,16 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the peer speaks another major version",
         "host and Pi are of different releases",
         "install the same release on both",
+    ),
+    PiFault.NOT_OWNER: Explanation(
+        "the run belongs to another program",
+        "only the program that began the run may command it",
+        "command it there; a person at the Pi uses `polysight-pi take-over`",
+    ),
+    PiFault.PROGRAM: Explanation(
+        "the Pi's program failed at this command",
+        "a fault of this program, or it hangs",
+        "see `journalctl -u polysight-pi` and report it; systemd starts a hanging program again",
     ),
 }
 

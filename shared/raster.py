@@ -22,6 +22,8 @@ WIDTH_US = (0.025, 4.0)
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
 MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
+_Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
+_Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # NaN and infinities are refused, too
 _PLACING = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
 
 
@@ -139,11 +141,11 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `index` counts rows from the smallest y; even rows run towards +x, odd rows towards -x.
     """
 
-    index: int
-    y_mm: float
-    x_start_mm: float
-    step_mm: float
-    points: int
+    index: _Steps
+    y_mm: _Offset
+    x_start_mm: _Offset
+    step_mm: _Offset
+    points: _Steps
 
     @property
     def direction(self) -> int:
@@ -163,10 +165,10 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class RasterPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A grid walked row by row. Build with :func:`plan_raster`."""
 
-    columns: int
-    rows: int
-    step_x_mm: float
-    step_y_mm: float
+    columns: _Steps
+    rows: _Steps
+    step_x_mm: _Offset
+    step_y_mm: _Offset
 
     def row(self, index: int) -> Row:
         """Row `index` (0-based from the smallest y). Raises IndexError outside the plan."""

@@ -7,14 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.messages import MAX_COMMAND_BYTES
 
 Socket = zmq.Socket[bytes]
 HOST_KEYS = ("pi.key", "host.key_secret")
 """What the host needs of the keys that were made on the Pi. `pi.key_secret` never leaves the Pi."""
 PI_KEYS = ("pi.key_secret",)
 EVENT_TOPIC = b"event"
+MAX_SUBSCRIPTION_BYTES = 1024
+SEND_LIMIT_MS = 200
 
 
 def host_of(address: str) -> str:
@@ -42,8 +46,8 @@ def is_loopback(address: str) -> bool:
 def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """CURVE on a socket whose address is not loopback.
 
-    `key_dir` holds PI_KEYS or HOST_KEYS as zmq.auth writes them. The server accepts any client that knows its public
-    key; an address that is not loopback is refused without keys.
+    `key_dir` holds PI_KEYS or HOST_KEYS as zmq.auth writes them. Which clients' keys the server takes is for its
+    :func:`authenticator`; an address that is not loopback is refused without keys.
     """
     if is_loopback(address):
         return
@@ -105,7 +109,8 @@ def _make(
 
 def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """PUB socket of the Pi, bound."""
-    return _make(context, zmq.PUB, address, key_dir, bind=True, options={zmq.SNDHWM: 100_000})
+    options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
+    return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
 
 
 def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
@@ -126,10 +131,49 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 
 
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """REP socket of the Pi, bound."""
-    return _make(context, zmq.REP, address, key_dir, bind=True)
+    """ROUTER socket of the Pi, bound: it answers REQ sockets. Who sends a longer message than a command is cut off."""
+    options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
+    return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
+
+
+def authenticator(context: zmq.Context[Any]) -> Socket:
+    """REP socket that ZeroMQ asks about each client that connects by CURVE to a socket of this context (RFC 27)."""
+    socket: Socket = context.socket(zmq.REP)
+    socket.bind("inproc://zeromq.zap.01")
+    return socket
+
+
+class Refusals:
+    """Tells a server that refuses this client from one that is silent.
+
+    Parameters
+    ----------
+    socket
+        The client's, before or after it has connected.
+    """
+
+    def __init__(self, socket: Socket) -> None:
+        self._socket = socket
+        self._monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
+        self._refused = False
+
+    def seen(self) -> bool:
+        """Whether the server has refused this client's key, or this client the server's, until now."""
+        while self._monitor.poll(0):
+            recv_monitor_message(self._monitor)
+            self._refused = True
+        return self._refused
+
+    def close(self) -> None:
+        """Let go of the monitor. Before the socket is closed."""
+        self._socket.disable_monitor()
+        self._monitor.close()
 
 
 def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """REQ socket of the host, connected. Relaxed, so that a lost reply does not wedge it."""
-    return _make(context, zmq.REQ, address, key_dir, bind=False, options={zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1})
+    """REQ socket of the host, connected. Relaxed, so that a lost reply does not wedge it.
+
+    A socket that the server refused has nobody to send to: its `send` raises zmq.Again, soon.
+    """
+    options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1, zmq.SNDTIMEO: SEND_LIMIT_MS}
+    return _make(context, zmq.REQ, address, key_dir, bind=False, options=options)

@@ -13,7 +13,7 @@ import msgspec
 
 from polysight.shared.errors import ProtocolError
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 MAX_LINE_BYTES = 96
 MAX_SEQUENCE = 65535
 HOMING_LIMIT_S = 300.0  # then the Pi gives up and says why; whoever waits for the Pi waits longer
@@ -23,12 +23,20 @@ _FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
 
 
 class Immediate(IntEnum):
-    """Bytes taken in the receive interrupt, even while moving. None is one bit away from a byte used in lines."""
+    """Bytes taken in the receive interrupt, even while moving. None is one bit away from a byte used in lines.
+
+    RESUME, which makes a stage move, is three bits away from every other byte, and has to come twice.
+    """
 
     HOLD = 0x81
-    RESUME = 0x82
+    RESUME = 0x9D
     STATUS = 0x84
     STOP = 0x88
+
+    @property
+    def sent(self) -> bytes:
+        """What goes over the line."""
+        return bytes([self]) * (2 if self is Immediate.RESUME else 1)
 
 
 class Parameter(IntEnum):

@@ -18,6 +18,7 @@ void hal_directions(bool x_positive, bool y_positive) { machine->set_directions(
 void hal_enable(bool) {}
 void hal_trigger_width(uint16_t us) { machine->set_trigger_width(us); }
 void hal_write(const char* text, uint8_t length) { machine->replies_.append(text, length); }
+uint8_t hal_room() { return 255; }
 uint16_t hal_steps_per_mm() { return machine->steps_per_mm(); }
 
 Machine::Machine(const Rig& rig) : rig_(rig), stage_(motion_), protocol_(stage_), x_(rig.x), y_(rig.y) {

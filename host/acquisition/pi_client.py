@@ -6,14 +6,17 @@ tells the Pi that this process lives, from a thread and a socket of its own.
 
 from __future__ import annotations
 
+import secrets
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
+import msgspec
 import zmq
 
 from polysight.host.capture import take_priority
@@ -49,7 +52,7 @@ from polysight.shared.messages import (
     unpack_event,
     unpack_reply,
 )
-from polysight.shared.sockets import requester, subscriber
+from polysight.shared.sockets import Refusals, requester, subscriber
 
 ATTEMPTS = 3  # to ask a question
 REAL_TIME = 1  # of the heartbeat: below the receiving processes
@@ -72,11 +75,15 @@ class HostHeartbeat:
         The run that is begun.
     interval_s
         How often.
+    owner
+        As in `BeginRun`.
     """
 
-    def __init__(self, context: zmq.Context[Any], instrument: Instrument, scan_id: str, interval_s: float) -> None:
+    def __init__(
+        self, context: zmq.Context[Any], instrument: Instrument, scan_id: str, interval_s: float, owner: str = ""
+    ) -> None:
         self._socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
-        self._alive, self._interval_s = pack(Alive(scan_id=scan_id)), interval_s
+        self._alive, self._interval_s = pack(Alive(scan_id=scan_id, owner=owner)), interval_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
         self._thread.start()
@@ -85,7 +92,8 @@ class HostHeartbeat:
         take_priority(REAL_TIME)  # where that is not permitted, a busy machine may cost a row, which is taken again
         try:
             while not self._stop.wait(self._interval_s):
-                self._socket.send(self._alive)
+                with suppress(zmq.Again):  # nobody to send to: the Pi will notice
+                    self._socket.send(self._alive)
                 waited_s = 0.0
                 while not self._stop.is_set() and waited_s < _REPLY_LIMIT_S:
                     if self._socket.poll(round(self._interval_s * 1e3)):
@@ -134,6 +142,8 @@ class PiClient:
         keys = Path(instrument.pi.key_dir)
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
+        self._refusals = Refusals(self._commands)
+        self._owner = secrets.token_hex(16)  # of the runs that this client begins
         self._scan_id = ""
         self._last_seq = 0
         self._last_heard_s = time.monotonic()
@@ -165,14 +175,16 @@ class PiClient:
 
         Raises RefusedError, DeviceError.
         """
+        run = msgspec.structs.replace(run, owner=self._owner)
         self._ask(run, Accepted)
         self._fall_silent()
         if run.heartbeat_ms:
-            self._heartbeat = HostHeartbeat(self._context, self._instrument, run.scan_id, run.heartbeat_ms / 1e3)
+            interval_s = run.heartbeat_ms / 1e3
+            self._heartbeat = HostHeartbeat(self._context, self._instrument, run.scan_id, interval_s, self._owner)
 
     def end_run(self, scan_id: str, exit_status: ExitStatus, reason: str) -> None:
         """End the run. Raises RefusedError, DeviceError."""
-        self._ask(EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500]), Accepted)
+        self._ask(EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500], owner=self._owner), Accepted)
         self._fall_silent()
 
     def home(self) -> None:
@@ -185,7 +197,7 @@ class PiClient:
 
         Raises RefusedError, DeviceError.
         """
-        command = RunRow(scan_id=scan_id, row_index=row_index, take=take)
+        command = RunRow(scan_id=scan_id, row_index=row_index, take=take, owner=self._owner)
         for _ in range(ATTEMPTS):
             reply = self._once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, Accepted):
@@ -211,7 +223,7 @@ class PiClient:
 
     def abort(self, reason: str) -> None:
         """Stop the row now; aborting twice does no harm. Raises RefusedError, DeviceError."""
-        self._ask(Abort(reason=reason), Accepted)
+        self._ask(Abort(reason=reason[:500], owner=self._owner), Accepted)
 
     def come_to_rest(self, reason: str) -> None:
         """Stop whatever moves, and wait until it stands: a run cannot end before. Raises RefusedError, DeviceError.
@@ -237,7 +249,10 @@ class PiClient:
 
     def _once(self, command: AnyCommand, limit_s: float) -> AnyReply | None:
         """Send once; the reply, or None after `limit_s`. A new request drops the old one (relaxed, correlated REQ)."""
-        self._commands.send(pack(command))
+        try:
+            self._commands.send(pack(command))
+        except zmq.Again:  # nobody to send to
+            return None
         if not self._commands.poll(round(limit_s * 1e3)):
             return None
         reply = unpack_reply(self._commands.recv())
@@ -247,6 +262,13 @@ class PiClient:
         return reply
 
     def _silent(self, command: str) -> DeviceError:
+        if self._refusals.seen():
+            return DeviceError(
+                f"the Pi at {self._address} refuses this host's key",
+                "the key was revoked or never allowed, or pi.key here is another Pi's",
+                f"on the Pi: `polysight-pi keys --list`; here: the key files in {self._instrument.pi.key_dir}"
+                " (docs/how-to/install.md)",
+            )
         return DeviceError(
             f"the Pi at {self._address} did not answer {command} within {self._timeout_s:g} s ({ATTEMPTS} attempts)",
             "`polysight-pi run` is not running there, the address is wrong, or the CURVE keys do not match",
@@ -317,6 +339,7 @@ class PiClient:
         """Close the sockets."""
         self._fall_silent()
         self._events.close()
+        self._refusals.close()
         self._commands.close()
 
     def _fall_silent(self) -> None:

@@ -321,7 +321,7 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
         "later_ns": {name: mean * 1e9 for name, (mean, _) in later.items()},
         "crystal_ppm": ppm,
     }
-    lines = "several GPIO lines, written one after another" if rig.pi.wiring != "fanout" else "cables of unequal length"
+    lines = "several GPIO lines, written one after another" if len(rig.pi.sync_out) > 1 else "cables of unequal length"
     why = f"{lines}, a slow edge, or start_offset_hz that one board does not have"
     remedy = "one line and a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
     if abs(skew) > TOO_MUCH_S:

@@ -24,7 +24,7 @@ def sync_line(rig: Instrument, board: Board) -> int:
 
     Raises ConfigError when there are fewer lines than boards.
     """
-    if rig.pi.wiring == "fanout":
+    if rig.pi.wiring in ("fanout", "spi"):
         return rig.pi.sync_out[0]
     if len(rig.pi.sync_out) < len(rig.boards):
         raise ConfigError(

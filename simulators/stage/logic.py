@@ -7,12 +7,14 @@ from enum import Enum
 
 from polysight.shared.faults import StageError
 from polysight.shared.stage_line import Immediate, Parameter
-from polysight.simulators.stage.motion import EMERGENCY, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
+from polysight.simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
 
 MAX_TRAVEL = 999_999
 MAX_POINTS = 9_999
 MAX_BACKLASH = 20_000
 HOME_RATE, CREEP_RATE, PULL_OFF, MAX_RELEASE = 4000, 400, 400, 4000  # steps/s and steps
+HOME_ACCEL = 40_000  # steps/s^2
+QUIET_MS = 4
 _RANGES = {
     Parameter.ACCEL: (100, 1_000_000),
     Parameter.HEARTBEAT: (50, 60_000),
@@ -42,15 +44,15 @@ class Event(Enum):
     ALARM = 2
 
 
-def homing_zero(accel_steps_s2: int) -> int:
-    """Steps from where a switch closes to the zero that homing finds, at this acceleration.
+def homing_zero() -> int:
+    """Steps from where a switch closes to the zero that homing finds.
 
-    The creep sees the switch open after one step, takes the steps of its ramp to stop, and pulls off. Homing has to
-    begin at least that ramp away from the switch.
+    The creep sees the switch open after its looks, takes the steps of its ramp to stop, and pulls off. Homing has to
+    begin at least the ramp of the search away from the switch.
     """
     engine = StepEngine()
-    engine.set_accel(accel_steps_s2)
-    return 1 + engine.ramp_steps(CREEP_RATE) + PULL_OFF
+    engine.set_accel(HOME_ACCEL)
+    return LOOKS + engine.ramp_steps(CREEP_RATE) + PULL_OFF
 
 
 def _require(ok: bool, number: StageError) -> None:
@@ -87,7 +89,10 @@ class StageLogic:
         self.homed = self.held = self.row_command = self.heard = self.status_requested = False
         self._stopping: StageError | None = None
         self._enabled = self._stop = self._resume = self._homing_leg_made = False
-        self._phase = self._heard_ms = 0
+        self._byte_seen = self._resume_begun = self._knew = self.homing_command = False
+        self._quiet = True
+        self._phase = self._heard_ms = self._byte_ms = self._looked_ms = 0
+        self.lost_x = self.lost_y = 0
         self._row_leg = Leg(0, 0, MIN_RATE)
         self._row_y = 0
 
@@ -142,12 +147,13 @@ class StageLogic:
         self.homed = self.homed and self._enabled
 
     def _clear(self) -> None:
-        _require(not self._inputs() & EMERGENCY, StageError.EMERGENCY_STOP)
+        _require(not (self._inputs() | self._engine.stable) & EMERGENCY, StageError.EMERGENCY_STOP)
         self.alarm = None
 
     def _home(self) -> None:
         self._begin("home")
-        self.homed = False
+        self._engine.set_accel(HOME_ACCEL)
+        self._knew, self.homed = self.homed, False
         self._phase = 0
 
     def _move(self, x: int, y: int, rate: int) -> None:
@@ -182,6 +188,7 @@ class StageLogic:
         self.activity = activity
         self.held = self._homing_leg_made = False
         self.row_command = activity == "travel"
+        self.homing_command = activity == "home"
         self._engine.abandon()
         self._engine.points = self._engine.pulses = 0
         self.heard = True
@@ -190,22 +197,37 @@ class StageLogic:
         self._arm(self._engine.start(Leg(x - self._engine.x, y - self._engine.y, rate)))
 
     def immediate(self, byte: int) -> bool:
-        """Take an immediate byte; False when it is none."""
+        """Take a byte; False when it is not an immediate one."""
+        alone, confirmed = self._quiet, self._resume_begun
+        self._quiet, self._byte_seen, self._resume_begun = False, True, byte == Immediate.RESUME
         if byte == Immediate.HOLD:
             self._engine.hold, self._resume = True, False
         elif byte == Immediate.RESUME:
-            self._resume = True
+            self._resume |= confirmed
+            self._resume_begun = not confirmed
         elif byte == Immediate.STATUS:
             self.status_requested = True
         elif byte == Immediate.STOP:
             self._engine.hold = self._stop = True
         else:
             return False
-        self.heard = True
+        self.heard |= alone
         return True
+
+    def _listen(self, now_ms: int) -> None:
+        if self._byte_seen:
+            self._byte_seen, self._byte_ms = False, now_ms
+        elif now_ms - self._byte_ms >= QUIET_MS:
+            self._quiet = True
+        if self.heard:
+            self.heard, self._heard_ms = False, now_ms
+        if now_ms != self._looked_ms and not self._engine.stepping:
+            self._looked_ms = now_ms
+            self._engine.look(self._inputs())
 
     def _raise(self, alarm: StageError, position_lost: bool) -> Event:
         self._engine.abandon()
+        self._engine.set_accel(self.parameters[Parameter.ACCEL])
         self.activity = "idle"
         self._stopping = None
         self._stop = self._resume = False
@@ -216,11 +238,10 @@ class StageLogic:
     def service(self, now_ms: int) -> Event:
         """Go on to the next leg; watch heartbeat and switches. Call often."""
         engine = self._engine
-        if self.heard:
-            self.heard, self._heard_ms = False, now_ms
+        self._listen(now_ms)
         if engine.fault is not None:
             return self._raise(engine.fault, True)
-        if self._inputs() & EMERGENCY and self.alarm != StageError.EMERGENCY_STOP:
+        if engine.stable & EMERGENCY and self.alarm != StageError.EMERGENCY_STOP:
             return self._raise(StageError.EMERGENCY_STOP, True)
         if not self.busy:
             if self._stop and self.alarm is None:
@@ -269,11 +290,12 @@ class StageLogic:
             if self._engine.reached != (self._phase % 3 != 2):
                 return self._raise(StageError.HOMING_FAILED, True)
             if self._phase == 2:
-                self._engine.x = 0
+                self.lost_x, self._engine.x = -self._engine.x if self._knew else 0, 0
             if self._phase == 5:
-                self._engine.y = 0
+                self.lost_y, self._engine.y = -self._engine.y if self._knew else 0, 0
             self._phase += 1
         if self._phase == 6:
+            self._engine.set_accel(self.parameters[Parameter.ACCEL])
             self.homed = True
             return self._end()
         along_x, step = self._phase < 3, self._phase % 3

@@ -16,6 +16,7 @@ NS_PER_TICK = 1_000_000_000 // TICK_HZ
 MIN_RATE, MAX_RATE = 31, 20_000
 SWITCH_X, SWITCH_Y, EMERGENCY = 1, 2, 4
 SWITCHES = SWITCH_X | SWITCH_Y
+LOOKS = 5  # after which a switch counts
 
 
 class Leg(NamedTuple):
@@ -43,6 +44,7 @@ class StepEngine:
         self.x_direction = self.y_direction = 0
         self.to_trigger = self.carry = self.ticks = self.speed_q16 = 0
         self.points_left = 0
+        self.stable = self._looks = 0
         self.leg = Leg(0, 0, MIN_RATE)
         self.set_accel(40_000)
 
@@ -99,11 +101,19 @@ class StepEngine:
         self.left = self.ramp = self.points_left = 0
         self.fault = None
 
+    def look(self, inputs: int) -> None:
+        """Look at the switches: what differs from before counts after :data:`LOOKS` looks."""
+        self._looks = 0 if inputs == self.stable else self._looks + 1
+        if self._looks >= LOOKS:
+            self.stable, self._looks = inputs, 0
+
     def step(self, inputs: int) -> tuple[int, int, bool]:
         """Make the step that is due: steps of x and y (signed), and whether the trigger is raised."""
         leg = self.leg
         if not self.stepping or self.left == 0:
             return 0, 0, False
+        self.look(inputs)
+        inputs = self.stable
         if inputs & EMERGENCY:
             self.fault = StageError.EMERGENCY_STOP
         elif not leg.until and inputs & SWITCHES:
@@ -134,7 +144,7 @@ class StepEngine:
             Steps of the longer axis (0: nothing can be taken at once), of x and of y, and the ticks from the first of
             them to the step after the last.
         """
-        if not self.cruise or self.hold or self.leg.until:
+        if not self.cruise or self.hold or self.leg.until or self.stable:
             return 0, 0, 0, 0
         rate = self.leg.rate
         n = min(
@@ -148,6 +158,7 @@ class StepEngine:
             n = min(n, ((clear_y if self.x_major else clear_x) - 1) * self.major // self.minor)
         if n < 2:
             return 0, 0, 0, 0
+        self._looks = 0
         dx, dy, _ = self._advance(n)
         before = ((n - 1) * TICK_HZ + self.carry) // rate
         ticks, self.carry = divmod(n * TICK_HZ + self.carry, rate)

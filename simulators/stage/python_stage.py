@@ -245,6 +245,8 @@ class PythonStage:
         fields |= {"x": engine.x, "y": engine.y}
         if logic.row_command:
             fields["held"] = int(logic.held)
+        if logic.homing_command:
+            fields |= {"lostx": logic.lost_x, "losty": logic.lost_y}
         return Reply("done", self._motion_sequence, fields={k: str(v) for k, v in fields.items()}).encode()
 
     def _status(self) -> bytes:

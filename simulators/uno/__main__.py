@@ -34,7 +34,7 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     try:
         rig = load_instrument(args.config)
-        zero = homing_zero(round(rig.stage.accel_mm_s2 * rig.stage.steps_per_mm))
+        zero = homing_zero()
         program = str(emulator())
         command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
         command += ["--zero", f"{zero},{zero}", "--um-per-step", repr(1000.0 / rig.stage.steps_per_mm)]

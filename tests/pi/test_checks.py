@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import shutil
@@ -11,14 +12,22 @@ from collections import namedtuple
 import msgspec
 import pytest
 
-from polysight.pi_controller import checks
-from polysight.pi_controller.checks_lines import check_lines
+from polysight.pi_controller import checks, lines_spi
+from polysight.pi_controller.checks_lines import check_lines, measure_clock
+from polysight.pi_controller.finding import attempt
 from polysight.pi_controller.keys import make_keys
 from polysight.simulators import gpio
 from tests.support.pi.program import run
+from tests.support.rigs import timed_by_the_program
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 replace = msgspec.structs.replace
+
+
+@pytest.fixture
+def instrument(instrument):
+    """With SYNC_IN on a GPIO line."""
+    return timed_by_the_program(instrument)
 
 
 @pytest.fixture
@@ -45,9 +54,9 @@ def on_chip(write_config, stage, tmp_path):
 
 
 def test_a_whole_rig_is_all_ok(on_chip, rig):
-    found = on_chip(rig)
+    found = on_chip(replace(rig, pi=replace(rig.pi, one_shot=True)))  # how fast this machine is, is not asked
     rights = ["schedule right", "locked memory"]  # as this machine has it
-    lines = ["wiring", "GPIO chip", "trigger line 26", "SYNC_IN line 22"]
+    lines = ["wiring", "GPIO chip", "trigger line 26", "SYNC_IN line 22", "pulse width"]
     rest = ["stage port", "stage", "journal", "disk", "keys", "command address", "event address"]
     assert list(found) == ["plan", "clock", *rights, *lines, *rest]
     assert {f["verdict"] for name, f in found.items() if name not in rights} == {"ok"}
@@ -98,6 +107,53 @@ def test_wiring_and_line_release(rig, tmp_path):
         found = of("Raspberry Pi 4 Model B Rev 1.4", "line release")
         assert found.verdict == verdict
         assert (verdict == "ok") or "strict_gpiod" in found.remedy
+
+
+@pytest.mark.parametrize(("slow", "one_shot", "verdict"), [("0", False, "ok"), ("4", False, "fail"), ("4", True, "ok")])
+def test_widths_are_measured_with_the_line_low(on_chip, rig, slow, one_shot, verdict):
+    """`slow:US`: each change of an output takes so long, as a Pi's do. No pulse is sent meanwhile."""
+    found = on_chip(replace(rig, pi=replace(rig.pi, one_shot=one_shot)), *([f"slow:{slow}"] if slow != "0" else []))
+    width = found["pulse width"]
+    if slow == "0":
+        assert "measured now" in width["found"] or width["verdict"] == "fail", "as fast as this machine is"
+    else:
+        assert width["verdict"] == verdict
+    assert width["verdict"] == "ok" or 'wiring = "spi"' in width["remedy"]
+
+
+class Spidev:
+    """An SPI controller behind a file, at so many times the clock it is asked for."""
+
+    def __init__(self, rate, monkeypatch):
+        self.t, self.rate, self.data = 0, rate, []
+        monkeypatch.setattr(lines_spi.fcntl, "ioctl", self.ioctl)
+        monkeypatch.setattr(lines_spi.time, "monotonic_ns", lambda: self.t)
+
+    def ioctl(self, _, number, message):
+        if number == lines_spi.MESSAGE:
+            tx, _, length, clock_hz, *_ = lines_spi._TRANSFER.unpack(message)
+            self.data.append(ctypes.string_at(tx, length))
+            self.t += 60_000 + round(8e9 * length / clock_hz / self.rate)
+        return 0
+
+
+@pytest.mark.parametrize(("rate", "verdict"), [(1.0, "ok"), (1.6, "fail"), (0.6, "fail")])
+def test_an_spi_clock_is_measured_with_the_line_low(rig, tmp_path, monkeypatch, rate, verdict):
+    (tmp_path / "spidev0.0").touch()
+    device = Spidev(rate, monkeypatch)
+    pi = replace(rig.pi, wiring="spi", sync_out=(10,), spi_device=str(tmp_path / "spidev0.0"))
+    found = attempt("pulse width", lambda: measure_clock(replace(rig, pi=pi)))
+    assert found.verdict == verdict
+    assert (verdict == "ok") == (not found.remedy)
+    assert not any(any(data) for data in device.data), "no pulse"
+    lines_spi.SpiDevice(pi.spi_device).transfer(b"\x01\x80", 1_000_000)
+    assert device.data[-1] == b"\x01\x80"
+
+
+def test_spi_that_is_off_is_told(rig, tmp_path):
+    pi = replace(rig.pi, wiring="spi", sync_out=(10,), spi_device=str(tmp_path / "spidev0.0"))
+    found = attempt("pulse width", lambda: measure_clock(replace(rig, pi=pi)))
+    assert (found.verdict, "dtparam=spi=on" in found.remedy) == ("fail", True)
 
 
 def test_rights_that_are_missing(monkeypatch):

@@ -21,7 +21,7 @@ STUB = '#!/bin/sh\necho "$(basename "$0") $*" >> "$LOG"\n'
 STUBS = {
     **dict.fromkeys(("groupadd", "useradd", "udevadm", "systemctl", "chown", "pip"), STUB),
     "getent": STUB + "exit 2\n",
-    "python3": STUB + 'if [ "$2" = venv ]; then mkdir -p "$3/bin"; cp "$PIP" "$3/bin/pip"; fi\n',
+    "python3": STUB + 'if [ "$2" = venv ]; then mkdir -p "$3/bin"; cp "$PIP" "$3/bin/python"; fi\n',
     "python": STUB + 'mkdir -p "$7"; touch "$7/a.whl"\n',  # -m pip wheel --quiet --no-deps --wheel-dir FOLDER
     "ssh": STUB + '[ "$1" = -t ] && shift; shift; cd "$PI_HOME" && sh -c "$*"\n',  # the Pi is a folder here
     "sudo": STUB + '"$@"\n',
@@ -55,10 +55,44 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
     service = unit["Service"]
     assert int(service["LimitRTPRIO"]) >= 50
     assert service["LimitMEMLOCK"] == "infinity"
-    assert {"gpio", "dialout"} <= set(service["SupplementaryGroups"].split())
+    assert {"gpio", "spi", "dialout"} <= set(service["SupplementaryGroups"].split())
     rig = published_rig()
     assert Path(rig.pi.journal_dir).is_relative_to(service["ReadWritePaths"])
     assert Path(rig.pi.journal_dir).is_relative_to(Path("/var/lib") / service["StateDirectory"])
+
+
+def test_a_program_that_hangs_is_started_anew(unit):
+    """Told by the executor itself, more often than the watchdog asks and later than a lost stage takes."""
+    service = unit["Service"]
+    assert service["Type"] == "notify"
+    assert service["Restart"] == "on-failure"
+    assert 25 < int(service["WatchdogSec"]) <= 60
+
+
+def test_the_unit_exposes_little(tmp_path):
+    """systemd's own measure: 0 is a program that can do nothing, 10 one without any limit."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze: `apt-get install systemd` runs this test too")
+    shutil.copy(PI / "polysight-pi.service", tmp_path)
+    done = subprocess.run(
+        ["systemd-analyze", "security", "--offline=yes", "--no-pager", str(tmp_path / "polysight-pi.service")],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
+    if found is None:
+        pytest.skip(f"this systemd-analyze measures no file: {done.stderr.strip()}")
+    assert float(found[1]) <= 3.0, done.stdout
+
+
+def test_pinned_versions_are_what_the_wheel_asks_for():
+    pins = dict(x.split("==") for x in (PI / "requirements.txt").read_text().split() if "==" in x)
+    asked = re.findall(r'"(\w+)>=([\d.]+)', (PI / "pyproject.toml").read_text().partition("dependencies = [")[2])
+    assert set(pins) == {name for name, _ in asked}
+
+    def key(version):
+        return [int(x) for x in version.split(".")]
+
+    assert all(key(pins[name]) >= key(least) for name, least in asked)
 
 
 def test_udev_rules_are_well_formed():
@@ -114,10 +148,31 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
     assert (root / "etc/polysight/keys").stat().st_mode & 0o777 == 0o700
     for name in ("etc/systemd/system/polysight-pi.service", "etc/udev/rules.d/60-polysight.rules"):
         assert (root / name).read_text() == (PI / Path(name).name).read_text()
-    assert "--groups gpio,dialout" in asked, "by hand, `polysight-pi check` as this user has no group from the unit"
+    assert "--groups gpio,spi,dialout" in asked, "by hand, `polysight-pi check` as this user has no group from the unit"
     for words in ("useradd --system", "systemctl enable"):
         assert words in asked
     assert PROGRAM in done.stdout
+    opt = root / "opt/polysight"
+    assert (opt / "venv").readlink() == Path("releases/2")
+    back = [subprocess.run([PI / "install.sh", "--roll-back"], env=bench, check=False).returncode for _ in range(2)]
+    assert back == [0, 5], "to the first release, and no further"
+    assert (opt / "venv").readlink() == Path("releases/1")
+    assert (opt / "venv/bin/python").is_file()
+
+
+def test_a_release_that_cannot_be_installed_changes_nothing(bench, tmp_path):
+    copied = tmp_path / "copied"
+    shutil.copytree(PI, copied)
+    (copied / "a.whl").touch()
+    shutil.copy(REPO / "instrument.toml", copied)
+    install = [copied / "install.sh"]
+    assert subprocess.run(install, env=bench, check=False).returncode == 0
+    opt = tmp_path / "root/opt/polysight"
+    before = sorted(p.name for p in (opt / "releases").iterdir())
+    (opt / "venv/bin/python").write_text(STUB + "exit 1\n")
+    assert subprocess.run(install, env=bench, capture_output=True, check=False).returncode == 5
+    assert (opt / "venv").readlink() == Path("releases/1")
+    assert sorted(p.name for p in (opt / "releases").iterdir()) == before
 
 
 def test_a_pi_that_lacks_a_library_and_the_internet_is_told_so(bench, tmp_path):

@@ -1,82 +1,204 @@
-"""CURVE keys: who knows them gets in, where they are looked for, and that the Pi's secret never has to leave it."""
+"""CURVE keys: whose are allowed get in, where they are looked for, and that the Pi's secret never has to leave it."""
 
 from __future__ import annotations
 
 import shutil
+import threading
+import time
 from pathlib import Path
 
+import msgspec
 import pytest
 import zmq
 from zmq.auth import load_certificate
 
+from polysight.host.acquisition.pi_client import PiClient
 from polysight.pi_controller import checks
 from polysight.pi_controller.cli import main
+from polysight.pi_controller.executor import Snapshot
 from polysight.pi_controller.finding import attempt
-from polysight.pi_controller.keys import COPY, make_keys
+from polysight.pi_controller.keys import COPY, allow, make_keys, read_allowed, revoke
 from polysight.pi_controller.server import Server
+from polysight.shared import messages as m
 from polysight.shared.config import load_instrument
-from polysight.shared.errors import ConfigError
-from polysight.shared.sockets import HOST_KEYS, requester
+from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.faults import PiFault
+from polysight.shared.sockets import HOST_KEYS, Refusals, requester
 from polysight.shared.tables import decode, to_builtins
 from tests.support.paths import REPO, RIG_FILE
+from tests.support.rigs import published_rig
 
 ELSEWHERE = "tcp://192.0.2.1:5601"
 
 
-@pytest.mark.parametrize("right", [True, False])
-def test_curve_lets_in_who_knows_the_key(tmp_path, right):
+class Door:
+    """An executor that only says hello: what is asked here is who gets in."""
+
+    crash = None
+    stands_still_s = 0.0
+    snapshot = Snapshot(
+        m.StatusReply(
+            state="idle", homed=False, x_mm=0.0, y_mm=0.0, scan_id="", row_index=-1, take=0, points=0, pulses=0,
+            last_seq=0, fault=0, reason="",
+        ), "fake", False, {},
+    )  # fmt: skip
+
+    def full(self):
+        return False
+
+    def post(self, item):
+        raise AssertionError(item)
+
+    def host_alive(self, scan_id, owner):
+        raise AssertionError(scan_id + owner)
+
+
+@pytest.fixture
+def served(tmp_path):
+    """A Pi's sockets on all addresses, with keys in `keys`; they serve until the test's end."""
     make_keys(tmp_path / "keys")
     make_keys(tmp_path / "other")
-    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 500, "wires")
-    context = zmq.Context()
-    client = context.socket(zmq.REQ)
-    client.curve_publickey, client.curve_secretkey = load_certificate(tmp_path / "keys" / "host.key_secret")
-    client.curve_serverkey = load_certificate(tmp_path / ("keys" if right else "other") / "pi.key")[0]
-    client.connect(server.command_address.replace("0.0.0.0", "127.0.0.1"))
-    client.send(b"x", zmq.NOBLOCK)
-    assert bool(server._commands.poll(5000 if right else 300)) == right
-    context.destroy(linger=0)
+    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 50, "wires")
+    thread = threading.Thread(target=server.run, args=(Door(),))
+    thread.start()
+    yield server
+    server.stop()
+    thread.join(10)
     server.close()
 
 
-@pytest.mark.parametrize("right", [True, False])
-def test_curve_lets_hear_who_knows_the_key(tmp_path, right):
-    make_keys(tmp_path / "keys")
-    make_keys(tmp_path / "other")
-    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 500, "wires")
-    context = zmq.Context()
-    listener = context.socket(zmq.SUB)
+@pytest.fixture
+def context():
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    yield context
+    context.destroy(linger=0)
+
+
+@pytest.fixture
+def client_of(context):
+    """Makes clients with this secret key that take this one for the Pi's; gives their socket, and if it is refused."""
+    made = []
+
+    def make(kind, address, mine, pis):
+        socket = context.socket(kind)
+        socket.curve_publickey, socket.curve_secretkey = load_certificate(mine)
+        socket.curve_serverkey = load_certificate(pis)[0]
+        made.append((Refusals(socket), socket))
+        socket.connect(address.replace("0.0.0.0", "127.0.0.1"))
+        return socket, made[-1][0].seen
+
+    yield make
+    for refusals, socket in made:
+        refusals.close()
+        socket.close(linger=0)
+
+
+def until(there, limit_s=60.0):
+    deadline = time.monotonic() + limit_s
+    while not there() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert there()
+
+
+KEYS = {
+    "allowed": ("keys/host.key_secret", "keys/pi.key"),
+    "another Pi's key": ("keys/host.key_secret", "other/pi.key"),
+    "a key that nobody allowed": ("other/host.key_secret", "keys/pi.key"),
+}
+
+
+@pytest.mark.parametrize("which", KEYS)
+def test_curve_lets_in_whose_key_is_allowed(tmp_path, served, client_of, which):
+    mine, pis = (tmp_path / name for name in KEYS[which])
+    client, refused = client_of(zmq.REQ, served.command_address, mine, pis)
+    client.send(m.pack(m.Hello()))
+    if which == "allowed":
+        assert client.poll(60_000)
+        assert isinstance(m.unpack_reply(client.recv()), m.HelloReply)
+        assert not refused()
+    elif which == "another Pi's key":
+        assert not client.poll(300)  # to whom nobody speaks as the Pi, nobody can tell why
+    else:
+        until(refused)
+        assert not client.poll(300)
+
+
+@pytest.mark.parametrize("which", KEYS)
+def test_curve_lets_hear_whose_key_is_allowed(tmp_path, served, client_of, which):
+    mine, pis = (tmp_path / name for name in KEYS[which])
+    listener, _ = client_of(zmq.SUB, served.event_address, mine, pis)
     listener.subscribe(b"")
-    listener.curve_publickey, listener.curve_secretkey = load_certificate(tmp_path / "keys" / "host.key_secret")
-    listener.curve_serverkey = load_certificate(tmp_path / ("keys" if right else "other") / "pi.key")[0]
-    listener.connect(server.event_address.replace("0.0.0.0", "127.0.0.1"))
-    heard = False
-    for _ in range(600 if right else 10):  # until the subscription has arrived
-        server.publish([b"event"])
-        server.drain()
-        if heard := bool(listener.poll(50)):
-            break
-    assert heard == right
-    context.destroy(linger=0)
-    server.close()
+    assert bool(listener.poll(60_000 if which == "allowed" else 500)) == (which == "allowed")
 
 
-def test_the_host_needs_what_it_is_told_to_copy_and_no_more(tmp_path):
+def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served, client_of):
+    """Its next command is refused though it is connected; when it connects anew it is not let in."""
+    keys = tmp_path / "keys"
+    public, secret = allow(keys, "laptop")
+    assert secret.stat().st_mode & 0o077 == 0
+    assert set(read_allowed(keys).values()) == {"host", "laptop"}
+    clients = {
+        name: client_of(zmq.REQ, served.command_address, keys / f"{name}.key_secret", keys / "pi.key")
+        for name in ("host", "laptop")
+    }
+
+    def ask(name):
+        clients[name][0].send(m.pack(m.Hello()))
+        assert clients[name][0].poll(60_000)
+        return m.unpack_reply(clients[name][0].recv())
+
+    assert [type(ask(name)) for name in clients] == [m.HelloReply, m.HelloReply]
+    revoke(keys, "laptop")
+    reply = ask("laptop")
+    assert isinstance(reply, m.Refused)
+    assert reply.number == PiFault.NOT_OWNER
+    assert isinstance(ask("host"), m.HelloReply)
+    again, refused = client_of(zmq.REQ, served.command_address, secret, keys / "pi.key")
+    again.send(m.pack(m.Hello()))
+    until(refused)
+    with pytest.raises(ConfigError):
+        revoke(keys, "laptop")
+    with pytest.raises(ConfigError):
+        allow(keys, "host")
+    assert public.is_file()
+
+
+def test_a_host_whose_key_is_refused_is_told_so(tmp_path, served, context):
+    """Not that nobody answers."""
+    (tmp_path / "mine").mkdir()
+    shutil.copy(tmp_path / "keys" / "pi.key", tmp_path / "mine")
+    shutil.copy(tmp_path / "other" / "host.key_secret", tmp_path / "mine")
+    port, events = (a.rpartition(":")[2] for a in (served.command_address, served.event_address))
+    rig = published_rig()
+    replace = msgspec.structs.replace
+    pi = replace(
+        rig.pi, command_address=f"tcp://0.0.0.0:{port}", event_address=f"tcp://0.0.0.0:{events}",
+        key_dir=str(tmp_path / "mine"),
+    )  # fmt: skip
+    client = PiClient(context, replace(rig, pi=pi, limits=replace(rig.limits, command_timeout_s=0.6)))
+    with client, pytest.raises(DeviceError, match="refuses this host's key"):
+        client.hello()
+
+
+def test_keys_of_before_the_list_still_let_the_host_in(tmp_path):
+    make_keys(tmp_path)
+    (tmp_path / "allowed_clients").unlink()
+    assert list(read_allowed(tmp_path).values()) == ["host"]
+
+
+def test_the_host_needs_what_it_is_told_to_copy_and_no_more(tmp_path, served, context):
     """The files that every text names are enough to talk to the Pi, and its secret is not among them."""
-    made = {p.name for p in make_keys(tmp_path / "keys")}
+    made = {p.name for p in (tmp_path / "keys").iterdir()}
     assert "pi.key_secret" in made - set(HOST_KEYS)
     (tmp_path / "host").mkdir()
     for name in HOST_KEYS:
         shutil.copy(tmp_path / "keys" / name, tmp_path / "host")
-    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 500, "wires")
-    port = server.command_address.rpartition(":")[2]
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    port = served.command_address.rpartition(":")[2]
     # The kernel takes any of this machine's own addresses; 0.0.0.0 is none of the loopback ones.
     client = requester(context, f"tcp://0.0.0.0:{port}", tmp_path / "host")
-    client.send(b"x")
-    assert server._commands.poll(60_000)
-    context.destroy(linger=0)
-    server.close()
+    client.send(m.pack(m.Hello()))
+    assert client.poll(60_000)
+    client.close()
     install = (REPO / "docs/how-to/install.md").read_text(encoding="utf-8")
     assert f"tar -c -C /etc/polysight/keys {' '.join(HOST_KEYS)} |" in install
     for text in (install, COPY, (REPO / "host/doctor/check_pi.py").read_text(encoding="utf-8")):

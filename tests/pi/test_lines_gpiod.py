@@ -13,8 +13,15 @@ from polysight.pi_controller.trigger_loop import Counts, RowJob, TriggerLoop
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
 from tests.support.pi.fake_gpiod import FakeChip
+from tests.support.rigs import timed_by_the_program
 
 SPEC = BurstSpec(4, 1_500_000, 1000)
+
+
+@pytest.fixture
+def instrument(instrument):
+    """With SYNC_IN on a GPIO line."""
+    return timed_by_the_program(instrument)
 
 
 @pytest.fixture

@@ -17,12 +17,19 @@ from polysight.pi_controller.realtime import OTHERS_PRIORITY, PRIORITY
 from polysight.simulators import gpio
 from tests.support.paths import REPO
 from tests.support.pi.program import PROGRAM, Process
+from tests.support.rigs import timed_by_the_program
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing():
     pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}", allow_module_level=True)
 
 PR_CAPBSET_DROP, CAP_IPC_LOCK, CAP_SYS_NICE = 24, 14, 23
+
+
+@pytest.fixture
+def instrument(instrument):
+    """With SYNC_IN on a GPIO line."""
+    return timed_by_the_program(instrument)
 
 
 @pytest.fixture

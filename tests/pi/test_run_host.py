@@ -121,7 +121,7 @@ def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory
             bench.ask(m.Replay(scan_id="s", from_seq=1))
         else:
             bench.ask(m.RunRow(scan_id="another", row_index=0, take=1))
-            assert isinstance(bench.executor.host_alive("another"), m.Refused)
+            assert isinstance(bench.executor.host_alive("another", ""), m.Refused)
     assert bench.of(m.Fault)[0].number == PiFault.HOST_LOST
     bench.journals.close()
 

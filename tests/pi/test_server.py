@@ -62,6 +62,18 @@ def test_stage_gets_the_row_in_steps_and_a_heartbeat(pi, stage):
     assert any(isinstance(e, m.StageStatus) and e.state == "row" for e in host.events)
 
 
+def test_homing_tells_the_steps_that_were_lost(pi, stage):
+    """The check after a scan: home again, against the switches."""
+    host = pi.host
+    host.accepted(host.begin())
+    host.home()
+    assert (host.ask(m.Status()).lost_x_mm, host.ask(m.Status()).lost_y_mm) == (0, 0)
+    stage.lost = (-7, 12)
+    host.home()
+    status = host.ask(m.Status())
+    assert (status.lost_x_mm, status.lost_y_mm) == (-7 / 200, 12 / 200)
+
+
 def test_repeated_requests_act_once(pi, stage):
     host = pi.host
     host.accepted(host.begin())

@@ -102,7 +102,7 @@ def test_no_port_and_another_protocol(tmp_path, dry_stage, monkeypatch):
     with pytest.raises(StageLostError, match="cannot be opened"):
         StageLink(str(tmp_path / "none"), 115200, lambda _: None)
     monkeypatch.setattr("polysight.pi_controller.stage_link.PROTOCOL_VERSION", 9)
-    with pytest.raises(StageLostError, match="speaks protocol 1, this program speaks 9"):
+    with pytest.raises(StageLostError, match="speaks protocol 2, this program speaks 9"):
         connect(dry_stage)
 
 

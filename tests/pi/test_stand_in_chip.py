@@ -23,6 +23,7 @@ from tests.support.paths import REPO
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.program import Process, run
 from tests.support.pi.wires_log import WiresLog
+from tests.support.rigs import timed_by_the_program
 
 pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
 if lacking := gpio.missing():
@@ -30,6 +31,12 @@ if lacking := gpio.missing():
 
 TRIGGER, SYNC = 26, 22
 POINTS = 4
+
+
+@pytest.fixture
+def instrument(instrument):
+    """With SYNC_IN on a GPIO line."""
+    return timed_by_the_program(instrument)
 
 
 @pytest.fixture

@@ -51,7 +51,7 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
         ("chirp", "hpf1_khz", 180.0, "hpf1_khz must be one of"),
         ("burst", "period_us", 200.0, "at least 300 us"),
         ("burst", "width_us", 5.0, r"0\.025\.\.4 us"),
-        ("pi", "trigger_in", 22, "trigger_in must not be one of sync_out"),
+        ("pi", "trigger_in", 10, "trigger_in must not be one of sync_out"),
         ("pi", "sync_out", [22, 23], "drives exactly one line"),
         ("pi", "trigger_bias", "up", "pi.trigger_bias = 'up'"),
         ("pi", "trigger_debounce_us", 10, "swallows every trigger"),

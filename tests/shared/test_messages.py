@@ -13,10 +13,15 @@ from polysight.shared.raster import RasterPlan, Row
 n = st.integers(0, 2**62)
 text = st.text(max_size=40)
 x = st.floats(-1e6, 1e6, allow_nan=False)
-scan_ids = st.from_regex(r"[A-Za-z0-9._-]{1,40}", fullmatch=True)
+scan_ids = st.from_regex(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,39}", fullmatch=True)
+seqs = st.integers(0, 2**31 - 1)
+indices = st.integers(0, 99_999)
+numbers = st.integers(0, 999)
+micros = st.floats(0, 1e7)
+owners = st.sampled_from(["", "0a1b2c"])
 plans = st.builds(RasterPlan, columns=st.integers(1, 999), rows=st.integers(1, 999), step_x_mm=x, step_y_mm=x)
-rows = st.builds(Row, index=n, y_mm=x, x_start_mm=x, step_mm=x, points=n)
-head = {"version": st.just(m.WIRE_VERSION), "scan_id": text, "seq": n, "t_mono_ns": n}
+rows = st.builds(Row, index=indices, y_mm=x, x_start_mm=x, step_mm=x, points=indices)
+head = {"version": st.just(m.WIRE_VERSION), "scan_id": scan_ids | st.just(""), "seq": seqs, "t_mono_ns": n}
 exits = st.sampled_from(["success", "abort", "fail"])
 states = st.sampled_from(["idle", "homing", "ready", "running", "held", "fault"])
 small = st.integers(1, 10**6)
@@ -27,20 +32,20 @@ events = st.one_of(
     st.builds(m.RowStarted, row=rows, take=small, **head),
     st.builds(
         m.RowFinished,
-        row_index=n,
+        row_index=indices,
         take=small,
         status=st.sampled_from(["done", "aborted", "fault"]),
         points=n,
         edges=n,
         bursts=n,
         pulses=n,
-        fault=n,
+        fault=numbers,
         reason=text,
         **head,
     ),
     st.builds(
         m.Capture,
-        row_index=n,
+        row_index=indices,
         take=small,
         point=n,
         column=n,
@@ -52,23 +57,32 @@ events = st.one_of(
         jitter_ns=n,
         **head,
     ),
-    st.builds(m.StageStatus, state=text, x_mm=x, y_mm=x, points=n, alarm=n, **head),
+    st.builds(m.StageStatus, state=text, x_mm=x, y_mm=x, points=n, alarm=numbers, **head),
     st.builds(m.Heartbeat, state=states, period_ms=n, **head),
-    st.builds(m.Fault, number=n, what=text, why=text, remedy=text, **head),
+    st.builds(m.Fault, number=numbers, what=text, why=text, remedy=text, **head),
 )
 v = {"version": st.just(m.WIRE_VERSION)}
 commands = st.one_of(
     st.builds(m.Hello, host_release=text, **v),
-    st.builds(m.BeginRun, scan_id=scan_ids, plan=plans, pulses=small, period_us=x, width_us=x, speed_mm_s=x, **v),
-    st.builds(m.EndRun, scan_id=text, exit_status=exits, reason=text, **v),
+    st.builds(
+        m.BeginRun,
+        scan_id=scan_ids,
+        plan=plans,
+        pulses=st.integers(1, 65_536),
+        period_us=micros,
+        width_us=micros,
+        speed_mm_s=st.floats(0, 1e5),
+        **v,
+    ),
+    st.builds(m.EndRun, scan_id=scan_ids, exit_status=exits, reason=text, **v),
     st.builds(m.Home, **v),
-    st.builds(m.RunRow, scan_id=text, row_index=n, take=small, **v),
-    st.builds(m.Hold, **v),
+    st.builds(m.RunRow, scan_id=scan_ids, row_index=indices, take=small, **v),
+    st.builds(m.Hold, owner=owners, **v),
     st.builds(m.Resume, **v),
-    st.builds(m.Abort, reason=text, **v),
+    st.builds(m.Abort, reason=text, owner=owners, **v),
     st.builds(m.Status, **v),
-    st.builds(m.Pulse, pulses=st.integers(1, m.MOST_PULSES), period_us=x, width_us=x, **v),
-    st.builds(m.Replay, scan_id=text, from_seq=small, limit=st.integers(1, 10000), **v),
+    st.builds(m.Pulse, pulses=st.integers(1, m.MOST_PULSES), period_us=micros, width_us=micros, **v),
+    st.builds(m.Replay, scan_id=scan_ids, from_seq=small, limit=st.integers(1, 10000), **v),
 )
 replies = st.one_of(
     st.builds(
@@ -77,31 +91,31 @@ replies = st.one_of(
         firmware=text,
         backend=text,
         state=states,
-        scan_id=text,
-        last_seq=n,
+        scan_id=scan_ids,
+        last_seq=seqs,
         stage=st.dictionaries(text, x, max_size=5),
         **v,
     ),
     st.builds(m.Accepted, state=states, **v),
-    st.builds(m.Refused, number=n, what=text, why=text, remedy=text, **v),
+    st.builds(m.Refused, number=numbers, what=text, why=text, remedy=text, **v),
     st.builds(
         m.StatusReply,
         state=states,
         homed=st.booleans(),
         x_mm=x,
         y_mm=x,
-        scan_id=text,
-        row_index=st.integers(-1, 10**6),
-        take=n,
+        scan_id=scan_ids,
+        row_index=st.integers(-1, 99_999),
+        take=seqs,
         points=n,
         pulses=n,
-        last_seq=n,
-        fault=n,
+        last_seq=seqs,
+        fault=numbers,
         reason=text,
         **v,
     ),
-    st.builds(m.Pulsed, pulses=n, width_max_ns=n, jitter_ns=n, fault=n, **v),
-    st.builds(m.ReplayReply, events=st.lists(events, max_size=3), last_seq=n, **v),
+    st.builds(m.Pulsed, pulses=n, width_max_ns=n, jitter_ns=n, fault=numbers, **v),
+    st.builds(m.ReplayReply, events=st.lists(events, max_size=3), last_seq=seqs, **v),
 )
 
 

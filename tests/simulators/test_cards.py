@@ -127,10 +127,10 @@ def pulse(start: Start, tmp_path: Path) -> Iterator[Callable[..., None]]:
     del start
     clients: list[WireClient] = []
 
-    def send(first: int, n: int, line: int = 22) -> None:
+    def send(first: int, n: int, line: int = 10) -> None:
         if not clients:
             clients.append(WireClient(tmp_path / "w.sock"))
-            clients.append(WireClient(tmp_path / "w.sock", (22, 23)))  # joined last, and so is told last
+            clients.append(WireClient(tmp_path / "w.sock", (10, 23)))  # joined last, and so is told last
         edges = []
         for k in range(first, first + n):
             edges += [WireEdge(k * PERIOD_NS, line, 1), WireEdge(k * PERIOD_NS + 1000, line, 0)]

@@ -101,7 +101,7 @@ def test_hold_resumes_on_the_exact_grid(stage, only_edges, only_motions, seed: i
         stage.run_ms(600)
         held += stage.status().fields["state"] == "hold"
         assert only_motions(stage.wires)[-1].vx_um_s == 0
-        stage.rx(bytes([Immediate.RESUME]))
+        stage.rx(Immediate.RESUME.sent)
     stage.rest()
     (done,) = stage.replies()
     assert held == 3

@@ -64,7 +64,9 @@ def test_error_header_is_generated():
 def test_parameters_and_bytes():
     text = (SKETCH / "stage.h").read_text(encoding="ascii")
     assert dict(re.findall(r"PARAMETER_([A-Z_]+) = (\d+)", text)) == {p.name: str(int(p)) for p in Parameter}
-    assert dict(re.findall(r"IMMEDIATE_([A-Z]+) = (0x\d+)", text)) == {i.name: f"0x{int(i):02x}" for i in Immediate}
+    assert dict(re.findall(r"immediate_([a-z]+) = (0x\w+)", text.lower())) == {
+        i.name.lower(): f"0x{int(i):02x}" for i in Immediate
+    }
 
 
 def test_limits():

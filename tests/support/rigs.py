@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
+
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.tables import decode, to_builtins
 from tests.support.paths import RIG_FILE
@@ -16,6 +18,12 @@ Change = Callable[[dict[str, Any]], None]
 def published_rig() -> Instrument:
     """The rig of instrument.toml."""
     return load_instrument(RIG_FILE)
+
+
+def timed_by_the_program(rig: Instrument) -> Instrument:
+    """The same with SYNC_IN on a GPIO line, as the published rig had it: the program makes the pulses."""
+    pi = msgspec.structs.replace(rig.pi, wiring="fanout", sync_out=(22,))
+    return msgspec.structs.replace(rig, pi=pi)
 
 
 def rig_table() -> dict[str, Any]:

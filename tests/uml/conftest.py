@@ -19,7 +19,7 @@ from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
 from polysight.simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 from tests.support.paths import REPO
-from tests.support.rigs import published_rig
+from tests.support.rigs import published_rig, timed_by_the_program
 
 HERE = Path(__file__).parent
 LIMIT_S = 900
@@ -81,7 +81,7 @@ def _rig(points: int, one_shot: bool) -> Instrument:
 
     In real time a system call takes some 10 us in user-mode Linux: there pulses are not short enough without one shot.
     """
-    rig = published_rig()
+    rig = timed_by_the_program(published_rig())
     replace = msgspec.structs.replace
     width_mm = (points - 1) * rig.grid.step_x_mm
     return replace(

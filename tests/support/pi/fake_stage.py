@@ -2,7 +2,7 @@
 
 Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many answers),
 `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `extra` (a trigger too many),
-`alarm_at` (alarm number at a point), `pace_s` (wall time from point to point).
+`alarm_at` (alarm number at a point), `lost` (steps that homing finds lost), `pace_s` (wall time from point to point).
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class FakeStage:
         self.lose = self.damage = self.lose_end = 0
         self.skip: set[int] = set()
         self.extra = False
+        self.lost = (0, 0)
         self.alarm_at: dict[int, int] = {}
         self.pace_s = 0.0
         self.homed = self.moving = self.held = False
@@ -100,7 +101,7 @@ class FakeStage:
                 self.moving = False
                 if self.banner:
                     time.sleep(0.05)  # a boot, and the port's flush on opening
-                    self.say(Reply("banner", fields={"fw": "fake", "proto": "1"}))
+                    self.say(Reply("banner", fields={"fw": "fake", "proto": "2"}))
             open_before = is_open
             if not is_open:
                 time.sleep(0.005)
@@ -186,7 +187,8 @@ class FakeStage:
             self.alarm = number
             end = Reply("alarm", number=number)
         else:
-            end = Reply("done", c.sequence, fields={k: str(v) for k, v in where.items()})
+            lost = {"lostx": self.lost[0], "losty": self.lost[1]} if c.verb == "HOME" else {}
+            end = Reply("done", c.sequence, fields={k: str(v) for k, v in (where | lost).items()})
         self._end = (c.sequence, end)
         if self.lose_end:
             self.lose_end -= 1

@@ -26,7 +26,7 @@ class Conversation:
 
     def _bytes(self, text: str) -> bytes:
         if text.startswith("<"):
-            return bytes([Immediate[text.strip("<>")]])
+            return Immediate[text.strip("<>")].sent
         if text.startswith("sealed "):
             body = ast.literal_eval("b" + text.removeprefix("sealed "))
             return body + b"*%04X\n" % crc16(body)

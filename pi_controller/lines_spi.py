@@ -1,0 +1,129 @@
+"""SYNC_IN on MOSI of an SPI controller (spidev), the trigger input through libgpiod. Not run on a Pi yet.
+
+One burst is one transfer, one system call: spi_pulses.py makes its bits. The kernel ends a transfer that has begun also
+when this program is killed, and its last bits are low; the line is low before, between and after.
+Source of the ioctl: Linux, include/uapi/linux/spi/spidev.h.
+"""
+
+from __future__ import annotations
+
+import array
+import errno
+import fcntl
+import os
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+from polysight.pi_controller.lines_gpiod import TriggerInput
+from polysight.pi_controller.spi_pulses import DEFAULT_BUFSIZ, SpiBurst
+from polysight.pi_controller.trigger_lines import Clock, Edge
+from polysight.shared.config import Pi
+from polysight.shared.errors import DeviceError
+from polysight.shared.faults import PiFault
+from polysight.shared.messages import SPI
+
+BUFSIZ = Path("/sys/module/spidev/parameters/bufsiz")
+# _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8): mode 0, without chip select where the driver can.
+MESSAGE, WRITE_MODE = 0x40206B00, 0x40016B01
+MODE_NO_CS, MODE_0 = 0x40, 0x00
+_TRANSFER = struct.Struct("=QQIIHBBBBBB")  # tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
+_REASONS = {
+    errno.ENOENT: ("SPI is off", "put `dtparam=spi=on` into /boot/firmware/config.txt and start the Pi again"),
+    errno.EACCES: (
+        "no permission",
+        "add the user to the group spi; the udev rule 60-polysight.rules gives it the device",
+    ),
+    errno.EMSGSIZE: ("the transfer is longer than spidev's buffer", "raise bufsiz; `polysight-pi check` says to what"),
+}
+
+
+def read_bufsiz(file: Path = BUFSIZ) -> int:
+    """Longest transfer that spidev takes, bytes."""
+    try:
+        return int(file.read_text())
+    except (OSError, ValueError):
+        return DEFAULT_BUFSIZ
+
+
+class SpiDevice:
+    """A spidev device. Raises DeviceError when it cannot be had; the line is low from then on."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        try:
+            self._fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as e:
+            raise self._refused(e) from None
+        try:
+            try:
+                fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_NO_CS]))
+            except OSError:
+                fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_0]))
+            self.transfer(bytes(1), 1_000_000)
+        except (OSError, DeviceError) as e:
+            os.close(self._fd)
+            raise (e if isinstance(e, DeviceError) else self._refused(e)) from None
+
+    def transfer(self, data: bytes, clock_hz: int) -> tuple[int, int]:
+        """Clock the bytes out; returns the times before and after the one system call. Raises DeviceError."""
+        buffer = array.array("B", data)
+        message = _TRANSFER.pack(buffer.buffer_info()[0], 0, len(data), clock_hz, 0, 8, 0, 0, 0, 0, 0)
+        try:
+            before = time.monotonic_ns()
+            fcntl.ioctl(self._fd, MESSAGE, message)
+            return before, time.monotonic_ns()
+        except OSError as e:
+            raise self._refused(e) from None
+
+    def _refused(self, e: OSError) -> DeviceError:
+        why, remedy = _REASONS.get(e.errno or 0, (f"the kernel says: {e.strerror}", "look at the kernel's log (dmesg)"))
+        return DeviceError(f"fault {int(PiFault.TRIGGER_LINE_LOST)}: {self.path}: {e.strerror}", why, remedy)
+
+    def close(self) -> None:
+        """Let go of it."""
+        os.close(self._fd)
+
+
+class SpiLines:
+    """Trigger input with kernel time stamps; SYNC_IN on MOSI.
+
+    Raises
+    ------
+    DeviceError
+        when the SPI device, the chip or the trigger line cannot be had.
+    """
+
+    name: str = SPI
+
+    def __init__(self, pi: Pi, gpiod: Any, chip_path: str | None = None, clock: Clock | None = None) -> None:
+        self.bufsiz = read_bufsiz()
+        self._device = SpiDevice(pi.spi_device)
+        try:
+            self._input = TriggerInput(pi, gpiod, chip_path, clock)
+        except DeviceError:
+            self._device.close()
+            raise
+        self.now_ns, self.sleep_until = self._input.now_ns, self._input.sleep_until
+
+    def wait_edge(self, limit_s: float) -> Edge | None:
+        """The next rising edge. Raises DeviceError when the line is gone."""
+        return self._input.wait_edge(limit_s)
+
+    def transfer(self, burst: SpiBurst) -> tuple[int, int]:
+        """Send a burst. Raises DeviceError."""
+        return self._device.transfer(burst.data, burst.clock_hz)
+
+    def set_output(self, active: bool) -> None:
+        """MOSI is low whenever no transfer runs: there is nothing to set."""
+
+    def flush(self) -> None:
+        """Nothing is buffered."""
+
+    def close(self) -> None:
+        """Lines released; MOSI is low."""
+        try:
+            self._device.close()
+        finally:
+            self._input.close()

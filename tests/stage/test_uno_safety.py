@@ -1,0 +1,143 @@
+"""Chatter, glitches and stray bytes on an emulated UNO with the compiled sketch, in lockstep: nothing moves by them."""
+
+from __future__ import annotations
+
+import itertools
+import random
+
+import pytest
+
+from polysight.shared.stage_line import Immediate, Parameter
+from polysight.simulators.uno import HZ
+
+US, MS = HZ // 1_000_000, HZ // 1000
+TRIGGER, X_PUL = 2, 5
+TOP_RATE = 20_000  # steps/s
+CHATTER = {
+    "yes": lambda _: b"y\n" * 6,
+    "line ends": lambda _: b"\n" * 12,
+    "no line ends": lambda _: b"N" * 12,
+    "heartbeats without end": lambda _: bytes([Immediate.STATUS]) * 12,
+    "half lines": lambda _: b"N1 MOVE 0 0",
+    "a wrong baud rate": lambda rng: bytes(rng.choice([0x00, 0x78, 0x80, 0x84, 0xE6, 0xF8]) for _ in range(12)),
+}  # each a millisecond and more of the line at 115,200 baud
+
+
+@pytest.mark.parametrize("kind", CHATTER)
+def test_chatter_is_no_heartbeat(host, kind: str):
+    """The stage rests within its heartbeat's time and its ramp after the last sign of life, whatever comes then."""
+    rng = random.Random(kind)
+    host.set(Parameter.HEARTBEAT, 500)
+    host.uno.watch(X_PUL)
+    host.obeyed("MOVE", 100_000, 0, 4000)
+    for _ in range(5):
+        host.uno.run_ms(100)
+        host.uno.feed(bytes([Immediate.STATUS]))
+    host.uno.settle()
+    silent_from = host.uno.cycle
+    host.uno.edges.clear()
+    for _ in range(900):
+        host.uno.feed(CHATTER[kind](rng))
+        host.uno.run_ms(1)
+    steps = [e.cycle for e in host.uno.edges if e.value]
+    assert silent_from + 400 * MS < steps[-1] <= silent_from + (600 + 100 + 10) * MS
+    host.uno.settle()
+    host.uno.run_ms(50)
+    host.uno.received.clear()
+    host.uno.feed(b"\n")
+    host.uno.run_ms(20)
+    host.uno.received.clear()
+    status = host.status()
+    assert (status.integer("alarm"), status.integer("homed")) == (11, 0)
+
+
+@pytest.mark.parametrize("mask", [1, 2, 4, 7])
+def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
+    """Up to 100 us long, at any moment of a row at 100 mm/s: the row ends as if there had been none."""
+    rng = random.Random(mask)
+    host.set(Parameter.ACCEL, 400_000)
+    host.uno.edges.clear()
+    points, glitches = 120, 0
+    wanted = 1000 if request.config.getoption("--long") else 250
+    while glitches < wanted:
+        host.obeyed("ROW", 4000, 400, points, 500, TOP_RATE)
+        for _ in range(250):
+            host.uno.run(rng.randint(0, 8 * MS))
+            host.uno.press(mask)
+            host.uno.run(rng.choice([30, 60, 100]) * US)
+            host.uno.press(0)
+        glitches += 250
+        host.uno.rest()
+        (done,) = host.replies()
+        assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
+    rising = [e for e in host.uno.edges if e.value]
+    assert [host.at(e) for e in rising[-points:]] == [(4000 + 400 * i, 500) for i in range(points)]
+
+
+@pytest.mark.parametrize("rate", [500, 4000, TOP_RATE])
+@pytest.mark.parametrize(("mask", "number"), [(1, 12), (4, 14)])
+def test_a_real_switch_stops_at_once(host, rate: int, mask: int, number: int):
+    """One that stays closed for 15 ms, as every switch does: within five steps or six."""
+    host.set(Parameter.ACCEL, 400_000)
+    host.uno.watch(X_PUL)
+    host.obeyed("MOVE", 40_000, 0, rate)
+    host.uno.run_ms(400)
+    host.uno.edges.clear()
+    pressed = host.uno.cycle
+    host.uno.press(mask)
+    host.uno.run_ms(15)
+    steps = [e.cycle for e in host.uno.edges if e.value]
+    assert len(steps) <= 6
+    assert not steps or steps[-1] <= pressed + 6 * HZ // rate
+    host.uno.press(0)
+    host.uno.run_ms(50)
+    assert [(r.kind, r.number) for r in host.replies()] == [("alarm", number)]
+
+
+def test_no_stray_byte_ends_a_hold(host):
+    """Every single byte but STOP, once, in a hold: the stage stays where it is, and goes on when it is told to."""
+    host.uno.watch(X_PUL)
+    host.obeyed("ROW", 4000, 200, 60, 500, 4000)
+    host.uno.run_ms(1200)
+    host.uno.feed(bytes([Immediate.HOLD]))
+    host.uno.rest()
+    host.replies()
+    host.uno.edges.clear()
+    for byte in set(range(256)) - {Immediate.STOP}:
+        host.uno.feed(bytes([byte]) + b"\n")
+        host.uno.run_ms(15)
+    host.uno.settle()
+    assert host.uno.edges == []
+    host.uno.feed(Immediate.RESUME.sent)
+    host.uno.rest()
+    assert host.replies()[-1].kind == "done"
+
+
+def test_no_two_flips_make_a_resume():
+    """Of any other byte on the line."""
+    others = [*set(Immediate) - {Immediate.RESUME}, *b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ-* \n"]
+    assert min((int(Immediate.RESUME) ^ byte).bit_count() for byte in others) >= 3
+    assert all((a ^ b).bit_count() >= 2 for a, b in itertools.combinations(Immediate, 2))
+
+
+@pytest.mark.parametrize("accel", [400, 2_000, 40_000])
+def test_homing_overruns_the_switch_by_little(host, accel: int):
+    """Whatever the rows' acceleration is: a millimetre, within which a switch has to take it."""
+    host.motion("MOVE", 12_000, 300, TOP_RATE)
+    host.set(Parameter.ACCEL, accel)
+    host.uno.watch(X_PUL)
+    host.uno.edges.clear()
+    host.obeyed("HOME")
+    host.uno.rest()
+    host.replies()
+    lowest = min(e.x for e in host.uno.edges)
+    assert -250 <= lowest <= 0  # steps behind the closing point; 200 are 1 mm
+    assert host.motion("ROW", 6000 if accel > 400 else 60_000, 200, 3, 500, 1000).integer("points") == 3
+
+
+def test_homing_tells_the_steps_that_were_lost(host):
+    host.motion("MOVE", 9000, 700, TOP_RATE)
+    host.uno.slip(-7, 12)
+    done = host.motion("HOME")
+    assert (done.integer("lostx"), done.integer("losty")) == (-7, 12)
+    assert (host.motion("HOME").integer("lostx"), done.integer("x"), done.integer("y")) == (0, 0, 0)

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
+from polysight.host.acquisition.missed_pulses import PlacedFrames, earliest_pulse, place_frames, slipped_frames
 from polysight.host.capture import RowCapture, read_index, write_index
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
@@ -65,6 +65,16 @@ def find_slip(path: Path, row: Row, told: list[ToldCapture], rig: Instrument) ->
     """
     times = _times(path, row, told, rig)
     return slipped_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES) if times else None
+
+
+def first_pulse_ns(told: list[ToldCapture]) -> int | None:
+    """A time before the row's first pulse, monotonic clock, by its capture events; None where they do not tell."""
+    events = [t for t in sorted(told, key=lambda t: t.event.point) if t.event.pulses]
+    if not events or events[0].event.point != 0:
+        return None
+    first, last = [t.event.first_pulse_ns for t in events], [t.event.last_pulse_ns for t in events]
+    sent = np.linspace(first, last, events[0].event.pulses, axis=1, dtype=np.int64)
+    return earliest_pulse(sent, np.array([t.told_ns for t in events], dtype=np.int64))
 
 
 def _times(

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
 from polysight.host.capture.decode import decode_real, decode_row, decode_two_lane
-from polysight.host.capture.placement import Placed, Placement
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import Placed, place_record
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 
@@ -155,11 +156,11 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     size = max(ends) - min(ahead)
     if size > 1 << 34:
         raise DataError(f"byte counts span {size} bytes: more than one record, or corrupted packets")
-    out = np.zeros(size, dtype=np.uint8)
-    placement = Placement(out)
+    log = PacketLog(size)
     for packet in packets:
-        placement.place_packet(packet)
-    return out, placement.finish()
+        log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
+    placed, out = place_record(log)
+    return out, placed
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,11 @@ class EndRow(_Words, frozen=True):
     """The row has ended: fetch what still waits, make the file durable. Answered with RowCapture or Failed.
 
     `card_status` holds the bits the card reported since record start: some say that it lost data itself.
+    `not_before_ns`: as in Report.
     """
 
     card_status: int = 0
+    not_before_ns: int = 0
 
 
 class Discard(_Words, frozen=True):
@@ -65,7 +67,9 @@ class Discard(_Words, frozen=True):
 
 
 class Report(_Words, frozen=True):
-    """Answered with Progress."""
+    """Answered with Progress. No pulse of the row was sent before `not_before_ns` (monotonic clock; 0: not known)."""
+
+    not_before_ns: int = 0
 
 
 class Opened(_Words, frozen=True):
@@ -137,6 +141,11 @@ class RowCapture(_Words, frozen=True):
     card_status: int = 0
     holes: list[tuple[int, int]] = []
     slipped: bool = False
+    conflicting: int = 0
+    restarted: int = 0
+    before_pulses: int = 0
+    clock_jumps: int = 0
+    packets_crc32: int = 0
 
     @property
     def missing_bytes(self) -> int:
@@ -263,17 +272,18 @@ class ReceiverProcess:
             self._take(self._next())
         return self._progress
 
-    def report(self) -> Progress:
-        """How far the row is, asked for."""
-        return self._ask(Report(), Progress, _ANSWER_LIMIT_S)
+    def report(self, not_before_ns: int = 0) -> Progress:
+        """How far the row is, asked for. No pulse of it was sent before `not_before_ns`, if that is given."""
+        return self._ask(Report(not_before_ns), Progress, _ANSWER_LIMIT_S)
 
-    def end_row(self, card_status: Status | None = None) -> RowCapture:
+    def end_row(self, card_status: Status | None = None, not_before_ns: int = 0) -> RowCapture:
         """End the row: its file is durable when this returns. Raises DeviceError.
 
+        No pulse of the row was sent before `not_before_ns` (monotonic clock): packets that came earlier are left over.
         `card_status` is what the card reported by itself since record start. With bits 7 or 9 in it the card dropped
         data before numbering it: the row is masked as a whole, and the reason says so.
         """
-        return self._ask(EndRow(int(card_status or 0)), RowCapture, _ANSWER_LIMIT_S)
+        return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_LIMIT_S)
 
     def discard(self) -> None:
         """Forget the running row and remove its file."""

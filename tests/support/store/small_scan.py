@@ -180,8 +180,7 @@ class SmallRig:
     def _end(self, name: str, segment: Segment) -> RowCapture:
         row, take = self._row
         data = self._samples.of(name, row)
-        segment.data[:] = np.frombuffer(data, dtype=np.uint8)
-        crc = segment.finish()
+        crc = segment.finish(np.frombuffer(data, dtype=np.uint8))
         index = write_index(segment.path.with_suffix(".idx"), {"missing": []}, np.zeros((1, 2), dtype=np.int64))
         zero = dict.fromkeys(("duplicates", "late", "outside", "disagreeing", "malformed", "short", "strangers"), 0)
         return RowCapture(

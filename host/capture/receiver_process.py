@@ -189,12 +189,8 @@ class Receiver:
         placed, out = place_record(log, asked.frame_bytes, row.past, not_before_ns, dropped)
         self._past, self._memory = placed.past, log.payload
         crc = row.segment.finish(out)
-        status = {"card_status": request.card_status}
-        index_crc = write_index(
-            path.with_suffix(".idx"),
-            {"row": asked.row, "take": asked.take, **placed.facts(), **status},
-            placed.arrivals,
-        )
+        facts = {"row": asked.row, "take": asked.take, **placed.facts(), "card_status": request.card_status}
+        index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
         counts, losses, arrivals = vars(placed.counts).copy(), vars(placed.losses), placed.arrivals
         counts["packets"] = counts.pop("placed")
         return words.RowCapture(

@@ -1,9 +1,9 @@
 """Which of a row's packets are its record, and where the record starts: decided from all of them together.
 
 What is observed, what is hidden and which decision has which error: docs/spec/placement.md. In short: within a record
-all packets but the last are full, so `byte count - full x sequence` is one number, the record's *line*. Packets of other
-records lie on other lines, or on the same line at other counts. The record's start is believed where counters of the
-records before leave one possibility, or where its end proves it. Anything else is not located.
+all packets but the last are full, so `byte count - full x sequence` is one number, the record's *line*. Packets of
+other records lie on other lines, or on the same line at other counts. The record's start is believed where counters of
+the records before leave one possibility, or where its end proves it. Anything else is not located.
 """
 
 from __future__ import annotations
@@ -264,7 +264,7 @@ class _Search:
 
     def _from_past(self, bases: Counts, first: int, stop: int, short: bool) -> _Verdict:
         """The record starts at one of these bases."""
-        e, full = self._expected, self._p.full
+        e = self._expected
         possible = bases[(stop <= bases + e) & (bases <= first)]
         if not possible.size:
             base = int(bases[bases <= first].max(initial=-1)) if (bases <= first).any() else int(bases.min())

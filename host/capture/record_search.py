@@ -380,11 +380,11 @@ def _full_payload(log: PacketLog) -> int:
 def _before_pulses(log: PacketLog, not_before_ns: int) -> tuple[Flags, int]:
     """Which packets came before any pulse was sent, and how often the clock of the arrivals went backwards.
 
-    A clock that jumps tells nothing; nor does one by which every packet came too early.
+    A clock that jumps tells nothing.
     """
     jumps = int((np.diff(log.batches[:, 0]) < 0).sum())
     early = log.arrivals_ns < not_before_ns
-    return (early, jumps) if not (jumps or early.all()) else (np.zeros_like(early), jumps)
+    return (np.zeros_like(early) if jumps else early), jumps
 
 
 def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:

@@ -12,7 +12,7 @@ from polysight.host.capture.segment import Segment, read_index
 from polysight.shared.errors import DataError, DeviceError
 
 
-def test_memory_is_taken_again_and_clean(tmp_path):
+def test_memory_is_taken_again_and_clean():
     first = PacketLog(9000)
     first.payload[:] = 7
     second = PacketLog(8000, first.payload)

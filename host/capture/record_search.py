@@ -19,7 +19,7 @@ from polysight.host.capture.packet_log import PacketLog
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 SMALL_RECORD = 16  # packets: a record as small as this may be delayed as a whole
-_REMEMBERED = 16  # earlier records whose leftovers are known by their counters
+_REMEMBERED = 4  # earlier records whose leftovers are known by their counters
 _JOINS, _JOINS_SMALL = 1, 3  # doubtful records in a row, without a seam, after which the next one is believed
 
 
@@ -50,7 +50,9 @@ class Past:
     joint, joined
         Where a whole record ended whose start was not believed, and how many of them followed without a seam.
     unseen
-        Whether a small record may have been sent of which nothing came, and it is not known where.
+        Whether a record may have been sent of which nothing came, and it is not known where.
+    guessed
+        Whether `base` is not certain: only where its record ended is.
     """
 
     base: Counters | None = None
@@ -59,6 +61,7 @@ class Past:
     joint: Counters | None = None
     joined: int = 0
     unseen: bool = False
+    guessed: bool = False
 
     @staticmethod
     def ending_at(start: Counters) -> Past:
@@ -248,12 +251,16 @@ class _Search:
         else:
             inside = p.ahead[which] >= stop - self._expected
             verdict = self._from_itself(int(p.ahead[which][inside].min()), first, stop, last_size)
+            if verdict.located and not self._much(which):
+                why = "too little of it came to tell it from an earlier record's end"
+                verdict = replace(verdict, located=False, certain=False, reason=why)
             alone = which.size == self._live.sum() and not self._past.spans and p.at(first, line) == Counters(0, 1)
             if alone and not verdict.located and not verdict.excess:
                 why = self._too_short(first, stop, short).reason or "its last bytes did not come"
                 verdict = replace(verdict, reason=f"{why}; the card's counters had just begun", fresh=True)
         start = p.at(verdict.base, line)
-        if verdict.located and ((self._past.unseen and not bases.size) or bool(self._unsure[which].any())):
+        unclear = (self._past.unseen and not bases.size) or bool(self._unsure[which].any())
+        if verdict.located and unclear and not (self._expected >= SMALL_RECORD * p.full and self._much(which)):
             verdict = replace(verdict, doubtful=True)
         if verdict.doubtful:
             enough = _JOINS if self._expected >= SMALL_RECORD * p.full else _JOINS_SMALL
@@ -261,6 +268,11 @@ class _Search:
                 why = "its packets could as well be those of an earlier record that came late"
                 return replace(verdict, located=False, certain=False, reason=why)
         return verdict
+
+    def _much(self, which: Counts) -> bool:
+        """Whether half of the record's bytes are among these packets: no network holds back so many."""
+        _, one = np.unique(self._p.ahead[which], return_index=True)
+        return 2 * int(self._p.sizes[which][one].sum()) >= self._expected
 
     def _from_past(self, bases: Counts, first: int, stop: int, short: bool) -> _Verdict:
         """The record starts at one of these bases."""
@@ -325,11 +337,15 @@ def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_by
     if found.base is None:
         return _after_nothing(past, e, full, frame_bytes)
     base, ends = found.base, (found.offsets + log.sizes)[found.own]
-    if located:
+    stop = int(ends.max())
+    more = _more_records(found, stop, e)
+    if located and not more:
         sure = tuple(span for span in past.spans if span.sure)
         return Past(base, (e,), _remember(sure, Span(base, e)))
-    first, stop = int(found.offsets[found.own].min()), int(ends.max())
+    first = int(found.offsets[found.own].min())
     short = bool((log.sizes[found.own][ends == stop] < full).all())
+    if more:  # where the last of them ended is not known
+        return Past(spans=_remember(past.spans, Span(base, max(stop, e))), unseen=True)
     if found.certain:
         frames = range(-(-stop // frame_bytes) * frame_bytes, e + 1, frame_bytes) if frame_bytes > 1 else range(0)
         return Past(base, tuple(sorted({*frames, *([stop] if short else [])})), _remember(past.spans, Span(base, e)))
@@ -344,17 +360,27 @@ def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_by
         spans = (*spans, Span(end, first + e - stop, sure=False))
     known = Past(spans=spans, joint=end if joined else None, joined=joined, unseen=past.unseen)
     # A short packet ends its record, wherever that began; one cut short on its way leads to a line without packets.
-    return replace(known, base=base, ends=(stop,)) if short and not found.doubtful else known
+    return replace(known, base=base, ends=(stop,), guessed=True) if short and not found.doubtful else known
+
+
+def _more_records(found: Found, stop: int, expected: int) -> bool:
+    """Whether packets have counters behind the record's end: the card has sent another one, nobody knows of what size.
+
+    Or it began anew: packets that are of no record known.
+    """
+    rest = ~(found.own | found.early | found.old)
+    behind = (found.offsets >= stop) & (found.offsets < stop + 2 * expected + found.full)
+    counted = (found.steps > 0) & (found.steps * found.full < stop + 4 * expected + 4 * found.full)
+    return bool((rest & behind & counted).any())
 
 
 def _after_nothing(past: Past, expected: int, full: int, frame_bytes: int) -> Past:
     """Nothing came: the record may have been sent or not."""
-    small = expected < SMALL_RECORD * full
-    if past.base is None or len(past.ends) != 1:
-        return Past(spans=past.spans, unseen=past.unseen or small, joint=past.joint, joined=past.joined)
+    if past.base is None or len(past.ends) != 1 or past.guessed:
+        return Past(spans=past.spans, unseen=True, joint=past.joint, joined=past.joined)
     end = past.ends[0]
     base = past.base.after(end, -(-end // full))
-    spans = _remember(past.spans, Span(base, expected, sure=False)) if small else past.spans
+    spans = _remember(past.spans, Span(base, expected, sure=False))
     step = frame_bytes if frame_bytes > 1 else max(1, expected)
     return Past(base, tuple(range(0, expected + 1, step)), spans)
 

@@ -33,7 +33,7 @@ GRIDS = [  # bytes of a frame, frames of a row
     (1456, 7),
     (512, 30),
 ]
-MOST_REFUSED = 4  # perfect records in a row, after anything that may have happened
+MOST_REFUSED = 8  # perfect records in a row, after anything that may have happened
 
 
 def logged(sent: Sent, expected: int, batch: int) -> PacketLog:

@@ -159,6 +159,8 @@ def place_record(
     if dropped_by_card:
         located, reason = False, f"the card dropped data before numbering it ({dropped_by_card})"
     row.put_in_place()
+    if located and row.conflicts and not found.foreseen:
+        located, reason = False, "packets with the same counters brought different bytes: the card may have begun anew"
     holes = _gaps(row.covered, row.extent)
     missing = _merged([*holes, *row.conflicts, *([(row.extent, log.expected)] if row.extent < log.expected else [])])
     out = row.bytes(missing if located else holes)

@@ -20,6 +20,7 @@ Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 SMALL_RECORD = 16  # packets: a record as small as this may be delayed as a whole
 _REMEMBERED = 4  # earlier records whose leftovers are known by their counters
+_NEAR = 64  # records
 _JOINS, _JOINS_SMALL = 1, 3  # doubtful records in a row, without a seam, after which the next one is believed
 
 
@@ -110,6 +111,8 @@ class Found:
     fresh
         Whether it starts with the counters of a card just switched on, and nothing else came: the base is as good as
         certain for a row that missed triggers, whose frames are placed by their arrival.
+    foreseen
+        Whether the records before tell where it starts.
     clock_jumps
         Times at which the clock of the arrivals went backwards; then arrival decides nothing.
     """
@@ -127,6 +130,7 @@ class Found:
     excess: bool = False
     doubtful: bool = False
     fresh: bool = False
+    foreseen: bool = False
     clock_jumps: int = 0
 
 
@@ -141,6 +145,7 @@ class _Verdict:
     excess: bool = False
     doubtful: bool = False
     fresh: bool = False
+    foreseen: bool = False
 
 
 class _Packets:
@@ -205,7 +210,7 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
     steps = packets.steps - (v.base - line) // full
     return Found(
         base, v.certain, v.located, v.reason, offsets, steps, own, early, old, full, v.excess, v.doubtful,
-        v.fresh, jumps,
+        v.fresh, v.foreseen, jumps,
     )  # fmt: skip
 
 
@@ -247,7 +252,7 @@ class _Search:
         last_size = int(p.sizes[which][p.ahead[which] == last].max())
         stop, short = last + last_size, last_size < p.full
         if bases.size:
-            verdict = self._from_past(bases, first, stop, short)
+            verdict = replace(self._from_past(bases, first, stop, short), foreseen=True)
         else:
             inside = p.ahead[which] >= stop - self._expected
             verdict = self._from_itself(int(p.ahead[which][inside].min()), first, stop, last_size)
@@ -259,7 +264,8 @@ class _Search:
                 why = self._too_short(first, stop, short).reason or "its last bytes did not come"
                 verdict = replace(verdict, reason=f"{why}; the card's counters had just begun", fresh=True)
         start = p.at(verdict.base, line)
-        unclear = (self._past.unseen and not bases.size) or bool(self._unsure[which].any())
+        strange = not bases.size and (self._past.unseen or self._is_behind(verdict.base))
+        unclear = strange or bool(self._unsure[which].any())
         if verdict.located and unclear and not (self._expected >= SMALL_RECORD * p.full and self._much(which)):
             verdict = replace(verdict, doubtful=True)
         if verdict.doubtful:
@@ -268,6 +274,11 @@ class _Search:
                 why = "its packets could as well be those of an earlier record that came late"
                 return replace(verdict, located=False, certain=False, reason=why)
         return verdict
+
+    def _is_behind(self, base: int) -> bool:
+        """Whether a record with this base was sent not long before the place where this one was to start."""
+        near = -_NEAR * (self._expected + self._p.full)
+        return bool(self._ends.size) and near < base < int(self._ends.min())
 
     def _much(self, which: Counts) -> bool:
         """Whether half of the record's bytes are among these packets: no network holds back so many."""
@@ -382,7 +393,7 @@ def _after_nothing(past: Past, expected: int, full: int, frame_bytes: int) -> Pa
     base = past.base.after(end, -(-end // full))
     spans = _remember(past.spans, Span(base, expected, sure=False))
     step = frame_bytes if frame_bytes > 1 else max(1, expected)
-    return Past(base, tuple(range(0, expected + 1, step)), spans)
+    return Past(base, tuple(range(0, expected + 1, step)), spans, unseen=True)
 
 
 def _remember(spans: tuple[Span, ...], span: Span) -> tuple[Span, ...]:

@@ -388,7 +388,7 @@ def _more_records(found: Found, stop: int, expected: int) -> bool:
 def _after_nothing(past: Past, expected: int, full: int, frame_bytes: int) -> Past:
     """Nothing came: the record may have been sent or not."""
     if past.base is None or len(past.ends) != 1 or past.guessed:
-        return Past(spans=past.spans, unseen=True, joint=past.joint, joined=past.joined)
+        return Past(spans=past.spans, unseen=True)
     end = past.ends[0]
     base = past.base.after(end, -(-end // full))
     spans = _remember(past.spans, Span(base, expected, sure=False))

@@ -90,16 +90,25 @@ class Adversary:
         self._late: list[Arrival] = []  # what comes in a later record
         self.resets = 0
 
-    def record(self, frames: int, troubles: tuple[str, ...] = ()) -> Sent:
-        """Send one record of so many frames through these troubles; what is delayed comes with the records after it."""
+    def take_late(self, share: float) -> list[Arrival]:
+        """Some of what is still on its way comes now, a share of it on the average."""
+        coming = [a for a in self._late if self._chance.random() < share]
+        self._late = [a for a in self._late if not any(a is c for c in coming)]
+        return coming
+
+    def record(self, frames: int, troubles: tuple[str, ...] = (), data: bytes = b"") -> Sent:
+        """Send one record of so many frames through these troubles; what is delayed comes with the records after it.
+
+        Without `data` its bytes are drawn.
+        """
         chance, self._number = self._chance, self._number + 1
-        data = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, frames * self._frame, np.uint8).tobytes()
+        if not data:
+            draw = np.random.default_rng(chance.getrandbits(32))
+            data = draw.integers(1, 256, frames * self._frame, np.uint8).tobytes()
         pulse_ns = self._now_ns + 1_000_000
         sent = Sent(self._number, data, pulse_ns, troubles=troubles)
         packets = self._packets(sent, data)
-        before = [a for a in self._late if chance.random() < 0.5]
-        in_between = [a for a in self._late if a not in before and chance.random() < 0.7]
-        self._late = [a for a in self._late if a not in before and a not in in_between]
+        before, in_between = self.take_late(0.5), self.take_late(0.7)
         on_time = self._network(packets, sent)
         arriving = [Arrival(0, p, self._number) for p in on_time]
         for late in in_between:

@@ -318,6 +318,8 @@ class _Row:
 
     def _copy(self, mine: Counts, out: Bytes) -> None:
         """Copy runs of packets that follow each other in the log and in the row."""
+        if not mine.size:
+            return
         offsets, sizes, starts, stops = self.at[mine], self._sizes[mine], self._starts[mine], self._stops[mine]
         joined = (starts[1:] == starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
         firsts = np.flatnonzero(np.append(True, ~joined))

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.host.capture.scheduling import Core
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError
 
@@ -39,6 +40,7 @@ class Open(_Words, frozen=True):
     card_address: str
     buffer_bytes: int
     core: int | None = None
+    own_core: bool = True
 
 
 class BeginRow(_Words, frozen=True):
@@ -211,7 +213,8 @@ class ReceiverProcess:
     buffer_bytes
         Receive buffer to ask the kernel for.
     core
-        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None: any.
+        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None: any. A core
+        that it shares is taken with real-time priority only.
 
     Attributes
     ----------
@@ -226,7 +229,7 @@ class ReceiverProcess:
         when the process does not start, or its address and port cannot be bound.
     """
 
-    def __init__(self, board: Board, buffer_bytes: int, core: int | None = None) -> None:
+    def __init__(self, board: Board, buffer_bytes: int, core: Core | None = None) -> None:
         self.board = board
         self._progress = Progress(-1, 0, 0, False, 0)
         ours, theirs = socket.socketpair()
@@ -239,7 +242,10 @@ class ReceiverProcess:
             )
         self._connection = Connection(ours.detach())
         try:
-            request = Open(board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, core)
+            number, own = core or (None, True)
+            request = Open(
+                board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, number, own
+            )
             opened = self._ask(request, Opened, _START_LIMIT_S)
         except DeviceError:
             self.close()

@@ -129,8 +129,8 @@ class Receiver:
         self._socket = bind_udp(request.host_address, request.data_port, f"{request.board} data")
         granted = enlarge_receive_buffer(self._socket, request.buffer_bytes)
         self._batches = BatchReceiver(self._socket, request.card_address)
-        core, unpinned = take_core(request.core)
         priority, ordinary = take_priority()  # capture goes before processing where the system allows it
+        core, unpinned = take_core(request.core, request.own_core, urgent=not ordinary)
         scheduling = f"{'any core' if core is None else f'core {core}'}, {priority}"
         port = self._socket.getsockname()[1]
         return words.Opened(granted, port, scheduling, [w for w in (unpinned, ordinary) if w])

@@ -27,9 +27,9 @@ test: $(VENV)/installed  ## install what is missing, then run every test
 	@./tests/install-tools.sh
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
 
-test-long: $(VENV)/installed  ## tests at full length: 10,000 random rows and 1,000,000 bytes of the stage, 50 kills (an hour)
+test-long: $(VENV)/installed  ## tests at full length: 10,000 random rows and 1,000,000 bytes of the stage, 20,000 adversarial records, 100 scans, 1,050 kills (two hours)
 	@./tests/install-tools.sh
-	$(BIN)/python -m pytest tests/stage tests/store tests/calibration/test_metal.py tests/e2e/test_killed_processes.py -n $(JOBS) --dist loadgroup --long
+	$(BIN)/python -m pytest tests/stage tests/store tests/capture/test_adversary.py tests/acquisition/test_adversarial_scans.py tests/calibration/test_metal.py tests/e2e/test_killed_processes.py -n $(JOBS) --dist loadgroup --long
 
 test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode Linux built from Debian's source (10 minutes, once)
 	@./tests/install-tools.sh kernel

@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed
-from polysight.host.capture.record_search import Past
 from polysight.host.capture.segment import damaged, disk_full
 from polysight.shared.errors import DataError, DeviceError
 

@@ -6,6 +6,8 @@ it belongs is decided at the row's end from all of them (`placement.py`), and ca
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -174,6 +176,6 @@ class PacketLog:
         return log
 
 
-def _doubled(array: NDArray[np.generic], more: int) -> NDArray[np.generic]:
+def _doubled(array: NDArray[Any], more: int) -> NDArray[Any]:
     """The array with room for as many again, and `more`."""
     return np.concatenate([array, np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)])

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from polysight.host.capture import receiver as words
 from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
 from polysight.host.capture.packet_file import PACKETS, Evidence, write_packets
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Preview, place_record, preview
-from polysight.host.capture.record_search import Past
 from polysight.host.capture.scheduling import take_core, take_priority
 from polysight.host.capture.segment import Segment, write_index
 from polysight.shared.errors import DeviceError, PolysightError

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, SEQUENCE_BITS, Counters
+from polysight.host.capture.dca1000 import Counters
+from polysight.host.capture.earlier_records import CounterView, Past, Span, full_payload, line_of
 from polysight.host.capture.packet_log import PacketLog
 
 Counts = NDArray[np.int64]
@@ -22,66 +23,6 @@ SMALL_RECORD = 16  # packets: a record as small as this may be delayed as a whol
 _REMEMBERED = 4  # earlier records whose leftovers are known by their counters
 _NEAR = 64  # records
 _JOINS, _JOINS_SMALL = 1, 3  # doubtful records in a row, without a seam, after which the next one is believed
-
-
-@dataclass(frozen=True)
-class Span:
-    """Counters of an earlier record: packets that carry them are left over.
-
-    `sure`: packets of that record came, or its place is certain. Otherwise it may never have been sent.
-    """
-
-    start: Counters
-    size: int
-    sure: bool = True
-
-
-@dataclass(frozen=True)
-class Past:
-    """What the records before tell about this one.
-
-    Attributes
-    ----------
-    base
-        Where the record before this one started, when that was certain.
-    ends
-        The sizes in bytes that it may have had: this record starts behind one of them. One of a located record.
-    spans
-        Counters of earlier records.
-    joint, joined
-        Where a whole record ended whose start was not believed, and how many of them followed without a seam.
-    unseen
-        Whether a record may have been sent of which nothing came, and it is not known where.
-    guessed
-        Whether `base` is not certain: only where its record ended is.
-    """
-
-    base: Counters | None = None
-    ends: tuple[int, ...] = ()
-    spans: tuple[Span, ...] = ()
-    joint: Counters | None = None
-    joined: int = 0
-    unseen: bool = False
-    guessed: bool = False
-
-    @staticmethod
-    def ending_at(start: Counters) -> Past:
-        """The record before ended here for certain."""
-        return Past(start, (0,))
-
-    def starts_after(self, strays: PacketLog) -> Past:
-        """The same after packets that came between two records: some of them may be of a record nobody knows."""
-        if strays.count == 0 or self.base is None or self._knows(strays):
-            return self
-        return replace(self, base=None, ends=())
-
-    def _knows(self, strays: PacketLog) -> bool:
-        full = _full_payload(strays)
-        packets = _Packets(strays, self.base or Counters(0, 0), full)
-        known = packets.inside(self.spans, sure=True)
-        if len(self.ends) == 1:
-            known |= (packets.line == _line_of(self.ends[0], full)) & (packets.ahead < self.ends[0])
-        return bool(known.all())
 
 
 @dataclass(frozen=True)
@@ -148,31 +89,6 @@ class _Verdict:
     foreseen: bool = False
 
 
-class _Packets:
-    """Counters of all packets relative to a reference. Attributes are int64 [packet]."""
-
-    def __init__(self, log: PacketLog, reference: Counters, full: int) -> None:
-        self.reference, self.full, self.sizes = reference, full, log.sizes
-        self._counts, self._sequences = log.byte_counts, log.sequences
-        self.ahead = counter_differences(self._counts, reference.byte_count, BYTE_COUNT_BITS)
-        self.steps = counter_differences(self._sequences, reference.sequence, SEQUENCE_BITS)
-        self.line = self.ahead - full * self.steps
-
-    def inside(self, spans: tuple[Span, ...], sure: bool) -> Flags:
-        """Whether each has counters of one of these records."""
-        found = np.zeros(self.sizes.size, dtype=np.bool_)
-        for span in spans:
-            if span.sure is sure:
-                ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
-                steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
-                found |= (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps)
-        return found
-
-    def at(self, base: int, line: int) -> Counters:
-        """The counters so many bytes from the reference, on a line."""
-        return self.reference.after(base, (base - line) // self.full)
-
-
 def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int = 0) -> Found:
     """Find a row's record among its packets.
 
@@ -187,16 +103,18 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
     not_before_ns
         No pulse of the row was sent before this time: packets that came earlier are left over.
     """
-    full = _full_payload(log)
+    full = full_payload(log)
     nothing = np.zeros(log.count, dtype=np.bool_)
     if log.count == 0:
-        return Found(None, False, log.expected == 0, "no packet came", log.sizes, log.sizes, *3 * (nothing,), full)
+        return Found(
+            None, False, log.expected == 0, "no packet came", log.sizes, log.sizes, nothing, nothing, nothing, full
+        )
     first = Counters(int(log.byte_counts[0]), int(log.sequences[0]))
-    packets = _Packets(log, past.base or first, full)
+    packets = CounterView(log, past.base or first, full)
     early, jumps = _before_pulses(log, not_before_ns)
     old = packets.inside(past.spans, sure=True)
     if past.base is not None and len(past.ends) == 1:
-        old |= (packets.line == _line_of(past.ends[0], full)) & (packets.ahead < past.ends[0])
+        old |= (packets.line == line_of(past.ends[0], full)) & (packets.ahead < past.ends[0])
     live = ~(early | old)
     if not live.any():
         why = "every packet is of an earlier record, by its counters or because it came before the first pulse"
@@ -217,7 +135,7 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
 class _Search:
     """Judges the lines on which a row's packets lie, and chooses the record's."""
 
-    def __init__(self, packets: _Packets, live: Flags, expected: int, frame_bytes: int, past: Past) -> None:
+    def __init__(self, packets: CounterView, live: Flags, expected: int, frame_bytes: int, past: Past) -> None:
         self._p, self._live, self._expected, self._frame, self._past = packets, live, expected, frame_bytes, past
         self._unsure = live & packets.inside(past.spans, sure=False) if past.spans else np.zeros_like(live)
         ends = np.array(past.ends if past.base is not None else (), dtype=np.int64)
@@ -400,20 +318,6 @@ def _remember(spans: tuple[Span, ...], span: Span) -> tuple[Span, ...]:
     return (*spans, span)[-_REMEMBERED:]
 
 
-def _line_of(end: int, full: int) -> int:
-    """The line of a record that starts behind one of `end` bytes, relative to that one's start."""
-    return end - full * -(-end // full)
-
-
-def _full_payload(log: PacketLog) -> int:
-    """Payload of a full packet: the card's usual one, unless the packets of a longer row show another."""
-    sizes = log.sizes
-    if log.expected < MAX_PAYLOAD_BYTES or sizes.size == 0 or (sizes == MAX_PAYLOAD_BYTES).any():
-        return MAX_PAYLOAD_BYTES
-    values, counts = np.unique(sizes, return_counts=True)
-    return int(values[counts == counts.max()].max()) if counts.max() > 2 else MAX_PAYLOAD_BYTES
-
-
 def _before_pulses(log: PacketLog, not_before_ns: int) -> tuple[Flags, int]:
     """Which packets came before any pulse was sent, and how often the clock of the arrivals went backwards.
 
@@ -422,10 +326,3 @@ def _before_pulses(log: PacketLog, not_before_ns: int) -> tuple[Flags, int]:
     jumps = int((np.diff(log.batches[:, 0]) < 0).sum())
     early = log.arrivals_ns < not_before_ns
     return (np.zeros_like(early) if jumps else early), jumps
-
-
-def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
-    """`counters - origin` of the card's counters, int64 [n], which wrap after so many bits; nearest to zero."""
-    spare = 64 - bits
-    wrapped = (counters.astype(np.uint64) - np.uint64(origin)) << np.uint64(spare)  # the counter's top bit is the sign
-    return wrapped.view(np.int64) >> np.int64(spare)

@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 
+from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed, place_record
-from polysight.host.capture.record_search import Past
 from polysight.simulators.cards import KINDS, Adversary, Sent
 from tests.support.capture.records import FULL, mask_of
 
@@ -139,7 +139,7 @@ def test_no_byte_is_wrong_and_none_is_masked_in_vain(request: pytest.FixtureRequ
             max_examples=records // STEPS,
             stateful_step_count=STEPS,
             deadline=None,
-            suppress_health_check=[*HealthCheck],
+            suppress_health_check=list(HealthCheck),
             phases=[Phase.generate, Phase.shrink] if not request.config.getoption("--long") else list(Phase),
         ),
     )

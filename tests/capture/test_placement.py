@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from polysight.host.capture.dca1000 import Counters, encode_packet
+from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Losses, place_record
-from polysight.host.capture.record_search import Past
 from tests.support.capture.records import FULL, Record, is_original_or_masked, log_of, mask_of, place
 
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polysight.host.capture import PACKETS, Evidence, place_record, write_index, write_packets
-from polysight.host.capture.record_search import Past
+from polysight.host.capture.earlier_records import Past
 from polysight.host.jobs.placement import inspect_placement, replace_folder
 from polysight.host.store import ManifestWriter, ScanFolder, replace_rows
 from polysight.host.store.append_only import crc32

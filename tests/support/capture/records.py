@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from polysight.host.capture.dca1000 import Counters, encode_packet
+from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed, place_record
-from polysight.host.capture.record_search import Past
 
 FULL = 1456  # bytes of samples in a full packet
 

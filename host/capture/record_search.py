@@ -183,8 +183,7 @@ class _Search:
                 verdict = replace(verdict, reason=f"{why}; the card's counters had just begun", fresh=True)
         start = p.at(verdict.base, line)
         strange = not bases.size and (self._past.unseen or self._is_behind(verdict.base))
-        unclear = strange or bool(self._unsure[which].any())
-        if verdict.located and unclear and not (self._expected >= SMALL_RECORD * p.full and self._much(which)):
+        if verdict.located and (self._unclear(which, strange) or self._unclear(which[self._unsure[which]], True)):
             verdict = replace(verdict, doubtful=True)
         if verdict.doubtful:
             enough = _JOINS if self._expected >= SMALL_RECORD * p.full else _JOINS_SMALL
@@ -192,6 +191,11 @@ class _Search:
                 why = "its packets could as well be those of an earlier record that came late"
                 return replace(verdict, located=False, certain=False, reason=why)
         return verdict
+
+    def _unclear(self, which: Counts, suspect: bool) -> bool:
+        """Whether suspect packets may be an earlier record's: not half of a record that is not small."""
+        big = self._expected >= SMALL_RECORD * self._p.full
+        return suspect and which.size > 0 and not (big and self._much(which))
 
     def _is_behind(self, base: int) -> bool:
         """Whether a record with this base was sent not long before the place where this one was to start."""

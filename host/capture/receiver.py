@@ -322,14 +322,20 @@ class ReceiverProcess:
         try:
             return next_answer(self._connection)
         except (EOFError, OSError):
-            raise DeviceError(
-                f"{self.board.name}: the receiving process ended with status {self._process.poll()}",
-                "it was killed, or it failed; its message is above",
-                "`dmesg` tells whether the kernel ended it, for want of memory",
-            ) from None
+            raise self._ended() from None
+
+    def _ended(self) -> DeviceError:
+        return DeviceError(
+            f"{self.board.name}: the receiving process ended with status {self._process.poll()}",
+            "it was killed, or it failed; its message is above",
+            "`dmesg` tells whether the kernel ended it, for want of memory",
+        )
 
     def _ask(self, request: Request, kind: type[A], limit_s: float) -> A:
-        send(self._connection, request)
+        try:
+            send(self._connection, request)
+        except DeviceError:
+            raise self._ended() from None
         deadline = time.monotonic() + limit_s
         while self._connection.poll(max(0.0, deadline - time.monotonic())):
             answer = self._next()

@@ -182,7 +182,8 @@ class _Search:
                 why = self._too_short(first, stop, short).reason or "its last bytes did not come"
                 verdict = replace(verdict, reason=f"{why}; the card's counters had just begun", fresh=True)
         start = p.at(verdict.base, line)
-        strange = not bases.size and (self._past.unseen or self._is_behind(verdict.base))
+        unsure = not bases.size or self._past.guessed
+        strange = (unsure and self._past.unseen) or (not bases.size and self._is_behind(verdict.base))
         if verdict.located and (self._unclear(which, strange) or self._unclear(which[self._unsure[which]], True)):
             verdict = replace(verdict, doubtful=True)
         if verdict.doubtful:

@@ -142,15 +142,23 @@ class CaptureRig:
         """Status bits each card reported since its record start."""
         return {name: card.take_status() for name, card in self.cards.items()}
 
-    def end_row(self) -> dict[str, RowCapture]:
-        """Stop the records and take the rows: their files are durable when this returns. Raises DeviceError."""
+    def row_runs(self, not_before_ns: int) -> None:
+        """No pulse of the row was sent before this time (monotonic clock): what came earlier is left over."""
+        for receiver in self.receivers.values():
+            receiver.report(not_before_ns)
+
+    def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:
+        """Stop the records and take the rows: their files are durable when this returns. Raises DeviceError.
+
+        `not_before_ns` as in :meth:`row_runs`, known better by now.
+        """
         self.stop_records()
         deadline = time.monotonic() + _COMPLETED_LIMIT_S
         for name, receiver in self.receivers.items():
             if not receiver.poll().complete:  # of a complete row nothing can follow
                 self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()
-        return {name: receiver.end_row(statuses[name]) for name, receiver in self.receivers.items()}
+        return {name: receiver.end_row(statuses[name], not_before_ns) for name, receiver in self.receivers.items()}
 
     def stop_records(self) -> None:
         """Stop all records. Raises DeviceError."""

@@ -203,8 +203,19 @@ def _found_empty(arrivals: Times) -> Times:
     return out
 
 
-def _starts(pulses_ns: Times, told_ns: Times, arrivals: Times, frame_bytes: int) -> Times:
-    """Frames that had come when each burst began, int64 [burst + 1], counted in the pauses between the bursts."""
+def earliest_pulse(pulses_ns: Times, told_ns: Times) -> int | None:
+    """A time on the host's clock in the pause before a row's first pulse; None where the events do not tell.
+
+    Parameters as :func:`place_frames`; of each burst the first and the last pulse are enough.
+    """
+    try:
+        return int(_pauses(pulses_ns, told_ns)[0])
+    except _UndecidedError:
+        return None
+
+
+def _pauses(pulses_ns: Times, told_ns: Times) -> Times:
+    """A time on the host's clock in the pause before each burst, int64 [burst]."""
     last = pulses_ns[:, -1]
     if len(last) < 2:
         raise _UndecidedError("a single burst does not tell the offset between the clocks")
@@ -220,7 +231,12 @@ def _starts(pulses_ns: Times, told_ns: Times, arrivals: Times, frame_bytes: int)
     offset_ns = int(delay.min())  # too large by what the quickest event took
     if (delay < offset_ns + pause_ns // 4).sum() < 2:
         raise _UndecidedError("the capture events came too late to tell one burst from the next")
-    begins = pulses_ns[:, 0] + offset_ns - pause_ns // 2
+    return pulses_ns[:, 0] + offset_ns - pause_ns // 2
+
+
+def _starts(pulses_ns: Times, told_ns: Times, arrivals: Times, frame_bytes: int) -> Times:
+    """Frames that had come when each burst began, int64 [burst + 1], counted in the pauses between the bursts."""
+    begins = _pauses(pulses_ns, told_ns)
     at = np.searchsorted(arrivals[:, 0], begins, "right")
     extent = np.where(at > 0, arrivals[np.maximum(at - 1, 0), 1], 0)
     if extent[0]:

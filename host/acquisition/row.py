@@ -16,7 +16,7 @@ import zmq
 from polysight.host.acquisition.capture_rig import CaptureRig, record_ending
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.pi_client import PiClient
-from polysight.host.acquisition.slipped_row import ToldCapture, find_frames, find_slip
+from polysight.host.acquisition.slipped_row import ToldCapture, find_frames, find_slip, first_pulse_ns
 from polysight.host.acquisition.take import ON_REQUEST, FaultKind, Take, TakeFault
 from polysight.host.radar import RadarControl
 from polysight.host.store import PART
@@ -130,6 +130,7 @@ class RowTaker:
         else:
             transaction.to(RowState.RUNNING)
             self._radars.row_begins()
+            self._rig.row_runs(time.monotonic_ns())
             self._pi.run_row(self._scan_id, row.index, number)
             self._wait_for_row(take, transaction)
             if take.bursts_are_whole:
@@ -234,7 +235,7 @@ class RowTaker:
         """Stop the records and make the rows durable. A slow disk is waited for, and that is told."""
         began = time.monotonic()
         with ThreadPoolExecutor(1, thread_name_prefix="disk") as beside:
-            ending = beside.submit(self._rig.end_row)
+            ending = beside.submit(self._rig.end_row, first_pulse_ns(take.told) or 0)
             while not wait([ending], _DISK_NOTICE_S).done:
                 waited_s = time.monotonic() - began
                 self._say("wait", f"row {take.row.index}: the disk has not taken it after {waited_s:.0f} s; waiting")

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from polysight.host.capture import RowCapture, read_index, write_index
+from polysight.host.acquisition.missed_pulses import PlacedFrames, earliest_pulse, place_frames, slipped_frames
+from polysight.host.capture import PACKETS, RowCapture, read_index, read_packets, write_index, write_packets
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 from polysight.shared.messages import Capture
@@ -67,6 +67,16 @@ def find_slip(path: Path, row: Row, told: list[ToldCapture], rig: Instrument) ->
     return slipped_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES) if times else None
 
 
+def first_pulse_ns(told: list[ToldCapture]) -> int | None:
+    """A time before the row's first pulse, monotonic clock, by its capture events; None where they do not tell."""
+    events = [t for t in sorted(told, key=lambda t: t.event.point) if t.event.pulses]
+    if not events or events[0].event.point != 0:
+        return None
+    first, last = [t.event.first_pulse_ns for t in events], [t.event.last_pulse_ns for t in events]
+    sent = np.linspace(first, last, events[0].event.pulses, axis=1, dtype=np.int64)
+    return earliest_pulse(sent, np.array([t.told_ns for t in events], dtype=np.int64))
+
+
 def _times(
     path: Path, row: Row, told: list[ToldCapture], rig: Instrument
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None:
@@ -109,6 +119,7 @@ def write_in_place(path: Path, capture: RowCapture, placed: PlacedFrames, frame_
     """
     facts, arrivals = read_index(path.with_suffix(".idx"))
     received = np.fromfile(path, dtype=np.uint8)
+    packets_crc = _keep_payload(path.with_suffix(PACKETS), received)
     extent = int(arrivals[-1, 1])
     out, present, runs = np.zeros_like(received), [], _runs(placed.slots)
     for first, slot, count in runs:
@@ -134,7 +145,16 @@ def write_in_place(path: Path, capture: RowCapture, placed: PlacedFrames, frame_
         reason="",
         crc32=zlib.crc32(out.data),
         index_crc32=index_crc,
+        packets_crc32=packets_crc,
     )
+
+
+def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
+    """Keep all payload with the row's packets, for the row's file will not hold it as it came; returns the CRC-32."""
+    if not path.exists():
+        return 0
+    evidence, log = read_packets(path, received)
+    return write_packets(path, log, evidence, None)
 
 
 def _runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:

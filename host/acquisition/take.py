@@ -11,7 +11,7 @@ from enum import StrEnum
 
 from polysight.host.acquisition.missed_pulses import PlacedFrames
 from polysight.host.acquisition.slipped_row import ToldCapture, describe, write_in_place
-from polysight.host.capture import RowCapture, silent_radar, valid_frames
+from polysight.host.capture import PACKETS, RowCapture, silent_radar, valid_frames
 from polysight.host.radar import BoardState, RadarState
 from polysight.host.store import PART, Fact, ManifestWriter, ScanFolder, sync_folder, utc_now
 from polysight.shared.errors import DeviceError, ScanError, advice
@@ -30,6 +30,10 @@ _KINDS = (
     "strangers",
     "stale",
     "leftover",
+    "conflicting",
+    "restarted",
+    "before_pulses",
+    "clock_jumps",
     "kernel_drops",
     "head_bytes",
     "gaps",
@@ -57,6 +61,7 @@ class FaultKind(StrEnum):
     CARD_DROPPED = "card_dropped"  # the card says so: it dropped data before it numbered the packets
     LOST_BY_HOST = "lost_by_host"  # some at least: packets the kernel dropped
     LOST_ON_THE_WAY = "lost_on_the_way"  # packets that never came to this machine
+    CONFLICTING = "conflicting"  # packets with the same counters brought different bytes
     UNLOCATED = "unlocated"  # data came whose place in the row is not certain
 
 
@@ -179,6 +184,9 @@ class Take:
             waits = "; the radar still waits for pulses" if radar.state is RadarState.ARMED else ""
             kind = FaultKind.RADAR_WAITS if waits else FaultKind.HELD if held else _unlocated(capture)
             return TakeFault(kind, capture.reason + untold + waits + held, name)
+        if capture.conflicting and capture.missing:
+            text = f"{capture.conflicting} packets brought other bytes than others with the same counters"
+            return TakeFault(FaultKind.CONFLICTING, f"{text}; {capture.missing_bytes} bytes are masked", name)
         if capture.missing:
             text = (
                 f"{capture.missing_bytes} bytes in {len(capture.missing)} places did not come"
@@ -247,6 +255,7 @@ def commit_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
             "missing_bytes": capture.missing_bytes,
             "crc32": f"{capture.crc32:08x}",
             "index_crc32": f"{capture.index_crc32:08x}",
+            **({"packets_crc32": f"{capture.packets_crc32:08x}"} if capture.packets_crc32 else {}),
             **_counts(take, name),
             **({} if placed is None else {"pulses_missed": placed.pulses - placed.slots.size}),
         }
@@ -271,6 +280,7 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
         path = scan.row_path(name, take.row.index)
         path.with_suffix(PART).unlink(missing_ok=True)
         path.with_suffix(".idx").unlink(missing_ok=True)
+        path.with_suffix(PACKETS).unlink(missing_ok=True)
     writer.append(
         {
             "fact": "row_rejected",

@@ -109,6 +109,30 @@ def decode_real(
     return words.reshape(chirps, rx, samples).transpose(1, 0, 2).astype(np.float32)
 
 
+def decode_adjacent(
+    payload: bytes | memoryview | NDArray[np.uint8],
+    lanes: int,
+    chirps: int,
+    samples: int,
+    rx: int = 4,
+    swap_iq: bool = False,
+) -> NDArray[np.complex64]:
+    """Decode a recording in which I and Q of a sample stand side by side: `I0 Q0 I1 Q1`.
+
+    With 2 lanes a whole chirp of RX0, then RX1...; with 4 lanes every RX of a sample, then the next sample. Returns
+    complex64 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
+    """
+    words = _words(payload, chirps * samples * rx * 2)
+    if lanes == 4:
+        pairs = words.reshape(chirps, samples, rx, 2).transpose(2, 0, 1, 3)
+    else:
+        pairs = words.reshape(chirps, rx, samples, 2).transpose(1, 0, 2, 3)
+    first, second = (1, 0) if swap_iq else (0, 1)
+    out = np.empty((rx, chirps, samples), dtype=np.complex64)
+    out.real, out.imag = pairs[..., first], pairs[..., second]
+    return out
+
+
 def valid_frames(mask: Mask, frames: int, frame_bytes: int) -> NDArray[np.bool_]:
     """Bool [frame]: whether every byte of the frame is there. `mask` as in :func:`decode_row`."""
     valid = np.ones(frames, dtype=np.bool_)

@@ -8,7 +8,6 @@ first. `inspect_pcap.py` reads packet captures; `polysight.host.jobs.look` print
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,99 +15,33 @@ from numpy.typing import NDArray
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
-from polysight.host.capture.decode import decode_real, decode_row, decode_two_lane
-from polysight.host.capture.placement import Placed, Placement
+from polysight.host.capture.layouts import (
+    SAMPLES_TRIED,
+    Guess,
+    Shape,
+    candidates,
+    decode,
+    guess_shapes,
+    spectra,
+    spectral_disorder,
+)
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import Placed, place_record
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 
-Samples = NDArray[np.complex64] | NDArray[np.float32]
-SAMPLES_TRIED = (256, 512, 128, 1024, 64)
-DRAW = 0.02
-"""Layouts whose disorder differs by less are not told apart: the likelier one is taken."""
-_MOST_CHIRPS = 4096  # enough for the statistics
-_CHIRPS_TRIED = 512
 _LOOKED_AT = 16  # headers that tell whether a file holds whole packets
 _FULL_SCALE = 32767  # ADC counts
 _MUCH_DC = 0.05 * _FULL_SCALE
-_CLEARLY = 4 * DRAW  # so much less disorder in another layout contradicts the one that was given
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Layout of a recording: LVDS lanes, complex or real samples, samples of a chirp, antennas."""
-
-    lanes: int
-    is_complex: bool
-    samples: int
-    rx: int = 4
-
-    @staticmethod
-    def of_instrument(rig: Instrument) -> Shape:
-        """What a rig file makes the card send."""
-        return Shape(4, rig.chirp.if_mode.startswith("complex"), rig.chirp.samples)
-
-    @property
-    def chirp_bytes(self) -> int:
-        """Bytes of one chirp of all antennas."""
-        return self.samples * self.rx * (4 if self.is_complex else 2)
-
-    def __str__(self) -> str:
-        return f"{self.lanes}-lane {'complex' if self.is_complex else 'real'}, {self.samples} samples x {self.rx} RX"
-
-
-def decode(payload: NDArray[np.uint8], shape: Shape, q_first: bool = False, most: int = _MOST_CHIRPS) -> Samples:
-    """The first chirps in a layout: complex64 or float32 [rx, chirp, sample]."""
-    chirps = min(payload.size // shape.chirp_bytes, most)
-    if not shape.is_complex:
-        return decode_real(payload, shape.lanes, chirps, shape.samples, shape.rx)
-    if shape.lanes == 4:
-        return decode_row(payload, None, chirps, shape.samples, shape.rx, q_first)[0]
-    return decode_two_lane(payload, chirps, shape.samples, shape.rx, q_first)
-
-
-def candidates(
-    lanes: int | None, is_complex: bool | None, samples: int | None, rx: int, payload_bytes: int
-) -> list[Shape]:
-    """Every layout that agrees with what is known and fits into the payload, the likeliest first."""
-    shapes = (
-        Shape(k, c, n, rx)
-        for n, c, k in product(
-            SAMPLES_TRIED if samples is None else (samples,),
-            (True, False) if is_complex is None else (is_complex,),
-            (4, 2) if lanes is None else (lanes,),
-        )
-    )
-    return [s for s in shapes if s.chirp_bytes <= payload_bytes]
-
-
-def best_shape(payload: NDArray[np.uint8], shapes: list[Shape]) -> Shape:
-    """The layout with the least disorder; the earlier, likelier one wins a draw."""
-    best, least = shapes[0], np.inf
-    for shape in shapes:
-        disorder = spectral_disorder(payload, shape)
-        if disorder < least - DRAW:
-            best, least = shape, disorder
-    return best
-
-
-def spectral_disorder(payload: NDArray[np.uint8], shape: Shape) -> float:
-    """Entropy of the chirps' spectra over its largest value, 0..1: the right layout has the fewest bins occupied.
-
-    The mean of every chirp is removed, or a constant would make any layout look ordered. Values in the wrong place
-    alternate between antennas, between I and Q, or between chirps, which spreads a tone over several lines.
-    """
-    power = spectra(decode(payload, shape, most=_CHIRPS_TRIED), remove_mean=True)
-    share = power / np.maximum(power.sum(axis=-1, keepdims=True), 1e-12)
-    return float(-(share * np.log(share + 1e-15)).sum(axis=-1).mean() / np.log(power.shape[-1]))
-
-
-def spectra(cube: Samples, remove_mean: bool = False) -> NDArray[np.float64]:
-    """Power spectra, Hann window: float64 [rx, chirp, bin], half as many bins for real samples."""
-    if remove_mean:
-        cube = cube - cube.mean(axis=-1, keepdims=True)
-    windowed = cube * np.hanning(cube.shape[-1])
-    transform = np.fft.fft(windowed, axis=-1) if np.iscomplexobj(cube) else np.fft.rfft(windowed, axis=-1)[..., :-1]
-    return np.abs(transform) ** 2
+_CLEARLY = 0.08  # so much less disorder in another layout contradicts the one that was given
+_WHITE = 0.94  # of the disorder of white noise
+_UNIFORM = 0.45 * _FULL_SCALE  # standard deviation of values that fill the whole range
+_MAGIC = {
+    b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
+    b"PK\x03\x04": "an archive (zip)", b"\x1f\x8b": "compressed (gzip)", b"\x89HDF": "HDF5",
+    b"BZh": "compressed (bzip2)", b"\xfd7zXZ": "compressed (xz)", b"\x93NUMPY": "a numpy array",
+    b"RIFF": "sound or video (RIFF)",
+}  # fmt: skip
 
 
 def is_mirrored(power: NDArray[np.float64]) -> bool:
@@ -155,11 +88,11 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     size = max(ends) - min(ahead)
     if size > 1 << 34:
         raise DataError(f"byte counts span {size} bytes: more than one record, or corrupted packets")
-    out = np.zeros(size, dtype=np.uint8)
-    placement = Placement(out)
+    log = PacketLog(size)
     for packet in packets:
-        placement.place_packet(packet)
-    return out, placement.finish()
+        log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
+    placed, out = place_record(log)
+    return out, placed
 
 
 @dataclass(frozen=True)
@@ -171,11 +104,12 @@ class Known:
     samples: int | None = None
     rx: int = 4
     q_first: bool | None = None
+    adjacent: bool | None = None
 
     @staticmethod
     def of_shape(shape: Shape, q_first: bool | None = False) -> Known:
         """Everything, for a recording of this layout."""
-        return Known(shape.lanes, shape.is_complex, shape.samples, shape.rx, q_first)
+        return Known(shape.lanes, shape.is_complex, shape.samples, shape.rx, q_first, shape.adjacent)
 
     @staticmethod
     def of_instrument(rig: Instrument) -> Known:
@@ -189,7 +123,8 @@ class Report:
 
     `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
     float64 [samples], or half as many of real samples. `rx_profile_db` is the same of every antenna over the same
-    median. `rx_rms` and `rx_dc` are one value an antenna, ADC counts. `guessed` names what was not given.
+    median. `rx_rms` and `rx_dc` are one value an antenna, ADC counts. `guessed` names what was not given. `guesses` are
+    the layouts that agree with what was given, likeliest first. `not_a_capture` says why the file is none.
     """
 
     path: Path
@@ -212,6 +147,9 @@ class Report:
     remarks: list[str] = field(default_factory=list)
     card: CardReport | None = None
     simulated: bool = False
+    adjacent: bool = False
+    guesses: list[Guess] = field(default_factory=list)
+    not_a_capture: str = ""
 
 
 @dataclass
@@ -248,7 +186,7 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Rep
     """Inspect payload bytes, uint8 [n]; `path` is for the report. Raises DataError as :func:`inspect_bin`."""
     lanes, is_complex, samples, rx, q_first = known.lanes, known.is_complex, known.samples, known.rx, known.q_first
     given: dict[str, object] = {"lanes": lanes, "complex or real": is_complex, "samples": samples}
-    shapes = candidates(lanes, is_complex, samples, rx, payload.size)
+    shapes = candidates(lanes, is_complex, samples, rx, payload.size, known.adjacent)
     if not shapes:
         raise DataError(
             f"{path}: {payload.size} bytes are not even one chirp of {samples or min(SAMPLES_TRIED)} samples x {rx} RX",
@@ -261,7 +199,8 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Rep
         remarks.append("offset binary, not two's complement: read with its sign bit turned round")
         words = words ^ np.int16(-0x8000)
     values = words.view(np.uint8)
-    shape = best_shape(values, shapes)
+    guesses = guess_shapes(values, shapes)
+    shape = guesses[0].shape
     remarks += _contradiction(values, shape)
     mirrored = shape.is_complex and is_mirrored(spectra(decode(values, shape)).mean(axis=(0, 1)))
     if shape.is_complex and q_first is None:
@@ -290,6 +229,9 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Rep
         profile_db=profile,
         rx_profile_db=each,
         guessed=[name for name, value in given.items() if value is None],
+        adjacent=shape.adjacent,
+        guesses=guesses,
+        not_a_capture=_not_a_capture(payload, words, guesses),
     )
     if mirrored != q_first and shape.is_complex:
         report.remarks.append("most power is at negative frequencies: I and Q seem to be in the other order")
@@ -300,9 +242,25 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Rep
 def _contradiction(values: NDArray[np.uint8], shape: Shape) -> list[str]:
     """What is said when another layout of the same bytes fits far better than the one taken."""
     others = [s for s in candidates(None, None, None, shape.rx, values.size) if s != shape]
-    better = best_shape(values, [shape, *others])
+    better = guess_shapes(values, [shape, *others])[0].shape
     gain = spectral_disorder(values, shape) - spectral_disorder(values, better)
     return [f"the data look like {better}, not {shape}: wrong lanes, or another chirp"] if gain > _CLEARLY else []
+
+
+def _not_a_capture(payload: NDArray[np.uint8], words: NDArray[np.int16], guesses: list[Guess]) -> str:
+    """Why these bytes were not written by a card; "" when they may have been."""
+    head = payload[:8].tobytes()
+    for magic, kind in _MAGIC.items():
+        if head.startswith(magic):
+            return f"it begins as {kind}"
+    if not words.any():
+        return "every value is zero"
+    some = words[: 1 << 20].astype(np.float64)
+    # The entropy of a periodogram of white noise is Euler's 1 - 0.577 short of that of equal bins.
+    white = min(g.disorder / (1 - 0.423 / np.log(g.shape.bins)) for g in guesses) > _WHITE
+    if white and some.std() > _UNIFORM:
+        return "its values fill the whole range evenly, and have no spectrum in any layout: compressed or random bytes"
+    return ""
 
 
 def _over_median(power: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.host.capture.scheduling import Core
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError
 
@@ -39,6 +40,7 @@ class Open(_Words, frozen=True):
     card_address: str
     buffer_bytes: int
     core: int | None = None
+    own_core: bool = True
 
 
 class BeginRow(_Words, frozen=True):
@@ -55,9 +57,11 @@ class EndRow(_Words, frozen=True):
     """The row has ended: fetch what still waits, make the file durable. Answered with RowCapture or Failed.
 
     `card_status` holds the bits the card reported since record start: some say that it lost data itself.
+    `not_before_ns`: as in Report.
     """
 
     card_status: int = 0
+    not_before_ns: int = 0
 
 
 class Discard(_Words, frozen=True):
@@ -65,7 +69,9 @@ class Discard(_Words, frozen=True):
 
 
 class Report(_Words, frozen=True):
-    """Answered with Progress."""
+    """Answered with Progress. No pulse of the row was sent before `not_before_ns` (monotonic clock; 0: not known)."""
+
+    not_before_ns: int = 0
 
 
 class Opened(_Words, frozen=True):
@@ -137,6 +143,11 @@ class RowCapture(_Words, frozen=True):
     card_status: int = 0
     holes: list[tuple[int, int]] = []
     slipped: bool = False
+    conflicting: int = 0
+    restarted: int = 0
+    before_pulses: int = 0
+    clock_jumps: int = 0
+    packets_crc32: int = 0
 
     @property
     def missing_bytes(self) -> int:
@@ -202,7 +213,8 @@ class ReceiverProcess:
     buffer_bytes
         Receive buffer to ask the kernel for.
     core
-        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None: any.
+        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None: any. A core
+        that it shares is taken with real-time priority only.
 
     Attributes
     ----------
@@ -217,7 +229,7 @@ class ReceiverProcess:
         when the process does not start, or its address and port cannot be bound.
     """
 
-    def __init__(self, board: Board, buffer_bytes: int, core: int | None = None) -> None:
+    def __init__(self, board: Board, buffer_bytes: int, core: Core | None = None) -> None:
         self.board = board
         self._progress = Progress(-1, 0, 0, False, 0)
         ours, theirs = socket.socketpair()
@@ -230,7 +242,10 @@ class ReceiverProcess:
             )
         self._connection = Connection(ours.detach())
         try:
-            request = Open(board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, core)
+            number, own = core or (None, True)
+            request = Open(
+                board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, number, own
+            )
             opened = self._ask(request, Opened, _START_LIMIT_S)
         except DeviceError:
             self.close()
@@ -263,17 +278,18 @@ class ReceiverProcess:
             self._take(self._next())
         return self._progress
 
-    def report(self) -> Progress:
-        """How far the row is, asked for."""
-        return self._ask(Report(), Progress, _ANSWER_LIMIT_S)
+    def report(self, not_before_ns: int = 0) -> Progress:
+        """How far the row is, asked for. No pulse of it was sent before `not_before_ns`, if that is given."""
+        return self._ask(Report(not_before_ns), Progress, _ANSWER_LIMIT_S)
 
-    def end_row(self, card_status: Status | None = None) -> RowCapture:
+    def end_row(self, card_status: Status | None = None, not_before_ns: int = 0) -> RowCapture:
         """End the row: its file is durable when this returns. Raises DeviceError.
 
+        No pulse of the row was sent before `not_before_ns` (monotonic clock): packets that came earlier are left over.
         `card_status` is what the card reported by itself since record start. With bits 7 or 9 in it the card dropped
         data before numbering it: the row is masked as a whole, and the reason says so.
         """
-        return self._ask(EndRow(int(card_status or 0)), RowCapture, _ANSWER_LIMIT_S)
+        return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_LIMIT_S)
 
     def discard(self) -> None:
         """Forget the running row and remove its file."""
@@ -306,14 +322,20 @@ class ReceiverProcess:
         try:
             return next_answer(self._connection)
         except (EOFError, OSError):
-            raise DeviceError(
-                f"{self.board.name}: the receiving process ended with status {self._process.poll()}",
-                "it was killed, or it failed; its message is above",
-                "`dmesg` tells whether the kernel ended it, for want of memory",
-            ) from None
+            raise self._ended() from None
+
+    def _ended(self) -> DeviceError:
+        return DeviceError(
+            f"{self.board.name}: the receiving process ended with status {self._process.poll()}",
+            "it was killed, or it failed; its message is above",
+            "`dmesg` tells whether the kernel ended it, for want of memory",
+        )
 
     def _ask(self, request: Request, kind: type[A], limit_s: float) -> A:
-        send(self._connection, request)
+        try:
+            send(self._connection, request)
+        except DeviceError:
+            raise self._ended() from None
         deadline = time.monotonic() + limit_s
         while self._connection.poll(max(0.0, deadline - time.monotonic())):
             answer = self._next()

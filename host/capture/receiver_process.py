@@ -19,71 +19,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.capture import receiver as words
-from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, MAX_PAYLOAD_BYTES, Counters, Status
+from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
-from polysight.host.capture.placement import Placement
+from polysight.host.capture.packet_file import PACKETS, Evidence, write_packets
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import Preview, place_record, preview
 from polysight.host.capture.scheduling import take_core, take_priority
 from polysight.host.capture.segment import Segment, write_index
 from polysight.shared.errors import DeviceError, PolysightError
 
 _MAX_BATCHES = 64  # batches fetched before the pipe is looked at again
+_LOOK_SHARE = 20  # a look at how far the row is takes at most this part of the time
 _GATHER_MS = 1  # packets gather in the kernel's buffer meanwhile: fewer, fuller batches
 
 
 class _Row:
     """The row that is being received."""
 
-    def __init__(
-        self,
-        request: words.BeginRow,
-        segment: Segment,
-        start: Counters | None,
-        stale: int,
-        strangers: int,
-        drops: int,
-    ) -> None:
-        self.request, self.segment = request, segment
-        self.stale, self.strangers, self.drops = stale, strangers, drops
-        self.placement = Placement(self.segment.data, request.frame_bytes, start)
-        self._arrivals = np.zeros((2 * request.expected_bytes // MAX_PAYLOAD_BYTES + 256, 2), dtype=np.int64)
-        self._noted = 0
-        self._quiet_ns = 0  # when the socket was last found empty since the last batch
+    def __init__(self, request: words.BeginRow, segment: Segment, log: PacketLog, past: Past) -> None:
+        self.request, self.segment, self.log, self.past = request, segment, log, past
+        self.stale = self.strangers = self.drops = 0
+        self.not_before_ns = 0
         self._told = (False, False)
-
-    def note_arrival(self) -> None:
-        """Write down when the packets just placed came, and up to which byte the row is there.
-
-        Before it, when the socket was last found empty: these packets came later than that.
-        """
-        if self.placement.forgotten:
-            self._noted, self.placement.forgotten = 0, False
-        if self._noted + 2 > len(self._arrivals):
-            self._arrivals = np.concatenate([self._arrivals, np.zeros_like(self._arrivals)])
-        if self._quiet_ns and self._noted:
-            self._arrivals[self._noted] = self._quiet_ns, self._arrivals[self._noted - 1, 1]
-            self._noted += 1
-        self._quiet_ns = 0
-        self._arrivals[self._noted] = time.monotonic_ns(), self.placement.extent
-        self._noted += 1
-
-    def note_quiet(self, looked_ns: int) -> None:
-        """Nothing waited in the socket at this time."""
-        self._quiet_ns = looked_ns
-
-    @property
-    def arrivals(self) -> NDArray[np.int64]:
-        """int64 [n, 2]: time (monotonic, ns), bytes. Where the bytes do not grow, the socket was found empty then."""
-        return self._arrivals[: self._noted]
+        self._looked_at = 0  # packets
+        self._next_look_ns = 0
+        self._preview = Preview(0, request.expected_bytes == 0, ended=False)
 
     def news(self) -> bool:
-        """Whether there is something to tell the host unasked."""
-        told, self._told = self._told, (self.placement.complete, self.placement.ended)
+        """Whether there is something to tell the host unasked: it may be complete, or its last packet came."""
+        log = self.log
+        if log.payload_bytes < log.expected and not log.last_is_short:
+            return False
+        if log.count == self._looked_at or (began := time.monotonic_ns()) < self._next_look_ns:
+            return False
+        self._look()
+        self._next_look_ns = time.monotonic_ns() + _LOOK_SHARE * (time.monotonic_ns() - began)
+        told, self._told = self._told, (self._preview.complete, self._preview.ended)
         return self._told != told and any(self._told)
 
     def progress(self) -> words.Progress:
-        p, r = self.placement, self.request
-        last = int(self.arrivals[-1, 0]) if self._noted else 0
-        return words.Progress(r.row, r.take, p.received, p.complete, last, p.ended)
+        self._look()
+        p, r = self._preview, self.request
+        return words.Progress(r.row, r.take, p.received, p.complete, self.log.last_arrival_ns, p.ended)
+
+    def _look(self) -> None:
+        if self.log.count != self._looked_at:
+            self._looked_at = self.log.count
+            self._preview = preview(self.log, self.request.frame_bytes, self.past, self.not_before_ns)
 
 
 class Receiver:
@@ -94,7 +77,7 @@ class Receiver:
         self._socket: socket.socket | None = None
         self._batches: BatchReceiver | None = None
         self._row: _Row | None = None
-        self._start: Counters | None = None  # where the card's next record should start
+        self._past = Past()  # what the records so far tell about the next
         self._memory: NDArray[np.uint8] | None = None  # of the row before, taken again
 
     def serve(self) -> None:
@@ -132,20 +115,22 @@ class Receiver:
         if isinstance(request, words.BeginRow):
             return self._begin(request)
         if isinstance(request, words.EndRow):
-            return self._end(Status(request.card_status))
+            return self._end(request)
         if isinstance(request, words.Discard):
             if self._row is not None:
-                self._row.segment.discard()
-                self._row, self._start = None, None
+                self._forget()
             return words.Discarded()
-        return self._row.progress() if self._row is not None else words.Progress(-1, 0, 0, False, 0)
+        if self._row is None:
+            return words.Progress(-1, 0, 0, False, 0)
+        self._row.not_before_ns = request.not_before_ns or self._row.not_before_ns
+        return self._row.progress()
 
     def _open(self, request: words.Open) -> words.Answer:
         self._socket = bind_udp(request.host_address, request.data_port, f"{request.board} data")
         granted = enlarge_receive_buffer(self._socket, request.buffer_bytes)
         self._batches = BatchReceiver(self._socket, request.card_address)
-        core, unpinned = take_core(request.core)
         priority, ordinary = take_priority()  # capture goes before processing where the system allows it
+        core, unpinned = take_core(request.core, request.own_core, urgent=not ordinary)
         scheduling = f"{'any core' if core is None else f'core {core}'}, {priority}"
         port = self._socket.getsockname()[1]
         return words.Opened(granted, port, scheduling, [w for w in (unpinned, ordinary) if w])
@@ -154,17 +139,28 @@ class Receiver:
         if self._socket is None or self._batches is None:
             raise DeviceError("the receiver has no socket yet")
         if self._row is not None:
-            self._row.segment.discard()
-            self._row, self._start = None, None
-        segment = Segment(Path(request.path), request.expected_bytes, self._memory)
-        self._memory = segment.memory
-        stale = 0
+            self._forget()
+        segment = Segment(Path(request.path), request.expected_bytes)
+        try:
+            log = PacketLog(request.expected_bytes, self._memory)
+        except MemoryError:
+            segment.discard()
+            what = f"{request.path}: no memory for a row of {request.expected_bytes} bytes"
+            raise DeviceError(what, "the row is larger than memory") from None
+        strays = PacketLog(0)
         while n := self._batches.receive():
-            stale += n
-        if stale:
-            self._start = None  # the card went on counting: where it starts now is not known
-        self._row = _Row(request, segment, self._start, stale, self._batches.strangers, kernel_drops(self._socket))
-        return words.Began(stale)
+            strays.add(self._batches.packets[:n], self._batches.lengths[:n], time.monotonic_ns())
+        self._past = self._past.starts_after(strays)
+        self._row = row = _Row(request, segment, log, self._past)
+        row.stale, row.strangers = strays.count + strays.malformed, self._batches.strangers
+        row.drops = kernel_drops(self._socket)
+        return words.Began(row.stale)
+
+    def _forget(self) -> None:
+        """Give the row up; what its card sent is not known then."""
+        if self._row is not None:
+            self._row.segment.discard()
+        self._row, self._past = None, Past(spans=self._past.spans)
 
     def _receive(self) -> None:
         row, batches = self._row, self._batches
@@ -174,53 +170,37 @@ class Receiver:
             looked_ns = time.monotonic_ns()
             n = batches.receive()
             if n == 0:
-                row.note_quiet(looked_ns)
+                row.log.note_quiet(looked_ns)
                 break
-            row.placement.place(batches.packets[:n], batches.lengths[:n])
-            row.note_arrival()
+            row.log.add(batches.packets[:n], batches.lengths[:n], time.monotonic_ns())
         if row.news():
             words.send(self._connection, row.progress())
 
-    def _end(self, card_status: Status) -> words.Answer:
+    def _end(self, request: words.EndRow) -> words.Answer:
         row = self._row
         if row is None or self._socket is None or self._batches is None:
             raise DeviceError("no row is being received")
         self._receive()
         self._row = None
-        placed = row.placement.finish((card_status & LOST_BEFORE_PACKETS).name or "")
-        self._start = placed.next_start
-        counts, request = placed.counts, row.request
-        facts = {
-            "row": request.row,
-            "take": request.take,
-            "expected": placed.expected,
-            "received": placed.received,
-            "located": placed.located,
-            "reason": placed.reason,
-            "missing": placed.missing,
-            "holes": placed.holes,
-            "clock": "CLOCK_MONOTONIC of the host, ns",
-            "card_status": int(card_status),
-            **{name: int(value) for name, value in (vars(counts) | vars(placed.losses)).items()},
-        }
-        crc = row.segment.finish()
-        arrivals = row.arrivals
-        index_crc = write_index(Path(request.path).with_suffix(".idx"), facts, arrivals)
+        asked, log, path = row.request, row.log, Path(row.request.path)
+        dropped = (Status(request.card_status) & LOST_BEFORE_PACKETS).name or ""
+        not_before_ns = max(request.not_before_ns, row.not_before_ns)
+        evidence = Evidence(asked.expected_bytes, asked.frame_bytes, not_before_ns, dropped, row.past)
+        placed, out = place_record(log, asked.frame_bytes, row.past, not_before_ns, dropped)
+        self._past, self._memory = placed.past, log.payload
+        crc = row.segment.finish(out)
+        facts = {"row": asked.row, "take": asked.take, **placed.facts(), "card_status": request.card_status}
+        index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
+        counts, losses, arrivals = vars(placed.counts).copy(), vars(placed.losses), placed.arrivals
+        counts["packets"] = counts.pop("placed")
         return words.RowCapture(
-            row=request.row,
-            take=request.take,
+            row=asked.row,
+            take=asked.take,
             expected=placed.expected,
             bytes=placed.received,
             missing=placed.missing,
             located=placed.located,
             reason=placed.reason,
-            packets=counts.placed,
-            duplicates=counts.duplicates,
-            late=counts.late,
-            outside=counts.outside,
-            disagreeing=counts.disagreeing,
-            malformed=counts.malformed,
-            short=counts.short,
             strangers=self._batches.strangers - row.strangers,
             stale=row.stale,
             kernel_drops=kernel_drops(self._socket) - row.drops,
@@ -228,15 +208,12 @@ class Receiver:
             last_arrival_ns=int(arrivals[-1, 0]) if arrivals.size else 0,
             crc32=crc,
             index_crc32=index_crc,
-            leftover=counts.leftover,
-            late_by_bytes=counts.late_by_bytes,
-            head_bytes=placed.losses.head_bytes,
-            gaps=placed.losses.gaps,
-            gap_bytes=placed.losses.gap_bytes,
-            tail_bytes=placed.losses.tail_bytes,
-            card_status=int(card_status),
+            packets_crc32=write_packets(path.with_suffix(PACKETS), log, evidence, placed),
+            card_status=request.card_status,
             holes=placed.holes,
             slipped=placed.slipped,
+            **counts,
+            **losses,
         )
 
 

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import os
+from typing import NamedTuple
 
 REAL_TIME = 5  # below the kernel's own threads and the Pi's pulses (where both run on one machine)
 NICE = -5
 PRIORITY_REMEDY = (
-    "put `USER - rtprio 10` and `USER - nice -10` into /etc/security/limits.d/polysight.conf (USER: who scans) and log"
-    " in again; without it a busy machine may lose packets, which are counted and their row taken again"
+    "`sudo host/rights.sh USER` (USER: who scans), then log out and in again, or restart the machine (docs/how-to/"
+    "install.md); without it a busy machine may lose packets, which are counted and their row taken again"
 )
 
 
-def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[int | None]:
+class Core(NamedTuple):
+    """A core for a receiver, and whether it has it to itself among the receivers."""
+
+    number: int
+    own: bool
+
+
+def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core | None]:
     """A core for each receiver, from the last one down; the first is left to the host. None where there is only one.
 
     Parameters
@@ -25,12 +33,17 @@ def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[int |
     if cores is None:
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     usable = cores[1:][::-1]
-    return [usable[k % len(usable)] if usable else None for k in range(receivers)]
+    own = len(usable) >= receivers
+    return [Core(usable[k % len(usable)], own) if usable else None for k in range(receivers)]
 
 
-def take_core(core: int | None) -> tuple[int | None, str]:
-    """Pin this process to a core. Returns the core it is on (None: any), and what could not be done ("" when all)."""
-    if core is None:
+def take_core(core: int | None, own: bool = True, urgent: bool = True) -> tuple[int | None, str]:
+    """Pin this process to a core. Returns the core it is on (None: any), and what could not be done ("" when all).
+
+    Not on a core that it shares with other receivers (`own` false), unless it is `urgent`, of real-time priority:
+    ordinary processes pinned to one core lose far more packets than where the kernel may move them.
+    """
+    if core is None or not (own or urgent):
         return None, ""
     try:
         os.sched_setaffinity(0, {core})

@@ -26,18 +26,20 @@ def _scan_of(path: Path) -> Path:
     return path.parents[2] if path.parent.parent.name == "raw" else path.parent
 
 
-def _full(path: Path) -> tuple[str, str]:
+def disk_full(path: Path) -> tuple[str, str]:
+    """Why a row's file could not be written, and what to do."""
     return "the disk is full or fails", f"free space, then `polysight resume {_scan_of(path)}` takes the row again"
 
 
-def _damaged(path: Path) -> tuple[str, str]:
+def damaged(path: Path) -> tuple[str, str]:
+    """Why a row's file cannot be read, and what to do."""
     return "the file is damaged or truncated", f"`polysight validate {_scan_of(path)}` names every damaged file"
 
 
 class Segment:
-    """A file of known size, its space on the disk reserved; its bytes are gathered in memory until :meth:`finish`.
+    """A file of known size, its space on the disk reserved; its bytes are written at once by :meth:`finish`.
 
-    In memory, because a mapped file can make the receiver wait for the disk whenever the kernel writes the file back,
+    At once, because a mapped file can make the receiver wait for the disk whenever the kernel writes the file back,
     while the receive buffer holds a quarter of a second. A row that was not finished is re-taken anyway.
 
     Parameters
@@ -46,15 +48,6 @@ class Segment:
         The file; its folder is made.
     size
         Bytes.
-    memory
-        uint8 [at least size] to gather in, from an earlier segment; new memory when it is None or too small.
-
-    Attributes
-    ----------
-    data
-        uint8 [size], zero at first.
-    memory
-        For the next segment.
 
     Raises
     ------
@@ -62,7 +55,7 @@ class Segment:
         when the disk has no room or cannot be written.
     """
 
-    def __init__(self, path: Path, size: int, memory: NDArray[np.uint8] | None = None) -> None:
+    def __init__(self, path: Path, size: int) -> None:
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,8 +65,6 @@ class Segment:
                 if size:
                     # Reserve the space now: a full disk must be an error here, not after the row.
                     os.posix_fallocate(self._file.fileno(), 0, size)
-                if memory is None or memory.size < size:
-                    memory = np.empty(size, dtype=np.uint8)
                 stack.pop_all()
         except OSError as e:
             raise DeviceError(
@@ -81,22 +72,17 @@ class Segment:
                 "the disk is full or read-only",
                 f"free space; `polysight resume {_scan_of(path)}` then goes on from the last committed row",
             ) from None
-        except MemoryError:
-            raise DeviceError(f"{path}: no memory for a row of {size} bytes", "the row is larger than memory") from None
-        self.memory = memory
-        self.data = memory[:size]
-        self.data.fill(0)  # what does not come must be zero; and the pages are there before the first packet
 
-    def finish(self) -> int:
+    def finish(self, data: NDArray[np.uint8]) -> int:
         """Write the bytes, make them durable, close; returns their CRC-32. Raises DeviceError when the disk fails."""
-        left = self.data.data
+        left = np.ascontiguousarray(data).data
         crc = zlib.crc32(left)
         try:
             while left:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except OSError as e:
-            raise DeviceError(f"{self.path}: cannot be made durable: {e.strerror}", *_full(self.path)) from None
+            raise DeviceError(f"{self.path}: cannot be made durable: {e.strerror}", *disk_full(self.path)) from None
         finally:
             self.close()
         return crc
@@ -121,7 +107,7 @@ def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) 
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
-        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *_full(path)) from None
+        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *disk_full(path)) from None
     return zlib.crc32(raw)
 
 
@@ -132,7 +118,7 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
         facts = json.loads(head)
         pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: not a readable row index: {e}", *_damaged(path)) from None
+        raise DataError(f"{path}: not a readable row index: {e}", *damaged(path)) from None
     if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
-        raise DataError(f"{path}: the row index does not hold what it says", *_damaged(path))
+        raise DataError(f"{path}: the row index does not hold what it says", *damaged(path))
     return facts, pairs

@@ -13,7 +13,7 @@ from typing import Literal
 from polysight.host.capture.card import CardClient
 from polysight.host.capture.network import Hop, check_receive_buffer, route_interface, silent_hop, silent_radar
 from polysight.host.capture.receiver import ReceiverProcess, RowCapture
-from polysight.host.capture.scheduling import PRIORITY_REMEDY, receiver_cores
+from polysight.host.capture.scheduling import PRIORITY_REMEDY, Core, receiver_cores
 from polysight.shared.config import Board, Instrument
 from polysight.shared.errors import DeviceError
 
@@ -71,7 +71,7 @@ def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurv
         return [survey.result() for survey in surveys]
 
 
-def _survey(board: Board, instrument: Instrument, core: int | None, listen_s: float) -> CardSurvey:
+def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: float) -> CardSurvey:
     survey = CardSurvey(board)
     found = survey.hops
     try:
@@ -109,7 +109,7 @@ def _reach(survey: CardSurvey, card: CardClient) -> Iterator[HopFinding]:
         yield HopFinding(hop, "ok", sound)
 
 
-def _receive(card: CardClient, instrument: Instrument, core: int | None, listen_s: float) -> Iterator[HopFinding]:
+def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen_s: float) -> Iterator[HopFinding]:
     """The receiving process as a scan starts it, its buffer, and what it gets from the radar."""
     board, wanted = card.board, instrument.card.receive_buffer_bytes
     try:

@@ -186,6 +186,10 @@ def _add_plan(add: Add) -> None:
 def _inspect(args: argparse.Namespace) -> int:
     from polysight.host.jobs.look import inspect_file
 
+    if args.placement:
+        from polysight.host.jobs.placement import inspect_placement
+
+        return inspect_placement(args.file, args.json)
     return inspect_file(args.file, args.config, args.plot, args.card, args.json)
 
 
@@ -198,6 +202,9 @@ def _add_inspect(add: Add) -> None:
     )
     sub.add_argument(
         "--config", type=Path, metavar="RIG", help="rig file it was recorded with (default: a scan's own; else guessed)"
+    )
+    sub.add_argument(
+        "--placement", action="store_true", help="FILE is a row of a scan: how its packets were placed, decided again"
     )
     sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the range profile of every antenna")
     sub.add_argument("--card", default="", metavar="ADDRESS", help="which card, where packets of several were recorded")

@@ -36,6 +36,10 @@ def _resume(args: argparse.Namespace) -> int:
 def _validate(args: argparse.Namespace) -> int:
     from polysight.host.jobs.look import validate_folder
 
+    if args.replace:
+        from polysight.host.jobs.placement import replace_folder
+
+        return replace_folder(args.folder, args.json)
     return validate_folder(args.folder, args.json)
 
 
@@ -99,6 +103,9 @@ def _add_file_commands(add: Add) -> None:
         "validate", _validate, "check every file of a scan folder, and name every fault", "polysight validate scans/one"
     )
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument(
+        "--replace", action="store_true", help="place every row again from its packets, and commit what changes"
+    )
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")
 
     sub = add(

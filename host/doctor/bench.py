@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from polysight.host.acquisition import CaptureRig, PiClient
 from polysight.host.capture import CardSurvey, RowCapture, row_words, survey_cards
+from polysight.host.doctor.receiver_load import Held, measure
 from polysight.host.radar import BoardState, radar_control
 from polysight.host.store import PART
 from polysight.shared.config import Board, Instrument
@@ -174,6 +175,7 @@ class System:
     wall_ns: Callable[[], int] = time.time_ns
     clock_is_synchronised: Callable[[], bool | None] = clock_is_synchronised
     write_speed: Callable[[Path], float] = write_speed
+    held: Callable[[Instrument, list[float]], tuple[list[Held], str]] = measure
     root: Path = Path("/")
 
 

@@ -7,7 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from polysight.host.calibration import checked
+from polysight.host.capture import PRIORITY_REMEDY
 from polysight.host.doctor.bench import Bench, Finding, error, not_checked, ok, warning
+from polysight.host.doctor.receiver_load import SEND_US, rates
 from polysight.host.materials import SIMULATED_LIBRARY, Library
 from polysight.host.plan import scan_time
 from polysight.host.process import Options
@@ -143,4 +145,21 @@ def check_pi_clock(bench: Bench) -> Finding:
         )
     if abs(offset_s) - unsure_s > APART_S:
         return warning(told, "one of the two is not synchronised", _NTP, **facts)
+    return ok(told, **facts)
+
+
+def check_receivers(bench: Bench) -> Finding:
+    """What the receivers hold under load, and whether a scan needs more."""
+    some = rates(bench.rig)
+    held, scheduling = bench.system.held(bench.rig, some)
+    told = "; ".join(
+        f"{h.mbit_s:.0f} Mbit/s a card: {'nothing lost' if not h.lost else f'{100 * h.lost / h.sent:.1f} % lost'}"
+        for h in held
+    )
+    told = f"receivers ({scheduling}) beside a busy machine: {told}"
+    facts = {"held": [vars(h) for h in held], "scheduling": scheduling}
+    needed = held[: some.index(1e6 / (bench.rig.card.packet_delay_us + SEND_US)) + 1]
+    if any(h.lost for h in needed):
+        why = "other programs take the processor from the receivers"
+        return warning(told, why, PRIORITY_REMEDY if "real-time" not in scheduling else "a faster machine", **facts)
     return ok(told, **facts)

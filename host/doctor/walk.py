@@ -12,7 +12,14 @@ from dataclasses import asdict, dataclass, replace
 
 from polysight.host.doctor.bench import Bench, Finding, System, Wanted, not_checked, of_error
 from polysight.host.doctor.check_capture import check_buffer, check_card, check_network, check_pulses, check_radar
-from polysight.host.doctor.check_host import check_config, check_disk, check_host_clock, check_pi_clock, check_time
+from polysight.host.doctor.check_host import (
+    check_config,
+    check_disk,
+    check_host_clock,
+    check_pi_clock,
+    check_receivers,
+    check_time,
+)
 from polysight.host.doctor.check_pi import SIMULATED, check_free, check_keys, check_pi, check_stage, check_trigger
 from polysight.shared.config import Board
 from polysight.shared.errors import DeviceError, PolysightError
@@ -75,6 +82,7 @@ CHECKS = (
     Check("card", check_card, ("config",), ("rig is free",), each_board=True),
     Check("network", check_network, ("config",), each_board=True),
     Check("buffer", check_buffer, ("card",), each_board=True),
+    Check("receivers", check_receivers, ("config",), ("rig is free",)),
     Check("disk", check_disk, ("config",), ("rig is free",)),
     Check("scan time", check_time, ("config",)),
     Check("trigger line", check_trigger, ("rig is free", "stage")),

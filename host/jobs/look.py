@@ -18,6 +18,7 @@ from polysight.host.store import MANIFEST, ScanFolder, to_json, validate
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import DataError, PolysightError
 
+GUESSES = 3  # layouts that are named
 BOTTOM_DB = -20.0  # of the plot of a range profile
 
 
@@ -29,15 +30,27 @@ def main_text(report: Report) -> str:
         lines += _card_lines(r.card)
     if r.chirps:
         order = ("Q first" if r.q_first else "I first") if r.is_complex else "real"
+        order += ", adjacent" if r.adjacent else ""
         lines += [
             f"shape      {r.chirps} chirps x {r.rx} RX x {r.samples} samples, {r.lanes}-lane, {order}"
             + (f" (guessed: {', '.join(r.guessed)})" if r.guessed else ""),
+            *_guess_lines(r),
             f"peak       {r.peak_db:.1f} dB over the median at bin {r.peak_bin} of {r.samples}",
             f"level      rms {', '.join(f'{v:.0f}' for v in r.rx_rms)} counts on RX 0.., DC {max(r.rx_dc):.1f}",
             f"clipping   {r.clipped} values at full scale",
             f"profile    {_sparkline(r.profile_db)}",
         ]
+    if r.not_a_capture:
+        lines.append(f"not a capture: {r.not_a_capture}")
     return "\n".join(lines + [f"note       {remark}" for remark in r.remarks]) + "\n"
+
+
+def _guess_lines(r: Report) -> list[str]:
+    """The layouts that were tried, where there was a choice: the likeliest few."""
+    if len(r.guesses) < 2:
+        return []
+    told = (f"{g.shape} {100 * g.likelihood:.0f} %" for g in r.guesses[:GUESSES])
+    return [f"likely     {'; '.join(told)}"]
 
 
 def _card_lines(card: CardReport) -> list[str]:
@@ -108,7 +121,7 @@ def _scan_of(file: Path) -> ScanFolder | None:
 
 
 def inspect_file(file: Path, config: Path | None, plot: Path | None, card_address: str, as_json: bool) -> int:
-    """Say what is in a capture, and draw its range profile; returns the exit status.
+    """Say what is in a capture, and draw its range profile; returns the exit status, that of DataError if it is none.
 
     `config` is the rig file it was recorded with; a row of a scan folder brings its own. Raises PolysightError.
     """
@@ -129,7 +142,7 @@ def inspect_file(file: Path, config: Path | None, plot: Path | None, card_addres
     if plot is not None:
         plot_profile(report, plot)
         sys.stderr.write(f"range profile: {plot}\n")
-    return 0
+    return DataError.exit_status if report.not_a_capture else 0
 
 
 def plot_profile(report: Report, path: Path) -> None:

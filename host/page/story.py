@@ -57,6 +57,10 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
         "Packets were lost between card and host",
         "Nothing, while it is rare; else check cable and switch",
     ),
+    K.CONFLICTING: (
+        "Packets with the same counters brought different bytes",
+        "Nothing: the row is taken again. If it comes back, reset the card: `polysight card reset BOARD`",
+    ),
     K.UNLOCATED: (
         "Packets were lost at the row's beginning, or the radar saw triggers that were not sent",
         "Nothing, while it is rare; else check cable, switch and SYNC_IN wire",

@@ -9,6 +9,7 @@ from polysight.host.store.append_only import sync_folder
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.raw import Digests, drop, droppable, require_raw
+from polysight.host.store.replace import PlacedAgain, Replaced, place_again, replace_rows
 from polysight.host.store.scan_folder import (
     EVENTS,
     MANIFEST,
@@ -38,7 +39,9 @@ __all__ = [
     "Manifest",
     "ManifestFault",
     "ManifestWriter",
+    "PlacedAgain",
     "RawSource",
+    "Replaced",
     "RowData",
     "Scan",
     "ScanFolder",
@@ -53,10 +56,12 @@ __all__ = [
     "mirrored",
     "new_scan_id",
     "open_source",
+    "place_again",
     "raw_source",
     "read_events",
     "read_settings",
     "reconnected",
+    "replace_rows",
     "require_raw",
     "rig_of",
     "sync_folder",

@@ -110,6 +110,7 @@ class BoardRow(msgspec.Struct, frozen=True):
     missing_bytes: int
     crc32: str
     index_crc32: str = ""
+    packets_crc32: str = ""
 
 
 class CommittedRow(msgspec.Struct, frozen=True):

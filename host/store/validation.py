@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
-from polysight.host.capture import read_index
+from polysight.host.capture import PACKETS, read_index
 from polysight.host.store import manifest
 from polysight.host.store.events import read_events
 from polysight.host.store.manifest import ManifestFault
@@ -137,6 +137,7 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     elif f"{crc:08x}" != board.crc32:
         found.append(Finding("error", where, "not the bytes that were committed (CRC)", _COPY))
     index = path.with_suffix(".idx")
+    found += _packets(scan, board, path.with_suffix(PACKETS))
     where = str(index.relative_to(scan.path))
     if not index.exists():
         needed = board.missing_bytes > 0 or board.index_crc32 != ""
@@ -157,6 +158,21 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     if not ordered or not inside or sum(b - a for a, b in gaps) != board.missing_bytes:
         found.append(Finding("error", where, f"its gaps do not make the {board.missing_bytes} missing bytes"))
     return found
+
+
+def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
+    """Compare the row's packets with what was committed. Rows of earlier releases have none."""
+    if not board.packets_crc32:
+        return []
+    where = str(path.relative_to(scan.path))
+    try:
+        _, crc = _digest(path)
+    except FileNotFoundError:
+        return [Finding("error", where, "absent", _COPY)]
+    except OSError as e:
+        return [_not_read(where, e)]
+    right = f"{crc:08x}" == board.packets_crc32
+    return [] if right else [Finding("error", where, "not the bytes that were committed (CRC)", _COPY)]
 
 
 def _not_read(where: str, e: OSError) -> Finding:
@@ -189,11 +205,11 @@ def _dropped(scan: ScanFolder) -> list[Finding]:
 
 def _strays(scan: ScanFolder, rows: dict[int, CommittedRow]) -> list[Finding]:
     known = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
-    known |= {p.with_suffix(".idx") for p in known}
+    known |= {p.with_suffix(suffix) for p in known for suffix in (".idx", PACKETS)}
     return [
         Finding("note", str(p.relative_to(scan.path)), "belongs to no committed row", "resume replaces it")
         for p in sorted((scan.path / "raw").rglob("*"))
-        if p.is_file() and p not in known and p.suffix in (".bin", ".idx", PART)
+        if p.is_file() and p not in known and p.suffix in (".bin", ".idx", PACKETS, PART)
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.inspect import Known, Report, Shape, inspect_bin
 from polysight.host.capture.pcap import inspect_pcap, read_pcap
-from polysight.host.jobs.look import main_text, plot_profile
+from polysight.host.jobs.look import inspect_file, main_text, plot_profile
 from polysight.shared.errors import DataError
 from tests.support.capture.recordings import real_row, row, write_pcap
 from tests.support.paths import REAL_CAPTURES
@@ -37,6 +38,66 @@ def test_shape_and_order_are_guessed(tmp_path, lanes, q_first):
     assert r.peak_bin < 128
     assert r.remarks == []
     assert "guessed" in main_text(r)
+
+
+@pytest.mark.parametrize("lanes", [4, 2])
+@pytest.mark.parametrize("q_first", [False, True])
+@pytest.mark.parametrize("samples", [128, 256, 512])
+def test_adjacent_pairs_are_recognised(tmp_path, lanes, q_first, samples):
+    """Public data sets of IWR and AWR16xx, 18xx, 68xx hold I and Q of a sample side by side."""
+    path = tmp_path / "x.bin"
+    row(lanes, q_first, samples=samples, adjacent=True).tofile(path)
+    r = inspect_bin(path)
+    assert (r.lanes, r.samples, r.chirps, r.q_first, r.adjacent) == (lanes, samples, 32, q_first, True)
+    assert r.peak_bin < samples // 2
+    assert "adjacent" in main_text(r)
+
+
+@pytest.mark.parametrize("adjacent", [False, True])
+@pytest.mark.parametrize("lanes", [4, 2])
+def test_guesses_have_likelihoods(tmp_path, lanes, adjacent):
+    """They sum to one, the taken one is the likeliest of clear data, and what is given leaves no choice."""
+    path = tmp_path / "x.bin"
+    row(lanes, False, adjacent=adjacent).tofile(path)
+    r = inspect_bin(path)
+    assert sum(g.likelihood for g in r.guesses) == pytest.approx(1)
+    assert r.guesses[0].shape == Shape(lanes, True, 256, 4, adjacent)
+    assert r.guesses[0].likelihood == max(g.likelihood for g in r.guesses)
+    assert f"{100 * r.guesses[0].likelihood:.0f} %" in main_text(r)
+    given = inspect_bin(path, Known.of_shape(Shape(lanes, True, 256, 4, adjacent)))
+    assert [g.likelihood for g in given.guesses] == [1.0]
+
+
+def noise_of_a_receiver(tmp_path: Path) -> bytes:
+    del tmp_path
+    return np.random.default_rng(1).normal(scale=20, size=1 << 16).round().astype("<i2").tobytes()
+
+
+def a_whole_picture(tmp_path: Path) -> bytes:
+    row(4, False).tofile(tmp_path / "y.bin")
+    plot_profile(inspect_bin(tmp_path / "y.bin"), tmp_path / "y.png")
+    return (tmp_path / "y.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "is_capture"),
+    [
+        (noise_of_a_receiver, True),
+        (lambda _p: row(4, False).tobytes(), True),
+        (lambda _p: row(2, False, adjacent=True).tobytes(), True),
+        (lambda _p: altered(row(4, False), "clipping").tobytes(), True),
+        (lambda _p: altered(row(2, False), "offset binary").tobytes(), True),
+        (lambda _p: np.random.default_rng(1).bytes(1 << 17), False),
+        (lambda _p: bytes(1 << 16), False),
+        (a_whole_picture, False),
+        (lambda _p: Path(sys.executable).resolve().read_bytes()[: 1 << 20], False),
+    ],
+)
+def test_what_is_no_capture_has_a_status_of_its_own(tmp_path, capsys, content, is_capture):
+    path = tmp_path / "x.bin"
+    path.write_bytes(content(tmp_path))
+    assert inspect_file(path, None, None, "", as_json=False) == (0 if is_capture else DataError.exit_status)
+    assert ("not a capture" in capsys.readouterr().out) is not is_capture
 
 
 def test_faults_are_told(tmp_path):

@@ -11,8 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from polysight.host.capture.dca1000 import Counters, encode_packet
-from polysight.host.capture.placement import Losses, Placement
-from tests.support.capture.records import FULL, Record, is_original_or_masked, mask_of, place
+from polysight.host.capture.earlier_records import Past
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import Losses, place_record
+from tests.support.capture.records import FULL, Record, is_original_or_masked, log_of, mask_of, place
 
 SLOW = [HealthCheck.too_slow]  # a busy machine is no fault
 COUNT, SEQUENCE = 1 << 48, 1 << 32
@@ -129,7 +131,9 @@ def test_every_disorder_at_once(
     placed, out = place(size, [p for _, p in arriving], Counters(count, sequence), frame, batch)
     c = placed.counts
     assert is_original_or_masked(record, placed, out)
-    assert c.placed + c.duplicates + c.leftover + c.outside + c.disagreeing + c.malformed == len(arriving)
+    assert c.placed + c.duplicates + c.conflicting + c.leftover + c.outside + c.disagreeing + c.malformed == len(
+        arriving
+    )
     assert c.malformed == malformed
     if arriving and (arriving[0][0] == 0 or len(arriving[0][1]) == 10 + FULL) and not c.disagreeing:
         assert (c.placed, c.duplicates, c.late) == (oracle.placed, oracle.duplicates, oracle.late)
@@ -164,16 +168,14 @@ def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, 
         assert placed.missing == ([(0, head * FULL)] if head else [])
         assert placed.losses.head_bytes == head * FULL
         assert is_original_or_masked(record, placed, out)
-        count, sequence, start = count + len(record.data), sequence + len(record.packets), placed.next_start
+        count, sequence, start = count + len(record.data), sequence + len(record.packets), placed.past
 
 
 def test_bytes_the_card_dropped_itself_mask_the_whole_record():
     """Status bits 7 and 9: the counters have no gap, so no byte's place is certain, even when the count is right."""
     record = Record.make(5 * 4096, 0, 1)
-    placement = Placement(np.zeros(5 * 4096, dtype=np.uint8), 4096, Counters(0, 1))
-    for packet in record.packets:
-        placement.place_packet(packet)
-    placed = placement.finish("DDR_FULL")
+    log = log_of(5 * 4096, record.packets)
+    placed, _ = place_record(log, 4096, Past.ending_at(Counters(0, 1)), dropped_by_card="DDR_FULL")
     assert not placed.complete
     assert placed.missing == [(0, 5 * 4096)]
     assert "dropped data before numbering it (DDR_FULL)" in placed.reason
@@ -188,23 +190,22 @@ def test_losses_are_told_by_kind():
     assert (placed.counts.late, placed.counts.late_by_bytes) == (1, 2 * FULL)
 
 
-def test_placing_allocates_nothing_that_stays():
-    """Nothing is kept for a packet: a thousand batches leave as many blocks of memory as ten."""
+def test_logging_allocates_nothing_that_stays():
+    """A packet makes no object: a thousand batches leave as many blocks of memory as ten."""
     size, batch = 256 * FULL, 256
     record = Record.make(size, 0, 1)
     block = np.frombuffer(b"".join(record.packets), dtype=np.uint8).reshape(batch, 10 + FULL).copy()
     lengths = np.full(batch, 10 + FULL, dtype=np.uint32)
-    out = np.zeros(size * 1000, dtype=np.uint8)
-    placement = Placement(out, 4096, Counters(0, 1))
+    log = PacketLog(size * 1000)
     kept = []
     for n in range(1000):
         k = np.arange(n * batch, (n + 1) * batch)
         block[:, 0:4] = (k + 1).astype("<u4")[:, None].view(np.uint8)
         block[:, 4:10] = (k * FULL).astype("<u8")[:, None].view(np.uint8)[:, :6]
-        placement.place(block, lengths)
+        log.add(block, lengths, n)
         if n in (9, 999):
             kept.append(sys.getallocatedblocks())
-    assert placement.complete
+    assert log.count == 256_000
     assert kept[1] - kept[0] < 200
 
 
@@ -308,7 +309,7 @@ def test_second_record_continues_and_the_stale_first_is_outside():
     first, second = Record.make(5000, 0, 1), Record.make(5000, 5000, 5, seed=1)
     placed, _ = place(5000, first.packets)
     assert placed.next_start == Counters(5000, 5)
-    placed, out = place(5000, [second.packets[0], first.packets[-1], *second.packets[1:]], placed.next_start, 1000)
+    placed, out = place(5000, [second.packets[0], first.packets[-1], *second.packets[1:]], placed.past, 1000)
     assert placed.complete
     assert (placed.counts.leftover, placed.counts.outside) == (1, 0)
     assert out.tobytes() == second.data

@@ -3,34 +3,61 @@
 from __future__ import annotations
 
 import os
+import subprocess
 
 import pytest
 
 from polysight.host.capture.network import check_receive_buffer, usable_packets
 from polysight.host.capture.receiver import ReceiverProcess
-from polysight.host.capture.scheduling import receiver_cores, take_core, take_priority
+from polysight.host.capture.scheduling import Core, receiver_cores, take_core, take_priority
 from polysight.shared.errors import DeviceError
+from tests.support.paths import REPO
 
 FULL = 1456
+RIGHTS = REPO / "host/rights.sh"
 
 
 def test_cores_leave_the_first_to_the_host():
     assert receiver_cores(2, [0]) == [None, None]
     assert receiver_cores(2, []) == [None, None]
-    assert receiver_cores(2, [0, 1]) == [1, 1]
-    assert receiver_cores(3, [0, 1, 2, 5]) == [5, 2, 1]
+    assert receiver_cores(2, [0, 1]) == [(1, False), (1, False)]
+    assert receiver_cores(3, [0, 1, 2, 5]) == [(5, True), (2, True), (1, True)]
     assert len(receiver_cores(2)) == 2
 
 
 def test_where_and_how_urgently_it_runs_is_said(board):
     core = max(os.sched_getaffinity(0))
-    with ReceiverProcess(board, 1 << 20, core) as receiver:
+    with ReceiverProcess(board, 1 << 20, Core(core, own=True)) as receiver:
         pinned = os.sched_getaffinity(receiver.pid) == {core}
         urgent = os.sched_getscheduler(receiver.pid) == os.SCHED_RR
         assert (f"core {core}" in receiver.scheduling) is pinned
         assert ("real-time" in receiver.scheduling) is urgent
         assert pinned or any("not pinned" in w for w in receiver.warnings)
         assert urgent or any("no real-time priority" in w for w in receiver.warnings)
+
+
+@pytest.mark.parametrize(("own", "urgent"), [(True, True), (True, False), (False, True), (False, False)])
+def test_a_shared_core_is_taken_with_priority_only(monkeypatch, own, urgent):
+    taken: list[set[int]] = []
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _pid, cores: taken.append(cores))
+    assert take_core(1, own, urgent) == ((1, "") if own or urgent else (None, ""))
+    assert taken == ([{1}] if own or urgent else [])
+
+
+def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
+    done = subprocess.run(
+        ["sh", RIGHTS, "ada"], env={**os.environ, "ROOT": str(tmp_path)}, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    limits = (tmp_path / "etc/security/limits.d/60-polysight.conf").read_text()
+    assert limits.splitlines()[-2:] == ["ada - rtprio 10", "ada - nice -10"]
+    desktop = (tmp_path / "etc/systemd/system/user@.service.d/60-polysight.conf").read_text()
+    assert "LimitRTPRIO=10" in desktop
+    assert "LimitNICE=-10" in desktop
+    assert f"net.core.rmem_max = {8 << 20}" in (tmp_path / "etc/sysctl.d/60-polysight.conf").read_text()
+    for bad in ([], ["a b"], ["ada; reboot"]):
+        refused = subprocess.run(["sh", RIGHTS, *bad], env={**os.environ, "ROOT": str(tmp_path)}, check=False)
+        assert refused.returncode == 2
 
 
 def test_what_is_not_permitted_is_said(monkeypatch):

@@ -55,8 +55,10 @@ def test_the_drawing_shows_the_rig_file_and_the_sketch():
 def test_what_the_installation_writes_is_what_the_programs_want():
     text = (ROOT / "docs/how-to/install.md").read_text(encoding="utf-8")
     rig = tomllib.loads((ROOT / "instrument.toml").read_text(encoding="utf-8"))
-    assert f'ATTR{{idVendor}}=="{VENDOR:04x}", ATTR{{idProduct}}=="{PRODUCT:04x}"' in text
-    assert f"net.core.rmem_max = {rig['card']['receive_buffer_bytes']}" in text
+    rights = (ROOT / "host/rights.sh").read_text(encoding="utf-8")
+    assert "host/rights.sh" in text
+    assert f'ATTR{{idVendor}}=="{VENDOR:04x}", ATTR{{idProduct}}=="{PRODUCT:04x}"' in rights
+    assert f"net.core.rmem_max = {rig['card']['receive_buffer_bytes']}" in rights
     assert {board["host_address"] for board in rig["boards"]} == {re.findall(r"addresses ([\d.]+)/24", text)[0]}
     assert f"cd {rig['pi']['key_dir'].removesuffix('/keys')}\n" in (ROOT / "docs/how-to/bring-up.md").read_text()
     assert rig["pi"]["key_dir"] in text

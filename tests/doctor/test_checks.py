@@ -13,7 +13,8 @@ from polysight.host.cli.main import main
 from polysight.host.doctor import bench as kernel
 from polysight.host.doctor.bench import Bench, Finding, System, Wanted, error, ok
 from polysight.host.doctor.check_capture import check_network
-from polysight.host.doctor.check_host import check_config, check_disk, check_time
+from polysight.host.doctor.check_host import check_config, check_disk, check_receivers, check_time
+from polysight.host.doctor.receiver_load import Held, measure
 from polysight.host.doctor.walk import CHECKS, _try, walk
 from polysight.shared.messages import GPIOD, GPIOMEM, WIRES, HelloReply
 from polysight.shared.tables import to_builtins
@@ -214,3 +215,21 @@ def test_config_is_read_from_the_file(tmp_path):
     bench = Bench(Wanted(path))
     assert check_config(bench).verdict == "ok"
     assert bench.rig == RIG
+
+
+@pytest.mark.parametrize(("lost", "verdict"), [((0, 0, 0), "ok"), ((0, 0, 50), "ok"), ((0, 5, 50), "warning")])
+def test_receivers_must_hold_what_the_card_sends_at_its_pace(tmp_path, lost, verdict):
+    """What only the fastest card would lose is told, and no fault of this rig's machine."""
+    held = System(held=lambda _rig, some: ([Held(r, r, 100, n) for r, n in zip(some, lost, strict=True)], "nice -5"))
+    finding = check_receivers(bench_of(programmed_rig(), tmp_path, held))
+    assert finding.verdict == verdict
+    assert "50.0 % lost" in finding.found if lost[2] else "nothing lost" in finding.found
+    assert verdict == "ok" or "rights.sh" in finding.remedy
+
+
+def test_the_receivers_are_measured_with_packets():
+    held, scheduling = measure(programmed_rig(), [500.0], seconds=0.2)
+    assert scheduling
+    assert [(h.wanted, h.sent) for h in held] == [(500.0, 200)]
+    assert 0 <= held[0].lost <= held[0].sent
+    assert held[0].reached > 0

@@ -13,6 +13,7 @@ from polysight.host.acquisition.scan import run_scan
 from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
 from polysight.host.cli.main import main
 from polysight.host.doctor.bench import System
+from polysight.host.doctor.receiver_load import Held
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
@@ -22,7 +23,9 @@ from polysight.shared.messages import BeginRun
 from polysight.shared.raster import plan_raster
 
 pytestmark = pytest.mark.xdist_group("doctor")
-QUICK = System(write_speed=lambda _folder: 200e6)
+QUICK = System(
+    write_speed=lambda _folder: 200e6, held=lambda _rig, rates: ([Held(r, r, 9, 0) for r in rates], "any core")
+)
 
 
 def only_wrong(findings, *names):

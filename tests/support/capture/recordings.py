@@ -10,8 +10,15 @@ import numpy as np
 CARD, OTHER = b"\xc0\xa8\x21\xb4", b"\xc0\xa8\x21\xb5"
 
 
-def row(lanes: int, q_first: bool, chirps: int = 32, samples: int = 256, dead: int | None = None) -> np.ndarray:
-    """Two tones a chirp at positive frequencies, noise, int16 words."""
+def row(
+    lanes: int,
+    q_first: bool,
+    chirps: int = 32,
+    samples: int = 256,
+    dead: int | None = None,
+    adjacent: bool = False,
+) -> np.ndarray:
+    """Two tones a chirp at positive frequencies, noise, int16 words. `adjacent`: I0 Q0 I1 Q1."""
     rng = np.random.default_rng(5)
     t = np.arange(samples)
     x = np.zeros((4, chirps, samples), dtype=complex)
@@ -24,7 +31,9 @@ def row(lanes: int, q_first: bool, chirps: int = 32, samples: int = 256, dead: i
     if dead is not None:
         x[dead] = 0
     parts = np.stack([x.imag, x.real] if q_first else [x.real, x.imag])  # [part, rx, chirp, sample]
-    if lanes == 4:
+    if adjacent:
+        words = parts.transpose(2, 3, 1, 0) if lanes == 4 else parts.transpose(2, 1, 3, 0)
+    elif lanes == 4:
         words = parts.transpose(2, 3, 0, 1)
     else:
         words = parts.reshape(2, 4, chirps, samples // 2, 2).transpose(2, 1, 3, 0, 4)

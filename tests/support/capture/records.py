@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from polysight.host.capture.dca1000 import encode_packet
-from polysight.host.capture.placement import Counters, Placed, Placement
+from polysight.host.capture.dca1000 import Counters, encode_packet
+from polysight.host.capture.earlier_records import Past
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import Placed, place_record
 
 FULL = 1456  # bytes of samples in a full packet
 
@@ -28,18 +30,24 @@ class Record:
         return k * FULL, min((k + 1) * FULL, len(self.data))
 
 
-def place(
-    size: int, packets: list[bytes], start: Counters | None = None, frame: int = 1, batch: int = 7
-) -> tuple[Placed, np.ndarray]:
-    out = np.zeros(size, dtype=np.uint8)
-    placement = Placement(out, frame, start)
+def log_of(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> PacketLog:
+    """The packets of a row as a receiver logs them, a batch every nanosecond."""
+    log = PacketLog(size)
     for i in range(0, len(packets), batch):
         some = packets[i : i + batch]
-        block = np.zeros((len(some), max(map(len, some))), dtype=np.uint8)
+        block = np.zeros((len(some), max(10, *map(len, some))), dtype=np.uint8)
         for k, p in enumerate(some):
             block[k, : len(p)] = np.frombuffer(p, dtype=np.uint8)
-        placement.place(block, np.array([len(p) for p in some]))
-    return placement.finish(), out
+        log.add(block, np.array([len(p) for p in some]), t_ns + i)
+    return log
+
+
+def place(
+    size: int, packets: list[bytes], start: Counters | Past | None = None, frame: int = 1, batch: int = 7
+) -> tuple[Placed, np.ndarray]:
+    """Place a row that starts at these counters, or behind what is known of the records before."""
+    past = Past.ending_at(start) if isinstance(start, Counters) else start
+    return place_record(log_of(size, packets, batch), frame, past)
 
 
 def mask_of(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:

@@ -7,11 +7,14 @@ import numpy as np
 
 from polysight.host.calibration.direct_signal import find_direct
 from polysight.host.doctor.bench import Bench, System, Wanted
+from polysight.host.doctor.receiver_load import Held
 from polysight.host.sync import BoardSetup
 from polysight.simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import programmed_rig
 
-QUICK = System(write_speed=lambda _folder: 200e6)
+QUICK = System(
+    write_speed=lambda _folder: 200e6, held=lambda _rig, rates: ([Held(r, r, 9, 0) for r in rates], "any core")
+)
 FRAMES = 32
 
 

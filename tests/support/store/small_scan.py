@@ -18,6 +18,10 @@ import pytest
 
 from polysight.host.acquisition import scan as host_run
 from polysight.host.acquisition.scan import ScanProgress, ScanResult, resume_scan, run_scan
+from polysight.host.capture.dca1000 import encode_packet
+from polysight.host.capture.packet_file import PACKETS, Evidence, write_packets
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import place_record
 from polysight.host.capture.receiver import RowCapture
 from polysight.host.capture.segment import Segment, write_index
 from polysight.host.pipeline import Pipeline
@@ -34,6 +38,7 @@ from polysight.simulators.scene import SimulatedRig, load_scene, row_offsets_mm
 from tests.support.rigs import published_rig
 from tests.support.scenes import small_scene
 
+FULL = 1456  # bytes of samples in a full packet
 SCENE = small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
 
 
@@ -174,19 +179,29 @@ class SmallRig:
     def reports(self) -> dict[str, Any]:
         return {}
 
-    def end_row(self) -> dict[str, RowCapture]:
+    def row_runs(self, not_before_ns: int) -> None:
+        """Nothing is left over here."""
+
+    def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:
+        del not_before_ns
         return {name: self._end(name, segment) for name, segment in self._segments.items()}
 
     def _end(self, name: str, segment: Segment) -> RowCapture:
         row, take = self._row
         data = self._samples.of(name, row)
-        segment.data[:] = np.frombuffer(data, dtype=np.uint8)
-        crc = segment.finish()
-        index = write_index(segment.path.with_suffix(".idx"), {"missing": []}, np.zeros((1, 2), dtype=np.int64))
+        log, evidence = PacketLog(len(data)), Evidence(len(data), self._samples.instrument.frame_bytes)
+        for k, at in enumerate(range(0, len(data), FULL)):
+            packet = encode_packet(k + 1, at, data[at : at + FULL])
+            log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), k + 1)
+        placed, out = place_record(log, evidence.frame_bytes)
+        crc = segment.finish(out)
+        index = write_index(segment.path.with_suffix(".idx"), placed.facts(), placed.arrivals)
+        packets = write_packets(segment.path.with_suffix(PACKETS), log, evidence, placed)
         zero = dict.fromkeys(("duplicates", "late", "outside", "disagreeing", "malformed", "short", "strangers"), 0)
         return RowCapture(
             row=row, take=take, expected=len(data), bytes=len(data), missing=[], located=True, reason="", packets=1,
             **zero, stale=0, kernel_drops=0, first_arrival_ns=0, last_arrival_ns=0, crc32=crc, index_crc32=index,
+            packets_crc32=packets,
         )  # fmt: skip
 
     def close(self) -> None:

@@ -1,0 +1,149 @@
+"""`<row>.pkt`: every packet of a row with its header and arrival, so that the row can be placed again.
+
+Payload that lies in the row's file as it came is not kept twice; what does not (left over, conflicting, more than the
+row has) is at the end of this one. Format: docs/spec/scan-folder.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.host.capture.earlier_records import Past
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import Placed
+from polysight.host.capture.segment import damaged, disk_full
+from polysight.shared.errors import DataError, DeviceError
+
+PACKETS = ".pkt"  # suffix, beside the row's file
+FORMAT = 1
+RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
+"""Packets of one size that follow each other: counters of the first, how many, payload of each, and where that is.
+
+`place`: offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
+"""
+BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets that had come by then
+Bytes = NDArray[np.uint8]
+
+
+class Evidence(msgspec.Struct, frozen=True):
+    """What placing a row needs beside its packets."""
+
+    expected: int
+    frame_bytes: int
+    not_before_ns: int = 0
+    dropped_by_card: str = ""
+    past: Past = Past()
+
+
+def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
+    """Write a row's packets durably; returns the file's CRC-32. Without `placed` all of the payload goes in here.
+
+    Raises DeviceError when the disk fails.
+    """
+    kept = log.kept
+    sizes, sequences, counts = log.sizes[:kept], log.sequences[:kept], log.byte_counts[:kept]
+    at = np.full(kept, -1, dtype=np.int64) if placed is None else _in_the_row(placed, sizes)
+    here = at < 0
+    rest = np.concatenate([[0], np.cumsum(np.where(here, sizes, 0))])[:-1]
+    place = np.where(here, -1 - rest, at)
+    ahead = np.where(here[:-1], -sizes[:-1], sizes[:-1])
+    joined = (
+        (np.diff(sizes) == 0) & (np.diff(sequences) == 1) & (np.diff(counts) == sizes[:-1])
+        & (np.diff(place) == ahead) & (here[1:] == here[:-1])
+    )  # fmt: skip
+    first = np.flatnonzero(np.append(True, ~joined))[: kept and None]
+    runs = np.zeros(first.size, dtype=RUN)
+    runs["sequence"], runs["byte_count"], runs["size"] = sequences[first], counts[first], sizes[first]
+    runs["packets"], runs["place"] = np.diff(np.append(first, kept)), place[first]
+    starts = np.cumsum(log.sizes) - log.sizes
+    own = [log.payload[starts[k] : starts[k] + sizes[k]] for k in np.flatnonzero(here).tolist()]
+    head = {
+        "format": FORMAT,
+        "batches": len(log.batches),
+        "runs": len(runs),
+        "packets": log.count,
+        "kept": kept,
+        "own_bytes": int(sizes[here].sum()),
+        "malformed": log.malformed,
+        "evidence": msgspec.to_builtins(evidence),
+    }
+    line = json.dumps(head, sort_keys=True, separators=(",", ":")).encode("ascii") + b"\n"
+    raw = b"".join([line, log.batches.astype(BATCH).tobytes(), runs.tobytes(), *(part.tobytes() for part in own)])
+    try:
+        with path.open("wb") as f:
+            f.write(raw)
+            f.flush()
+            os.fsync(f.fileno())
+    except OSError as e:
+        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *disk_full(path)) from None
+    return zlib.crc32(raw)
+
+
+def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
+    """What was observed of a row: its packets, and what was known beside them.
+
+    Parameters
+    ----------
+    path
+        `<row>.pkt`.
+    row
+        uint8: the bytes of the row's file, which hold most of the payload.
+
+    Raises
+    ------
+    DataError
+        when the file is absent or damaged, or does not belong to the row.
+    """
+    try:
+        line, _, tail = path.read_bytes().partition(b"\n")
+        head: dict[str, Any] = json.loads(line)
+        evidence = msgspec.convert(head["evidence"], Evidence)
+        size = 2 * BATCH.itemsize * head["batches"]
+        batches = np.frombuffer(tail[:size], dtype=BATCH).reshape(-1, 2).astype(np.int64)
+        runs = np.frombuffer(tail[size : size + RUN.itemsize * head["runs"]], dtype=RUN)
+        own = np.frombuffer(tail[size + runs.nbytes :], dtype=np.uint8)
+        log = _restored(evidence.expected, runs, batches, row, own)
+        whole = (head["packets"], head["own_bytes"]) == (int(batches[-1, 1]) if len(batches) else 0, own.size)
+        if not whole or log.count != head["kept"] or head["format"] != FORMAT:
+            raise ValueError("it does not hold what it says")
+        log.malformed = int(head["malformed"])
+    except (OSError, ValueError, KeyError, TypeError, msgspec.ValidationError) as e:
+        raise DataError(f"{path}: not a readable packet log: {e}", *damaged(path)) from None
+    return evidence, log
+
+
+def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """int64 [packet]: where in the row's file its payload lies as it came; -1 where it does not."""
+    at = placed.at[: sizes.size].copy()
+    at[at + sizes > placed.expected] = -1
+    for start, stop in placed.conflicts:
+        at[(at < stop) & (at + sizes > start)] = -1
+    return at
+
+
+def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
+    """The log again. Raises ValueError where payload is missing."""
+    many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
+    nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+    each = np.repeat(sizes, many)
+    parts = []
+    for n, size, place in zip(many.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
+        source, start = (row, place) if place >= 0 else (own, -1 - place)
+        parts.append(source[start : start + n * size])
+        if parts[-1].size != n * size:
+            raise ValueError("payload is missing")
+    payload = np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint8)
+    sequences = np.repeat(runs["sequence"].astype(np.int64), many) + nth
+    counts = np.repeat(runs["byte_count"].astype(np.int64), many) + nth * each
+    kept = batches[batches[:, 1] <= many.sum()] if len(batches) else batches
+    if len(kept) < len(batches) and (not len(kept) or kept[-1, 1] < many.sum()):
+        kept = np.concatenate([kept, [[batches[len(kept), 0], many.sum()]]])
+    return PacketLog.restore(expected, sequences, counts, each, kept, payload)

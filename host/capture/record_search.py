@@ -1,0 +1,333 @@
+"""Which of a row's packets are its record, and where the record starts: decided from all of them together.
+
+What is observed, what is hidden and which decision has which error: docs/spec/placement.md. In short: within a record
+all packets but the last are full, so `byte count - full x sequence` is one number, the record's *line*. Packets of
+other records lie on other lines, or on the same line at other counts. The record's start is believed where counters of
+the records before leave one possibility, or where its end proves it. Anything else is not located.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.host.capture.dca1000 import Counters
+from polysight.host.capture.earlier_records import CounterView, Past, Span, full_payload, line_of
+from polysight.host.capture.packet_log import PacketLog
+
+Counts = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+SMALL_RECORD = 16  # packets: a record as small as this may be delayed as a whole
+_REMEMBERED = 4  # earlier records whose leftovers are known by their counters
+_NEAR = 64  # records
+_JOINS, _JOINS_SMALL = 1, 3  # doubtful records in a row, without a seam, after which the next one is believed
+
+
+@dataclass(frozen=True)
+class Found:
+    """The record among a row's packets.
+
+    Attributes
+    ----------
+    base
+        Counters of the record's first byte; the best guess when it is not `certain`; None without any packet.
+    certain, located
+        Whether the base is certain; whether every byte's place is.
+    reason
+        Why it is not located.
+    offsets, steps
+        int64 [packet]: bytes and packets from the base.
+    own
+        bool [packet]: of the record's line, from the base on, and of no earlier record.
+    early, old
+        bool [packet]: came before the row's first pulse; has counters of an earlier record.
+    full
+        Payload of a full packet.
+    excess
+        Whether more came than the record has.
+    doubtful
+        Whether it is whole, but could be made of an earlier record's packets as well.
+    fresh
+        Whether it starts with the counters of a card just switched on, and nothing else came: the base is as good as
+        certain for a row that missed triggers, whose frames are placed by their arrival.
+    foreseen
+        Whether the records before tell where it starts.
+    clock_jumps
+        Times at which the clock of the arrivals went backwards; then arrival decides nothing.
+    """
+
+    base: Counters | None
+    certain: bool
+    located: bool
+    reason: str
+    offsets: Counts
+    steps: Counts
+    own: Flags
+    early: Flags
+    old: Flags
+    full: int
+    excess: bool = False
+    doubtful: bool = False
+    fresh: bool = False
+    foreseen: bool = False
+    clock_jumps: int = 0
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """What is decided of the packets on one line; `base` relative to the reference."""
+
+    base: int
+    certain: bool
+    located: bool
+    reason: str = ""
+    excess: bool = False
+    doubtful: bool = False
+    fresh: bool = False
+    foreseen: bool = False
+
+
+def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int = 0) -> Found:
+    """Find a row's record among its packets.
+
+    Parameters
+    ----------
+    log
+        The packets.
+    frame_bytes
+        Bytes of a frame; 1 when the record has none.
+    past
+        What the records before tell.
+    not_before_ns
+        No pulse of the row was sent before this time: packets that came earlier are left over.
+    """
+    full = full_payload(log)
+    nothing = np.zeros(log.count, dtype=np.bool_)
+    if log.count == 0:
+        return Found(
+            None, False, log.expected == 0, "no packet came", log.sizes, log.sizes, nothing, nothing, nothing, full
+        )
+    first = Counters(int(log.byte_counts[0]), int(log.sequences[0]))
+    packets = CounterView(log, past.base or first, full)
+    early, jumps = _before_pulses(log, not_before_ns)
+    old = packets.inside(past.spans, sure=True)
+    if past.base is not None and len(past.ends) == 1:
+        old |= (packets.line == line_of(past.ends[0], full)) & (packets.ahead < past.ends[0])
+    live = ~(early | old)
+    if not live.any():
+        why = "every packet is of an earlier record, by its counters or because it came before the first pulse"
+        steps = packets.steps
+        return Found(None, False, False, why, packets.ahead, steps, nothing, early, old, full, clock_jumps=jumps)
+    search = _Search(packets, live, log.expected, frame_bytes, past)
+    line, v = search.best()
+    base = packets.at(v.base, line)
+    offsets = packets.ahead - v.base
+    own = live & (packets.line == line) & (offsets >= 0)
+    steps = packets.steps - (v.base - line) // full
+    return Found(
+        base, v.certain, v.located, v.reason, offsets, steps, own, early, old, full, v.excess, v.doubtful,
+        v.fresh, v.foreseen, jumps,
+    )  # fmt: skip
+
+
+class _Search:
+    """Judges the lines on which a row's packets lie, and chooses the record's."""
+
+    def __init__(self, packets: CounterView, live: Flags, expected: int, frame_bytes: int, past: Past) -> None:
+        self._p, self._live, self._expected, self._frame, self._past = packets, live, expected, frame_bytes, past
+        self._unsure = live & packets.inside(past.spans, sure=False) if past.spans else np.zeros_like(live)
+        ends = np.array(past.ends if past.base is not None else (), dtype=np.int64)
+        self._ends, self._end_lines = ends, ends - packets.full * -(-ends // packets.full)
+
+    def best(self) -> tuple[int, _Verdict]:
+        """The record's line, and what is decided of it.
+
+        A line on which the record was to start comes first, where it is located; else the one with most bytes.
+        """
+        p, live = self._p, np.flatnonzero(self._live)
+        lines, group = np.unique(p.line[live], return_inverse=True)
+        order = np.lexsort((p.ahead[live], group))
+        new = np.ones(len(order), dtype=np.bool_)
+        new[1:] = (np.diff(group[order]) != 0) | (np.diff(p.ahead[live][order]) != 0)
+        weight = np.bincount(group[order], weights=p.sizes[live][order] * new, minlength=len(lines))
+        furthest = np.full(len(lines), -(1 << 62), dtype=np.int64)
+        np.maximum.at(furthest, group, p.ahead[live])
+        by_weight = np.lexsort((furthest, weight))[::-1]
+        foreseen = [int(k) for k in by_weight if np.isin(lines[k], self._end_lines)]
+        for k in foreseen:
+            verdict = self._judge(live[group == k], int(lines[k]))
+            if verdict.located:
+                return int(lines[k]), verdict
+        k = int(by_weight[0])
+        return int(lines[k]), self._judge(live[group == k], int(lines[k]))
+
+    def _judge(self, which: Counts, line: int) -> _Verdict:
+        """What is decided of the packets on one line."""
+        p, bases = self._p, self._ends[self._end_lines == line]
+        first, last = int(p.ahead[which].min()), int(p.ahead[which].max())
+        last_size = int(p.sizes[which][p.ahead[which] == last].max())
+        stop, short = last + last_size, last_size < p.full
+        if bases.size:
+            verdict = replace(self._from_past(bases, first, stop, short), foreseen=True)
+        else:
+            inside = p.ahead[which] >= stop - self._expected
+            verdict = self._from_itself(int(p.ahead[which][inside].min()), first, stop, last_size)
+            if verdict.located and not self._much(which):
+                why = "too little of it came to tell it from an earlier record's end"
+                verdict = replace(verdict, located=False, certain=False, reason=why)
+            alone = which.size == self._live.sum() and not self._past.spans and p.at(first, line) == Counters(0, 1)
+            if alone and not verdict.located and not verdict.excess:
+                why = self._too_short(first, stop, short).reason or "its last bytes did not come"
+                verdict = replace(verdict, reason=f"{why}; the card's counters had just begun", fresh=True)
+        start = p.at(verdict.base, line)
+        unsure = not bases.size or self._past.guessed
+        strange = (unsure and self._past.unseen) or (not bases.size and self._is_behind(verdict.base))
+        if verdict.located and (self._unclear(which, strange) or self._unclear(which[self._unsure[which]], True)):
+            verdict = replace(verdict, doubtful=True)
+        if verdict.doubtful:
+            enough = _JOINS if self._expected >= SMALL_RECORD * p.full else _JOINS_SMALL
+            if self._past.joint != start or self._past.joined < enough:
+                why = "its packets could as well be those of an earlier record that came late"
+                return replace(verdict, located=False, certain=False, reason=why)
+        return verdict
+
+    def _unclear(self, which: Counts, suspect: bool) -> bool:
+        """Whether suspect packets may be an earlier record's: not half of a record that is not small."""
+        big = self._expected >= SMALL_RECORD * self._p.full
+        return suspect and which.size > 0 and not (big and self._much(which))
+
+    def _is_behind(self, base: int) -> bool:
+        """Whether a record with this base was sent not long before the place where this one was to start."""
+        near = -_NEAR * (self._expected + self._p.full)
+        return bool(self._ends.size) and near < base < int(self._ends.min())
+
+    def _much(self, which: Counts) -> bool:
+        """Whether half of the record's bytes are among these packets: no network holds back so many."""
+        _, one = np.unique(self._p.ahead[which], return_index=True)
+        return 2 * int(self._p.sizes[which][one].sum()) >= self._expected
+
+    def _from_past(self, bases: Counts, first: int, stop: int, short: bool) -> _Verdict:
+        """The record starts at one of these bases."""
+        e = self._expected
+        possible = bases[(stop <= bases + e) & (bases <= first)]
+        if not possible.size:
+            base = int(bases[bases <= first].max(initial=-1)) if (bases <= first).any() else int(bases.min())
+            more = stop - base - e
+            if more > 0:
+                why = f"{more} bytes more than the row has: triggers the radar should not have seen"
+                return _Verdict(base, False, False, why, excess=True)
+            return _Verdict(first, False, False, "packets lie before the place where the record was to start")
+        if possible.size > 1:
+            base = int(possible.max())
+            if not (short and stop in possible + e):
+                return _Verdict(base, False, False, "the record may start at more than one place")
+            possible = possible[possible + e == stop]
+        if int(possible[0]) + e == stop:
+            return _Verdict(int(possible[0]), True, True)
+        return self._too_short(int(possible[0]), stop, short)
+
+    def _too_short(self, base: int, stop: int, short: bool) -> _Verdict:
+        """The record starts here for certain, and its last bytes are not there."""
+        missing = base + self._expected - stop
+        frames = f" ({missing // self._frame} frames)" if missing % self._frame == 0 and self._frame > 1 else ""
+        if short:
+            why = (
+                f"the record ended {missing} bytes{frames} early: missed SYNC_IN pulses, or the card dropped data"
+                " before numbering it"
+            )
+            return _Verdict(base, True, False, why)
+        if missing >= self._frame > 1:
+            why = f"the last {missing} bytes did not come: whether frames are missing before them is not known"
+            return _Verdict(base, True, False, why)
+        return _Verdict(base, True, True)
+
+    def _from_itself(self, first_inside: int, first: int, stop: int, last_size: int) -> _Verdict:
+        """Nothing is known of the start: only the record's end can prove it."""
+        e, full = self._expected, self._p.full
+        base = stop - e
+        lost = first_inside - base
+        if last_size < full and (e - last_size) % full == 0:
+            if lost % self._frame or self._frame == 1 or lost == 0:
+                return _Verdict(base, True, True)
+        elif last_size == full and e % full == 0 and stop - first == e:
+            return _Verdict(base, True, True)
+        if stop - first > e:
+            return _Verdict(
+                first, False, False, f"{stop - first - e} bytes more than the row has, and its start is not known",
+                excess=True,
+            )  # fmt: skip
+        why = f"{e - (stop - first)} bytes short, and the record's first byte is not known"
+        return _Verdict(first, False, False, why)
+
+
+def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_bytes: int) -> Past:
+    """What is known for the next record.
+
+    `located` is false also where the card said that it dropped data: then only a short last packet tells its end.
+    """
+    e, full = log.expected, found.full
+    if found.base is None:
+        return _after_nothing(past, e, full, frame_bytes)
+    base, ends = found.base, (found.offsets + log.sizes)[found.own]
+    stop = int(ends.max())
+    more = _more_records(found, stop, e)
+    if located and not more:
+        sure = tuple(span for span in past.spans if span.sure)
+        return Past(base, (e,), _remember(sure, Span(base, e)))
+    first = int(found.offsets[found.own].min())
+    short = bool((log.sizes[found.own][ends == stop] < full).all())
+    if more:  # where the last of them ended is not known
+        return Past(spans=_remember(past.spans, Span(base, max(stop, e))), unseen=True)
+    if found.certain:
+        frames = range(-(-stop // frame_bytes) * frame_bytes, e + 1, frame_bytes) if frame_bytes > 1 else range(0)
+        return Past(base, tuple(sorted({*frames, *([stop] if short else [])})), _remember(past.spans, Span(base, e)))
+    back = -(-max(0, first - (stop - e)) // full)  # packets that may be lost before the first
+    low, high = first - back * full, max(stop, first + e) if e % full else stop
+    spans = _remember(past.spans, Span(base.after(low, low // full), high - low))
+    end, joined = base.after(stop, -(-stop // full)), 0
+    if found.doubtful:
+        joined = past.joined + 1 if past.joint == base else 1
+        spans = (*spans, Span(end, e, sure=False))
+    elif e % full == 0 and first + e > stop:
+        spans = (*spans, Span(end, first + e - stop, sure=False))
+    known = Past(spans=spans, joint=end if joined else None, joined=joined, unseen=past.unseen)
+    # A short packet ends its record, wherever that began; one cut short on its way leads to a line without packets.
+    return replace(known, base=base, ends=(stop,), guessed=True) if short and not found.doubtful else known
+
+
+def _more_records(found: Found, stop: int, expected: int) -> bool:
+    """Whether packets have counters behind the record's end: the card has sent another one, nobody knows of what size.
+
+    Or it began anew: packets that are of no record known.
+    """
+    rest = ~(found.own | found.early | found.old)
+    behind = (found.offsets >= stop) & (found.offsets < stop + 2 * expected + found.full)
+    counted = (found.steps > 0) & (found.steps * found.full < stop + 4 * expected + 4 * found.full)
+    return bool((rest & behind & counted).any())
+
+
+def _after_nothing(past: Past, expected: int, full: int, frame_bytes: int) -> Past:
+    """Nothing came: the record may have been sent or not."""
+    if past.base is None or len(past.ends) != 1 or past.guessed:
+        return Past(spans=past.spans, unseen=True)
+    end = past.ends[0]
+    base = past.base.after(end, -(-end // full))
+    spans = _remember(past.spans, Span(base, expected, sure=False))
+    step = frame_bytes if frame_bytes > 1 else max(1, expected)
+    return Past(base, tuple(range(0, expected + 1, step)), spans, unseen=True)
+
+
+def _remember(spans: tuple[Span, ...], span: Span) -> tuple[Span, ...]:
+    return (*spans, span)[-_REMEMBERED:]
+
+
+def _before_pulses(log: PacketLog, not_before_ns: int) -> tuple[Flags, int]:
+    """Which packets came before any pulse was sent, and how often the clock of the arrivals went backwards.
+
+    A clock that jumps tells nothing.
+    """
+    jumps = int((np.diff(log.batches[:, 0]) < 0).sum())
+    early = log.arrivals_ns < not_before_ns
+    return (np.zeros_like(early) if jumps else early), jumps

@@ -1,0 +1,72 @@
+"""How rows were placed: `inspect --placement` says it of one, `validate --replace` places a scan's rows again."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from polysight.host.store import PlacedAgain, Replaced, ScanFolder, place_again, replace_rows
+
+_SHOWN = 8
+
+
+def inspect_placement(file: Path, as_json: bool) -> int:
+    """Say how a row's packets are placed by this program; 0 when that is how the row was committed.
+
+    `file` is the row's file, or one of those beside it. Raises DataError.
+    """
+    again = place_again(file.with_suffix(".bin"))
+    same = again.moved or again.missing == again.placed.missing
+    if as_json:
+        said = {**again.placed.facts(), "committed_missing": again.missing, "same": same}
+        sys.stdout.write(json.dumps(said, indent=1) + "\n")
+    else:
+        sys.stdout.write("\n".join(_lines(file, again, same)) + "\n")
+    return 0 if same else 1
+
+
+def _lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
+    p, e = again.placed, again.evidence
+    counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(p.counts).items() if n)
+    if e.past.base is None:
+        start = "not known from the records before"
+    elif len(e.past.ends) == 1:
+        start = "known from the record before"
+    else:
+        start = f"one of {len(e.past.ends)} places behind the record before"
+    missing = ", ".join(f"{a}..{b}" for a, b in p.missing[:_SHOWN]) + (", ..." if len(p.missing) > _SHOWN else "")
+    lines = [
+        f"{file}: {p.received} of {p.expected} bytes in place",
+        f"packets    {counts or 'none'}",
+        f"start      {start}",
+        f"located    {'yes' if p.located else f'no: {p.reason}'}",
+        f"missing    {missing or 'nothing'}",
+    ]
+    if e.dropped_by_card:
+        lines.append(f"card       dropped data before numbering it ({e.dropped_by_card})")
+    if again.moved:
+        lines.append("committed  with its frames at their pulses")
+    else:
+        told = "the same" if same else "differently: `polysight validate SCAN --replace` commits it as it is here"
+        lines.append(f"committed  {told}")
+    return lines
+
+
+def replace_folder(folder: Path, as_json: bool) -> int:
+    """Place every row of a scan again, and commit those that come out differently; 0 when all could be looked at."""
+    rows = replace_rows(ScanFolder.load(folder))
+    if as_json:
+        sys.stdout.write(json.dumps([asdict(r) for r in rows], indent=1) + "\n")
+    else:
+        sys.stdout.write("".join(f"{line}\n" for line in _told(folder, rows)))
+    return 1 if any(r.left and "not those" in r.left for r in rows) else 0
+
+
+def _told(folder: Path, rows: list[Replaced]) -> list[str]:
+    lines = [f"row {r.row} of {r.board}: {r.before} bytes missing before, {r.after} now" for r in rows if r.changed] + [
+        f"row {r.row} of {r.board}: left as it is: {r.left}" for r in rows if r.left
+    ]
+    same = sum(not (r.changed or r.left) for r in rows)
+    return [*lines, f"{folder}: {same} of {len(rows)} files come out as they were committed"]

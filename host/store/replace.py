@@ -1,0 +1,170 @@
+"""Rows placed again from their packets: what today's placement makes of what was observed then.
+
+A row that comes out differently is written to new files and committed by a new line; the old files go after that. So a
+kill at any moment leaves the row as it was or as it is to be.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from polysight.host.capture import (
+    PACKETS,
+    Evidence,
+    Placed,
+    place_record,
+    read_index,
+    read_packets,
+    valid_frames,
+    write_index,
+    write_packets,
+)
+from polysight.host.store.append_only import crc32, sync_folder
+from polysight.host.store.manifest import Fact, ManifestWriter
+from polysight.host.store.scan_folder import BoardRow, ScanFolder, utc_now
+from polysight.shared.errors import DataError, DeviceError
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """One board's row: bytes missing before and now, and why it was left as it was ("" when it was not)."""
+
+    row: int
+    board: str
+    before: int
+    after: int
+    left: str = ""
+    changed: bool = False
+
+
+@dataclass(frozen=True)
+class PlacedAgain:
+    """A row's packets placed by today's program: what was observed, the result, its bytes, the committed gaps."""
+
+    evidence: Evidence
+    placed: Placed
+    out: np.ndarray
+    missing: list[tuple[int, int]]
+    moved: bool  # its frames were moved to their pulses: it stays as it is
+
+
+def place_again(path: Path) -> PlacedAgain:
+    """Place a row again; `path` is its file, with `.idx` and `.pkt` beside it. Raises DataError."""
+    try:
+        row = np.fromfile(path, dtype=np.uint8)
+    except OSError as e:
+        why = "the path is wrong, or the raw data was dropped"
+        raise DataError(f"{path}: cannot be read: {e.strerror}", why, "give SCAN/raw/BOARD/ROW.bin") from None
+    facts, _ = read_index(path.with_suffix(".idx"))
+    evidence, log = read_packets(path.with_suffix(PACKETS), row)
+    e = evidence
+    placed, out = place_record(log, e.frame_bytes, e.past, e.not_before_ns, e.dropped_by_card)
+    missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
+    return PlacedAgain(evidence, placed, out, missing, moved="frames" in facts)
+
+
+def replace_rows(scan: ScanFolder) -> list[Replaced]:
+    """Place every committed row again; those that come out differently are committed anew.
+
+    Raises
+    ------
+    DeviceError
+        when the scan is in use, or the disk fails; rows that were not done yet are as they were.
+    """
+    found = []
+    with scan.writer() as writer:
+        scan.reload()
+        for row in scan.committed().values():
+            boards = {name: _place(scan, row.row, board) for name, board in row.boards.items()}
+            found += [report for report, _ in boards.values()]
+            changed = {name: again for name, (report, again) in boards.items() if report.changed and again is not None}
+            if changed:
+                _commit(scan, writer, row.row, changed)
+    scan.reload()
+    return found
+
+
+def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+    name, path = Path(board.file).parent.name, scan.path / board.file
+    before = board.missing_bytes
+    if not board.packets_crc32:
+        return Replaced(row, name, before, before, "its packets were not kept"), None
+    try:
+        if f"{crc32(path.with_suffix(PACKETS).read_bytes()):08x}" != board.packets_crc32:
+            return Replaced(row, name, before, before, "its packets are not those that were committed"), None
+        if f"{crc32(path.read_bytes()):08x}" != board.crc32:
+            return Replaced(row, name, before, before, "its bytes are not those that were committed"), None
+        again = place_again(path)
+    except (DataError, OSError) as e:
+        return Replaced(row, name, before, before, str(e)), None
+    if again.moved:
+        return Replaced(row, name, before, before, "its frames were placed by their pulses"), None
+    after = sum(b - a for a, b in again.placed.missing)
+    same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
+    return Replaced(row, name, before, after, changed=not same), again
+
+
+def _commit(scan: ScanFolder, writer: ManifestWriter, row: int, changed: dict[str, PlacedAgain]) -> None:
+    """Write the new files, then the line; then remove the old files."""
+    fact = next(f for f in reversed(scan.facts("row_committed")) if f["row"] == row)
+    boards, old = dict(fact["boards"]), []
+    for name, again in changed.items():
+        path = scan.path / boards[name]["file"]
+        old += [path.with_suffix(suffix) for suffix in (".bin", ".idx", PACKETS)]
+        boards[name] = {**boards[name], **_write(scan, path, again)}
+    kept = {k: v for k, v in fact.items() if k not in ("crc", "count", "previous", "boards")}
+    complete = all(b["missing_bytes"] == 0 for b in boards.values())
+    if complete:
+        kept = {k: v for k, v in kept.items() if k not in ("kept_incomplete", "faults")}
+    elif "kept_incomplete" not in kept:
+        kept["kept_incomplete"] = ["placed again: some bytes are not certain"]
+    new: Fact = {**kept, "boards": boards, "replaced_utc": utc_now()}
+    writer.append(new)
+    for path in old:
+        path.unlink(missing_ok=True)
+
+
+def _write(scan: ScanFolder, path: Path, again: PlacedAgain) -> Fact:
+    """Write a row's new files durably; what the manifest says of them."""
+    placed, frame = again.placed, scan.instrument.frame_bytes
+    facts, _ = read_index(path.with_suffix(".idx"))
+    _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))
+    new = _free_name(path)
+    try:
+        with new.open("wb") as f:
+            f.write(again.out.tobytes())
+            f.flush()
+            os.fsync(f.fileno())
+        sync_folder(new.parent)
+    except OSError as e:
+        raise DeviceError(
+            f"{new}: cannot be written: {e.strerror}", "the disk is full or fails", "free space"
+        ) from None
+    index_crc = write_index(new.with_suffix(".idx"), {**facts, **placed.facts()}, placed.arrivals)
+    packets_crc = write_packets(new.with_suffix(PACKETS), log, again.evidence, placed)
+    sync_folder(new.parent)
+    frames = placed.expected // frame
+    return {
+        "file": str(new.relative_to(scan.path)),
+        "frames_received": int(valid_frames(placed.missing, frames, frame).sum()),
+        "missing_bytes": sum(b - a for a, b in placed.missing),
+        "crc32": f"{crc32(again.out.tobytes()):08x}",
+        "index_crc32": f"{index_crc:08x}",
+        "packets_crc32": f"{packets_crc:08x}",
+        "located": placed.located,
+        "received_bytes": placed.received,
+        **msgspec.to_builtins(placed.losses),
+    }
+
+
+def _free_name(path: Path) -> Path:
+    """`0003-1.bin` for `0003.bin`, or the next number that is free."""
+    stem, number = path.stem.split("-")[0], 1
+    while (new := path.with_name(f"{stem}-{number}.bin")).exists():
+        number += 1
+    return new

@@ -1,0 +1,145 @@
+"""Rows of a card and a network that do their worst: data is original or masked, and what is decidable is not masked.
+
+A state machine takes record after record, each through drawn troubles; what one record leaves behind comes with the
+next. 2,000 records; `--long` takes 20,000 and draws new ones.
+"""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
+
+from polysight.host.capture.earlier_records import Past
+from polysight.host.capture.packet_log import PacketLog
+from polysight.host.capture.placement import Placed, place_record
+from polysight.simulators.cards import KINDS, Adversary, Sent
+from tests.support.capture.records import FULL, mask_of
+
+STEPS = 20
+GRIDS = [  # bytes of a frame, frames of a row
+    (64, 91),  # ends in a full packet
+    (64, 910),
+    (4096, 91),
+    (4096, 48),
+    (4096, 160),
+    (128, 5),  # one packet
+    (128, 12),
+    (1456, 1),  # one full packet
+    (1456, 7),
+    (512, 30),
+]
+MOST_REFUSED = 8  # perfect records in a row, after anything that may have happened
+
+
+def logged(sent: Sent, expected: int, batch: int) -> PacketLog:
+    """The arrivals as a receiver logs them, some at a time."""
+    log = PacketLog(expected)
+    for k in range(0, len(sent.arrivals), batch):
+        some = sent.arrivals[k : k + batch]
+        block = np.zeros((len(some), max(10, *(len(a.packet) for a in some))), dtype=np.uint8)
+        for row, a in zip(block, some, strict=True):
+            row[: len(a.packet)] = np.frombuffer(a.packet, dtype=np.uint8)
+        log.add(block, np.array([len(a.packet) for a in some]), some[-1].t_ns)
+    return log
+
+
+def wrong_bytes(sent: Sent, placed: Placed, out: np.ndarray) -> int:
+    """Bytes that are not masked and are not those of the row."""
+    mask = mask_of(out.size, placed.missing)
+    assert not placed.located or not out[mask].any()
+    return int((out[~mask] != np.frombuffer(sent.data, dtype=np.uint8)[~mask]).sum())
+
+
+class Rows(RuleBasedStateMachine):
+    """A receiver behind a card at its worst."""
+
+    @initialize(
+        grid=st.sampled_from(GRIDS),
+        seed=st.integers(0, 2**32 - 1),
+        fresh=st.booleans(),
+        near_wrap=st.booleans(),
+    )
+    def begin(self, grid, seed, fresh, near_wrap):
+        self.frame, self.frames = grid
+        self.size = self.frame * self.frames
+        chance = random.Random(seed)
+        count = 0 if fresh else 2**48 - chance.randint(1, 40_000) if near_wrap else chance.randrange(2**48)
+        sequence = 1 if fresh else 2**32 - chance.randint(1, 60) if near_wrap else chance.randrange(2**32)
+        self.card = Adversary(chance, self.frame, count, sequence)
+        self.past = Past()
+        self.sure = True  # the next record's start is known, or nothing came before it
+        self.refused = 0
+
+    def take(self, troubles: tuple[str, ...], batch: int, pulses_known: bool) -> tuple[Sent, Placed]:
+        sent = self.card.record(self.frames, troubles)
+        log = logged(sent, self.size, batch)
+        placed, out = place_record(log, self.frame, self.past, sent.first_pulse_ns if pulses_known else 0)
+        assert wrong_bytes(sent, placed, out) == 0, (troubles, placed.reason)
+        c = placed.counts
+        named = c.placed + c.duplicates + c.conflicting + c.leftover + c.restarted + c.outside + c.disagreeing
+        assert named + c.malformed == len(sent.arrivals)
+        self.check_mask(sent, placed)
+        self.past = placed.past
+        self.sure = placed.located
+        return sent, placed
+
+    def check_mask(self, sent: Sent, placed: Placed) -> None:
+        """Where the start is known and the card sent one whole record, the mask is what did not come."""
+        spoils = {"truncate", "turn_header_bit", "two_paths", "clock", "reset_between"}
+        if not (self.sure and self.past.base and sent.whole and self.card.resets == 0) or spoils & {*sent.troubles}:
+            return
+        came = {a.packet[:10] for a in sent.arrivals if a.record == sent.number}
+        last = max((int.from_bytes(head[4:], "little") for head in came), default=None)
+        start = self.past.base.byte_count + self.past.ends[0]
+        extent = 0 if last is None else min((last - start) % 2**48 + FULL, self.size)
+        if extent == self.size or (extent and self.size - extent < self.frame):
+            assert placed.located, placed.reason
+            heads = {(int.from_bytes(head[4:], "little") - start) % 2**48 for head in came}
+            lost = [(a, min(a + FULL, self.size)) for a in range(0, self.size, FULL) if a not in heads]
+            assert (mask_of(self.size, placed.missing) == mask_of(self.size, lost)).all()
+
+    @rule(
+        troubles=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3, unique=True).map(tuple),
+        batch=st.sampled_from([1, 7, 64]),
+        pulses_known=st.booleans(),
+    )
+    def disturbed(self, troubles, batch, pulses_known):
+        self.take(troubles, batch, pulses_known)
+        self.refused = 0
+
+    @rule(batch=st.sampled_from([1, 7, 64]))
+    def perfect(self, batch):
+        """Nothing happens to this record; leftovers may still come among its packets."""
+        sure, before = self.sure and self.past.base is not None and self.card.resets == 0, self.past
+        first = before == Past()
+        sent, placed = self.take((), batch, pulses_known=True)
+        alone = all(a.record == sent.number or a.t_ns < sent.first_pulse_ns for a in sent.arrivals)
+        if sure or (first and alone):
+            assert placed.complete, placed.reason
+        self.refused = 0 if placed.complete or not alone else self.refused + 1
+        assert self.refused <= MOST_REFUSED, placed.reason
+
+    @rule()
+    def resume(self):
+        """The host's program is started anew: it knows nothing, and nothing old comes after its first row has begun."""
+        self.past, self.sure, self.refused = Past(), False, 0
+        self.card.forget_late()
+
+
+def test_no_byte_is_wrong_and_none_is_masked_in_vain(request: pytest.FixtureRequest):
+    records = 20_000 if request.config.getoption("--long") else 2_000
+    run_state_machine_as_test(
+        Rows,
+        settings=settings(
+            max_examples=records // STEPS,
+            stateful_step_count=STEPS,
+            deadline=None,
+            suppress_health_check=list(HealthCheck),
+            phases=[Phase.generate, Phase.shrink] if not request.config.getoption("--long") else list(Phase),
+        ),
+    )

@@ -1,0 +1,119 @@
+"""Rows placed again from their packets: what changes is committed anew, what does not is not touched."""
+
+from __future__ import annotations
+
+import gc
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polysight.host.capture import PACKETS, Evidence, place_record, write_index, write_packets
+from polysight.host.capture.earlier_records import Past
+from polysight.host.jobs.placement import inspect_placement, replace_folder
+from polysight.host.store import ManifestWriter, ScanFolder, replace_rows
+from polysight.host.store.append_only import crc32
+from polysight.host.store.validation import validate
+from polysight.shared.raster import plan_raster
+from tests.support.capture.records import Record, log_of, mask_of
+from tests.support.rigs import rig_with
+from tests.support.store.faulty_disk import FaultyDisk, Killed
+
+
+def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder, bytes]:
+    """One row of each board, with a packet lost and a leftover; `wrong`: as a worse placement masked all of it."""
+    rig = rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
+    scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
+    size, frame = rig.row_bytes, rig.frame_bytes
+    record, before = Record.make(size, 5000, 7), Record.make(2000, 3000, 5)
+    packets = [before.packets[1], *record.packets[:lost], *record.packets[lost + 1 :], record.packets[4]]
+    boards = {}
+    with scan.writer() as writer:
+        for board in rig.recorded:
+            path = scan.row_path(board.name, 0)
+            log, evidence = log_of(size, packets), Evidence(size, frame, past=Past())
+            placed, out = place_record(log, frame)
+            packets_crc = write_packets(path.with_suffix(PACKETS), log, evidence, placed)
+            path.write_bytes(out.tobytes())
+            facts = {**placed.facts(), "missing": [(0, size)] if wrong else placed.missing}
+            boards[board.name] = {
+                "file": str(path.relative_to(folder)), "bytes": size, "frames_expected": size // frame,
+                "frames_received": 0, "missing_bytes": sum(b - a for a, b in facts["missing"]),
+                "crc32": f"{crc32(out.tobytes()):08x}", "packets_crc32": f"{packets_crc:08x}",
+                "index_crc32": f"{write_index(path.with_suffix('.idx'), facts, placed.arrivals):08x}",
+            }  # fmt: skip
+        commit(writer, boards, rig.grid.columns * rig.burst.pulses)
+    scan.reload()
+    return scan, record.data
+
+
+def commit(writer: ManifestWriter, boards: dict, pulses: int) -> None:
+    kept = {"kept_incomplete": ["a test"], "faults": []}
+    row = {"fact": "row_committed", "row": 0, "take": 1, "direction": 1, "boards": boards, "pulses": pulses}
+    writer.append({**row, **kept})
+
+
+def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None:
+    want = np.frombuffer(data, dtype=np.uint8)
+    for board in scan.instrument.recorded:
+        row = scan.read_row(board.name, 0)
+        assert row.mask is not None
+        assert (row.mask == mask_of(want.size, missing)).all()
+        assert (row.payload[~row.mask] == want[~row.mask]).all()
+
+
+def errors(scan: ScanFolder) -> list[str]:
+    return [str(f) for f in validate(scan.path) if f.severity == "error"]
+
+
+def test_what_comes_out_the_same_is_not_touched(tmp_path):
+    scan, data = scan_with(tmp_path / "scan", lost=9)
+    before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
+    assert [(r.changed, r.left) for r in replace_rows(scan)] == [(False, "")] * 2
+    assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == before
+    holds(scan, data, [(9 * 1456, 10 * 1456)])
+
+
+def test_a_row_that_was_masked_in_vain_is_committed_anew(tmp_path, capsys):
+    scan, data = scan_with(tmp_path / "scan", lost=9, wrong=True)
+    assert errors(scan) == []
+    assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 1
+    assert "committed  differently" in capsys.readouterr().out
+    assert replace_folder(scan.path, as_json=False) == 0
+    assert f"{len(data)} bytes missing before, 1456 now" in capsys.readouterr().out
+    scan.reload()
+    assert errors(scan) == []
+    holds(scan, data, [(9 * 1456, 10 * 1456)])
+    names = {p.name for p in scan.path.rglob("raw/RH/*")}
+    assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS}"}
+    assert inspect_placement(scan.path / "raw/RH/0000-1.idx", as_json=True) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["leftover"], said["duplicates"], said["missing"]) == (1, 1, [[9 * 1456, 10 * 1456]])
+    assert [r.changed for r in replace_rows(scan)] == [False, False]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # who is killed closes nothing
+def test_a_kill_while_rows_are_replaced_loses_nothing(tmp_path):
+    scan, data = scan_with(tmp_path / "count" / "scan", lost=9, wrong=True)
+    counting = FaultyDisk(tmp_path / "count")
+    with counting():
+        replace_rows(scan)
+    for at in range(1, len(counting.done) + 1):
+        folder = tmp_path / str(at)
+        scan, data = scan_with(folder / "scan", lost=9, wrong=True)
+        with pytest.raises(Killed), FaultyDisk(folder, "killed within", at)():
+            replace_rows(scan)
+        scan = ScanFolder.load(scan.path)
+        assert errors(scan) == [], counting.done[at - 1]
+        replace_rows(scan)
+        holds(scan, data, [(9 * 1456, 10 * 1456)])
+    gc.collect()  # files that nobody closed are this test's, not the next one's
+
+
+def test_a_row_without_its_packets_is_left(tmp_path):
+    scan, _ = scan_with(tmp_path / "scan", lost=9)
+    (scan.path / f"raw/RH/0000{PACKETS}").unlink()
+    (scan.path / f"raw/RV/0000{PACKETS}").write_bytes(b"no")
+    assert [bool(r.left) for r in replace_rows(scan)] == [True, True]
+    assert len(errors(scan)) == 2

@@ -174,6 +174,9 @@ class _Search:
         else:
             inside = p.ahead[which] >= stop - self._expected
             verdict = self._from_itself(int(p.ahead[which][inside].min()), first, stop, last_size)
+            if verdict.located and self._ended_within(which, stop):
+                why = "a record ended within it: the card may have begun anew"
+                verdict = replace(verdict, located=False, certain=False, reason=why)
             if verdict.located and not self._much(which):
                 why = "too little of it came to tell it from an earlier record's end"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
@@ -192,6 +195,11 @@ class _Search:
                 why = "its packets could as well be those of an earlier record that came late"
                 return replace(verdict, located=False, certain=False, reason=why)
         return verdict
+
+    def _ended_within(self, which: Counts, stop: int) -> bool:
+        """Whether a packet that is not full lies before the last: only a record's last one is."""
+        sizes = self._p.sizes[which]
+        return bool(((sizes < self._p.full) & (self._p.ahead[which] + sizes < stop)).any())
 
     def _unclear(self, which: Counts, suspect: bool) -> bool:
         """Whether suspect packets may be an earlier record's: not half of a record that is not small."""

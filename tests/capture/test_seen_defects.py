@@ -103,3 +103,17 @@ def test_what_came_before_the_first_pulse_is_left_over():
     placed, out = place_record(log, FRAME, not_before_ns=102)
     assert (placed.counts.before_pulses, placed.counts.leftover) == (2, 2)
     assert is_original_or_masked(one, placed, out)
+
+
+def test_a_short_packet_before_the_last_one_proves_no_start():
+    """The card begins anew behind three packets, and by chance they count on where the new counters end."""
+    size, missed = 40 * FULL, FRAME
+    row = Record.make(size - missed, 0, 1)
+    behind = Record.make(size, 37 * FULL, 38)
+    head = [packet[:10] + row.data[k * FULL : (k + 1) * FULL] for k, packet in enumerate(behind.packets[:3])]
+    rest = Record.make(size - missed - 3 * FULL, 0, 1)
+    anew = [p[:10] + row.data[(3 + k) * FULL : (4 + k) * FULL] for k, p in enumerate(rest.packets)]
+    log = log_of(size, [*head, *anew])
+    placed, _ = place_record(log, FRAME)
+    assert not placed.located
+    assert placed.missing == [(0, size)]

@@ -184,9 +184,7 @@ class Executor:
         if isinstance(item, BurstSent):
             self._machine.take_burst(item)
         elif isinstance(item, BenchBurst):
-            r = item.record
-            told = m.Pulsed(pulses=r.pulses, width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns, fault=r.fault)
-            self._replies += [(request, told) for request in self._pulsing]
+            self._replies += [(request, item.told()) for request in self._pulsing]
             self._pulsing.clear()
         elif isinstance(item, LoopFault):
             self._machine.take_loop_fault(item)

@@ -14,7 +14,7 @@ from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstRecord, Bur
 from polysight.pi_controller.trigger_lines import BitLines, Edge, TriggerLines
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
-from polysight.shared.messages import Timing
+from polysight.shared.messages import Pulsed, Timing
 
 # How often the loop looks whether it shall end. Edges are not delayed by it.
 LOOK_UP_S = 0.1
@@ -43,6 +43,14 @@ class BenchBurst(NamedTuple):
     """A burst that no edge asked for has been sent."""
 
     record: BurstRecord
+    timed_by: Timing
+
+    def told(self) -> Pulsed:
+        """What the host that asked for it is told."""
+        r = self.record
+        return Pulsed(
+            pulses=r.pulses, width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns, fault=r.fault, timed_by=self.timed_by
+        )
 
 
 class LoopFault(NamedTuple):
@@ -198,7 +206,7 @@ class TriggerLoop:
         record = send_burst(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
         if record.pulses:
             self._last_rise_ns, self._busy_until_ns = record.last_ns, record.end_ns
-        self._post(BenchBurst(record))
+        self._post(BenchBurst(record, self.timed_by(spec)))
 
     def _is_over(self, job: RowJob) -> bool:
         return self._job is not job or self._stop.is_set()

@@ -22,6 +22,7 @@ def test_every_pulse_is_sent_once_and_bursts_keep_their_distance(pi, hub, instru
     radar = WireClient(hub, listen=instrument.pi.sync_out)
     told = [pi.host.ask(m.Pulse(pulses=n, period_us=400.0, width_us=1.0)) for n in (3, 20)]
     assert [(t.pulses, t.width_max_ns, t.fault) for t in told] == [(3, 1000, 0), (20, 1000, 0)]
+    assert {t.timed_by for t in told} == {"spi"}
     at = rises(radar, 23)
     steps = [b - a for a, b in pairwise(at)]
     assert steps[:2] == [400_000] * 2

@@ -112,7 +112,8 @@ def full_payload(log: PacketLog) -> int:
     sizes = log.sizes
     if log.expected < MAX_PAYLOAD_BYTES or sizes.size == 0 or (sizes == MAX_PAYLOAD_BYTES).any():
         return MAX_PAYLOAD_BYTES
-    values, counts = np.unique(sizes, return_counts=True)
+    _, one = np.unique(log.byte_counts, return_index=True)  # a network may bring one packet many times
+    values, counts = np.unique(sizes[one], return_counts=True)
     return int(values[counts == counts.max()].max()) if counts.max() > 2 else MAX_PAYLOAD_BYTES
 
 

@@ -187,7 +187,10 @@ class _Search:
         start = p.at(verdict.base, line)
         unsure = not bases.size or self._past.guessed
         strange = (unsure and self._past.unseen) or (not bases.size and self._is_behind(verdict.base))
-        if verdict.located and (self._unclear(which, strange) or self._unclear(which[self._unsure[which]], True)):
+        # Full packets alone: one that came late at the head and one lost at the end have the row's length together.
+        by_length = not bases.size and not short and bool(self._past.spans)
+        unclear = self._unclear(which, strange) or self._unclear(which[self._unsure[which]], True)
+        if verdict.located and (by_length or unclear):
             verdict = replace(verdict, doubtful=True)
         if verdict.doubtful:
             enough = _JOINS if self._expected >= SMALL_RECORD * p.full else _JOINS_SMALL

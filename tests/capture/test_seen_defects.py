@@ -117,3 +117,24 @@ def test_a_short_packet_before_the_last_one_proves_no_start():
     placed, _ = place_record(log, FRAME)
     assert not placed.located
     assert placed.missing == [(0, size)]
+
+
+def test_one_short_packet_many_times_is_no_full_one():
+    """Of a row of two packets the last one came, five times: its head is missing, no more."""
+    zero, one = records(FULL + 80, 2, first=0, sequence=1)
+    past = place(FULL + 80, zero.packets, None, 128)[0].past
+    placed, out = place(FULL + 80, [one.packets[1]] * 5, past, 128)
+    assert placed.located
+    assert placed.missing == [(0, FULL)]
+    assert is_original_or_masked(one, placed, out)
+
+
+def test_a_late_head_and_a_lost_end_are_not_a_row():
+    """Rows of full packets: the last packet of a row that was not located comes in the next one, which loses its own."""
+    rows = records(FULL_ENDS, 4, first=70_000, sequence=9)
+    past = place(FULL_ENDS, rows[0].packets, None, FRAME, batch=256)[0].past
+    strange = Record.make(FULL_ENDS, 5_000_000, 40_000)
+    past = place(FULL_ENDS, strange.packets[:-40], past, FRAME, batch=256)[0].past
+    after = Record.make(FULL_ENDS, 5_000_000 + FULL_ENDS, 40_000 + FULL_ENDS // FULL)
+    placed, out = place(FULL_ENDS, [strange.packets[-1], *after.packets[:-1]], past, FRAME, batch=256)
+    assert is_original_or_masked(after, placed, out)

@@ -130,7 +130,7 @@ def test_one_short_packet_many_times_is_no_full_one():
 
 
 def test_a_late_head_and_a_lost_end_are_not_a_row():
-    """Rows of full packets: the last packet of a row that was not located comes in the next one, which loses its own."""
+    """Rows of full packets: the last packet of a row not located comes in the next one, which loses its own."""
     rows = records(FULL_ENDS, 4, first=70_000, sequence=9)
     past = place(FULL_ENDS, rows[0].packets, None, FRAME, batch=256)[0].past
     strange = Record.make(FULL_ENDS, 5_000_000, 40_000)

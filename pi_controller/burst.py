@@ -14,6 +14,7 @@ from typing import NamedTuple
 from polysight.pi_controller.spi_pulses import SpiBurst, longest_pause_ns, spi_burst
 from polysight.pi_controller.trigger_lines import BitLines, TriggerLines
 from polysight.shared.config import Burst
+from polysight.shared.errors import ConfigError
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, MAX_WIDTH_NS, MIN_PERIOD_NS
 from polysight.shared.units import us_to_ns
@@ -134,6 +135,38 @@ def send_burst(
 def bits_of(spec: BurstSpec, bufsiz: int) -> SpiBurst:
     """The transfer of a burst, made once. Raises ConfigError when spidev does not take it."""
     return spi_burst(spec.pulses, spec.period_ns, spec.width_ns, bufsiz)
+
+
+def send_bench(
+    lines: TriggerLines, spec: BurstSpec, start_ns: int, previous_rise_ns: int | None, stop: Callable[[], bool]
+) -> BurstRecord:
+    """The same for pulses that no edge asks for: as many transfers as the lines' buffer makes of them.
+
+    The pause between two transfers is at least a period; how exact it is the record's jitter does not say.
+    """
+    part = spec
+    if isinstance(lines, BitLines):
+        while part.pulses > 1 and not _fits(part, lines.bufsiz):
+            part = part._replace(pulses=-(-part.pulses // 2))
+    total = send_burst(lines, part, start_ns, previous_rise_ns, stop)
+    while total.pulses < spec.pulses and total.pulses and not total.fault and not stop():
+        part = part._replace(pulses=min(part.pulses, spec.pulses - total.pulses))
+        more = send_burst(lines, part, total.last_ns + spec.period_ns, total.last_ns, stop)
+        if not more.pulses:
+            return total._replace(fault=more.fault)
+        total = more._replace(
+            pulses=total.pulses + more.pulses, first_ns=total.first_ns,
+            width_max_ns=max(total.width_max_ns, more.width_max_ns), jitter_ns=max(total.jitter_ns, more.jitter_ns),
+        )  # fmt: skip
+    return total
+
+
+def _fits(spec: BurstSpec, bufsiz: int) -> bool:
+    try:
+        bits_of(spec, bufsiz)
+    except ConfigError:
+        return False
+    return True
 
 
 def _send_bits(

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from typing import NamedTuple
 
-from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstRecord, BurstSpec, send_burst
+from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstRecord, BurstSpec, send_bench, send_burst
 from polysight.pi_controller.trigger_lines import BitLines, Edge, TriggerLines
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
@@ -203,7 +203,7 @@ class TriggerLoop:
         start_ns = self._lines.now_ns()
         if self._last_rise_ns is not None:
             start_ns = max(start_ns, self._last_rise_ns + spec.period_ns)
-        record = send_burst(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
+        record = send_bench(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
         if record.pulses:
             self._last_rise_ns, self._busy_until_ns = record.last_ns, record.end_ns
         self._post(BenchBurst(record, self.timed_by(spec)))

@@ -27,6 +27,8 @@ Rise = tuple[float, float]
 """Growth of a plate's height along x and along y."""
 MOST_RISE = 0.06
 """Beyond this (3.4 degrees) a phase slope is no plate's tilt."""
+LEAST_ACROSS = 2e-3
+"""Below this (0.11 degrees) it is a neighbour's sidelobe as likely as a tilt: nothing is corrected."""
 _COHERENT = 0.5
 """Neighbouring pixels' phase steps must agree so far (1: all the same)."""
 _MOST_CHANGE = 2.0
@@ -81,17 +83,23 @@ class Illumination:
     def to_level(self, mask: NDArray[np.bool_], rise: Rise) -> NDArray[np.float64]:
         """Factors [2, n] that bring H and V of a patch's pixels to what a level plate shows there.
 
-        Of the footprint's magnitude: its phase ripples with the rows of the grid.
+        Of the footprint's magnitude: its phase ripples with the rows of the grid. And for the rise across the plane of
+        incidence alone: along it H and V are lit alike (|H| changes by some 7 % a degree), and the phase tells less:
+        plates at the sides of the image seem to rise by up to 0.3 degrees, of a narrow aperture by 0.8.
         """
+        slope = rise[self.across]
+        if abs(slope) < LEAST_ACROSS:
+            return np.ones((2, int(mask.sum())))
+        return np.stack([self._change(k, mask, self.moved_m[k][:, self.across] * slope) for k in (0, 1)])
+
+    def _change(self, channel: int, mask: NDArray[np.bool_], moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A channel's footprint at a patch's pixels over that so far away, [n]; 1 where the light ends between."""
         rows, columns = np.nonzero(mask)
-        factors = np.ones((2, rows.size))
-        for k, level in enumerate(np.abs(self.footprints)):
-            dx, dy = self.moved_m[k] @ np.asarray(rise)
-            at = np.stack([rows + dy / self.pixel_m[1], columns + dx / self.pixel_m[0]])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                change = level[rows, columns] / ndimage.map_coordinates(level, at, order=1, mode="nearest")
-            factors[k] = np.where((change > 1 / _MOST_CHANGE) & (change < _MOST_CHANGE), change, 1.0)
-        return factors
+        level = np.abs(self.footprints[channel])
+        at = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = level[rows, columns] / ndimage.map_coordinates(level, at, order=1, mode="nearest")
+        return np.where((change > 1 / _MOST_CHANGE) & (change < _MOST_CHANGE), change, 1.0)
 
 
 def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
@@ -120,9 +128,8 @@ def levelled(
     """Both channels with every patch as a level plate would show it; the rest as it is."""
     out = (h.copy(), v.copy())
     for mask, rise in zip(masks, rises, strict=True):
-        if any(rise):
-            for channel, factor in zip(out, lit.to_level(mask, rise), strict=True):
-                channel[mask] *= factor
+        for channel, factor in zip(out, lit.to_level(mask, rise), strict=True):
+            channel[mask] *= factor
     return out
 
 

@@ -148,8 +148,8 @@ class MaterialsResult:
         level = np.abs(self.h[r.patch.interior])
         level = level[np.isfinite(level)]
         row["amplitude_h"] = round(float(np.median(level)), 6) if level.size else None
-        if r.patch.label in self.tilts.rises:
-            row["tilt_deg"] = [round(float(np.degrees(t)), 3) for t in self.tilts.rises[r.patch.label]]
+        if r.patch.label in self.tilts.rises and r.refused is None:
+            row["tilt_across_deg"] = round(float(np.degrees(self.tilts.across_rad(r.patch.label))), 3)
         if r.patch.label in self.bands:
             row["bands"] = self.bands[r.patch.label]
         if r.patch.label in self.boxes:

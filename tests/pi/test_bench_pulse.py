@@ -57,3 +57,11 @@ def test_what_a_radar_cannot_take_is_refused(pi, period_us, width_us, number):
 
 def test_the_pi_tells_its_wall_clock(pi):
     assert pi.host.ask(m.Hello()).t_unix_ns > 1_600_000_000 * 10**9
+
+
+def test_pulses_beyond_one_transfer_are_sent_in_several(pi, hub, instrument):
+    """64 pulses are longer than spidev's buffer: none is lost, none comes too early."""
+    radar = WireClient(hub, listen=instrument.pi.sync_out)
+    told = pi.host.ask(m.Pulse(pulses=64, period_us=1500.0, width_us=1.0))
+    assert (told.pulses, told.fault, told.timed_by) == (64, 0, "spi")
+    assert min(b - a for a, b in pairwise(rises(radar, 64))) >= 1_500_000

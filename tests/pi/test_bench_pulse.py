@@ -1,5 +1,6 @@
 """A burst at rest: as many pulses as were asked for, on their deadlines, and never while a run is begun."""
 
+from contextlib import closing
 from itertools import pairwise
 
 import pytest
@@ -61,9 +62,10 @@ def test_the_pi_tells_its_wall_clock(pi):
 
 def test_pulses_beyond_one_transfer_are_sent_in_several(pi, hub, instrument):
     """64 pulses are longer than spidev's buffer: none is lost, none comes too early."""
-    radar = WireClient(hub, listen=instrument.pi.sync_out)
-    told = pi.host.ask(m.Pulse(pulses=64, period_us=1500.0, width_us=1.0))
-    assert (told.pulses, told.fault, told.timed_by) == (64, 0, "spi")
-    up = [e.t_ns for e in (radar.receive(5) for _ in range(128)) if e.value == 1]
+    with closing(WireClient(hub, listen=instrument.pi.sync_out)) as radar:
+        told = pi.host.ask(m.Pulse(pulses=64, period_us=1500.0, width_us=1.0))
+        assert (told.pulses, told.fault, told.timed_by) == (64, 0, "spi")
+        edges = [radar.receive(5) for _ in range(128)]
+    up = [e.t_ns for e in edges if e.value == 1]
     assert len(up) == 64
     assert min(b - a for a, b in pairwise(up)) >= 1_500_000

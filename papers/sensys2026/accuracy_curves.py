@@ -173,7 +173,6 @@ def curves_picture(quick: bool) -> Picture:
         dress(ax, title, unit, "patches (%)")
         ax.set_ylim(-3, 103)
         ax.legend(fontsize=7, frameon=False, loc="center left")
-    fig.tight_layout()
     return Picture(
         fig,
         f"{DISCRIMINANT}, 23 solids at {ANGLE_DEG:.0f}°, {LIBRARY_SCANS} other specimens of each in the library;"

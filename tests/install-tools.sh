@@ -13,6 +13,7 @@ command -v avr-g++ >/dev/null || missing+=(gcc-avr avr-libc binutils-avr)
 [ -f /usr/include/libelf.h ] || missing+=(libelf-dev)
 command -v avrdude >/dev/null || missing+=(avrdude)
 command -v arduino-builder >/dev/null || missing+=(arduino-builder)
+command -v systemd-analyze >/dev/null || lean+=(systemd)
 if [ "${1-}" = kernel ]; then
   for tool in flex bison bc; do command -v $tool >/dev/null || missing+=($tool); done
   command -v xz >/dev/null || missing+=(xz-utils)

@@ -61,7 +61,7 @@ def replace_folder(folder: Path, as_json: bool) -> int:
         sys.stdout.write(json.dumps([asdict(r) for r in rows], indent=1) + "\n")
     else:
         sys.stdout.write("".join(f"{line}\n" for line in _told(folder, rows)))
-    return 1 if any(r.left and "not those" in r.left for r in rows) else 0
+    return 1 if any(r.damaged for r in rows) else 0
 
 
 def _told(folder: Path, rows: list[Replaced]) -> list[str]:

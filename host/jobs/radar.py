@@ -96,7 +96,7 @@ def _check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], Wo
         steps = [row._asdict() for row in rows]
         sys.stdout.write(json.dumps({"board": name, "steps": steps, "report": report}, indent=1) + "\n")
     else:
-        for line in report.get("warnings", []):  # type: ignore[union-attr]
+        for line in report.get("warnings", []):
             sys.stdout.write(f"      note: {line}\n")
     return 0 if all(row.holds for row in rows) else 1
 

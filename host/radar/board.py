@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping
 from enum import Enum
+from typing import Any
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
@@ -254,9 +255,9 @@ class RadarBoard:
         self.facts["temperatures_c"] = dict(zip(_SENSORS, degrees, strict=True))
         self.facts["device_ms"] = stamp
 
-    def report(self) -> dict[str, object]:
+    def report(self) -> dict[str, Any]:
         """What happened since the last report: facts, every byte sent, events, warnings. For the manifest."""
-        told: dict[str, object] = {
+        told: dict[str, Any] = {
             "state": self._state.name.lower(),
             **self.facts,
             "sent": [raw.hex() for raw in self._sent],

@@ -40,6 +40,7 @@ class Replaced:
     after: int
     left: str = ""
     changed: bool = False
+    damaged: bool = False  # it was left because its files are not those that were committed, or cannot be read
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,16 @@ def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, Place
         return Replaced(row, name, before, before, "its packets were not kept"), None
     try:
         if f"{crc32(path.with_suffix(PACKETS).read_bytes()):08x}" != board.packets_crc32:
-            return Replaced(row, name, before, before, "its packets are not those that were committed"), None
+            return Replaced(
+                row, name, before, before, "its packets are not those that were committed", damaged=True
+            ), None
         if f"{crc32(path.read_bytes()):08x}" != board.crc32:
-            return Replaced(row, name, before, before, "its bytes are not those that were committed"), None
+            return Replaced(
+                row, name, before, before, "its bytes are not those that were committed", damaged=True
+            ), None
         again = place_again(path)
     except (DataError, OSError) as e:
-        return Replaced(row, name, before, before, str(e)), None
+        return Replaced(row, name, before, before, str(e), damaged=True), None
     if again.moved:
         return Replaced(row, name, before, before, "its frames were placed by their pulses"), None
     after = sum(b - a for a, b in again.placed.missing)

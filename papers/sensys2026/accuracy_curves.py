@@ -16,8 +16,8 @@ from polysight.host.materials import DISCRIMINANT, MODELS, Model, Samples, Scene
 from polysight.host.polarimetry import fresnel, permittivity_from_ratio
 from polysight.host.report import PALETTE
 from polysight.papers.sensys2026.item import Picture, dress, new_figure
-from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups
-from polysight.papers.sensys2026.specimen_spread import LIBRARY_SCANS, bayes
+from polysight.papers.sensys2026.patches import Errors, calibrated_errors
+from polysight.papers.sensys2026.specimen_spread import LIBRARY_SCANS, bayes, both_angles, by_patch
 
 ANGLE_DEG = 60.0
 SPREAD = (0.01, 0.05)
@@ -66,14 +66,12 @@ def curves(quick: bool) -> tuple[tuple[str, str, tuple[Curve, ...]], ...]:
 
 
 def _taught(errors: Errors) -> Model:
-    return MODELS[DISCRIMINANT]("H+V+P").fit(
-        draw(groups()["solids"].materials, ANGLE_DEG, errors, 41, LIBRARY_SCANS).samples()
-    )
+    return MODELS[DISCRIMINANT]("H+V+P").fit(both_angles("solids", (ANGLE_DEG,), errors, 41, LIBRARY_SCANS))
 
 
 def _known(at: Sequence[float], errors: Sequence[Errors], quick: bool) -> Curve:
     """Of conditions that library and scans have alike; beside Bayes' bound."""
-    judged = [_judge(_taught(e), _drawn(e, ANGLE_DEG, quick), lambda _: None) for e in errors]
+    judged = [_judge(_taught(e), _drawn(e, ANGLE_DEG, quick)) for e in errors]
     bounds = tuple(bayes("solids", (ANGLE_DEG,), e, quick) for e in errors)
     return Curve("found", tuple(at), *_columns(judged), bounds)
 
@@ -102,21 +100,15 @@ def _changed(
 
 
 def _drawn(errors: Errors, angle_deg: float, quick: bool) -> Samples:
-    return draw(groups()["solids"].materials, angle_deg, errors, 500, 2 if quick else 10).samples()
+    return both_angles("solids", (angle_deg,), errors, 500, 2 if quick else 10)
 
 
-def _judge(model: Model, test: Samples, told: Callable[[Samples], SceneErrors | None]) -> tuple[float, float]:
+def _judge(
+    model: Model, test: Samples, told: Callable[[Samples], SceneErrors | None] = lambda _: None
+) -> tuple[float, float]:
     """Shares of patches named right, and wrong."""
-    right = wrong = count = 0
-    for scan in np.unique(test.groups):
-        mine = test.take(test.groups == scan)
-        found = model.by_scan(mine.x, mine.patches, told(mine))
-        truth = mine.names[[np.flatnonzero(mine.patches == p)[0] for p in found.patches]]
-        named = found.distance <= 1
-        right += int((named & (found.names == truth)).sum())
-        wrong += int((named & (found.names != truth)).sum())
-        count += truth.size
-    return right / count, wrong / count
+    named, right, _ = by_patch(model, test, told)
+    return float((named & right).mean()), float((named & ~right).mean())
 
 
 def _columns(judged: Sequence[tuple[float, float]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -145,7 +137,7 @@ def _nothing(mine: Samples, value: float) -> None:
     del mine, value
 
 
-def _angle_told(mine: Samples, degrees: float) -> SceneErrors | None:
+def _angle_told(mine: Samples, degrees: float) -> SceneErrors:
     """The budget of a scan whose angle is known to so many degrees (at least 0.05)."""
     std, angle = np.radians(max(degrees, 0.05)), np.radians(ANGLE_DEG)
     patches = np.unique(mine.patches)
@@ -167,7 +159,15 @@ def curves_picture(quick: bool) -> Picture:
         for k, line in enumerate(lines):
             colour = PALETTE[k]
             ax.plot(line.at, 100 * np.array(line.right), color=colour, marker="o", ms=4, label=f"right, {line.label}")
-            ax.plot(line.at, 100 * np.array(line.wrong), color=colour, ls=":", marker="x", ms=4, label="wrong")
+            ax.plot(
+                line.at,
+                100 * np.array(line.wrong),
+                color=colour,
+                ls=":",
+                marker="x",
+                ms=4,
+                label=f"wrong, {line.label}",
+            )
             if line.bound:
                 ax.plot(line.at, 100 * np.array(line.bound), color=PALETTE[5], ls="--", label="Bayes bound")
         dress(ax, title, unit, "patches (%)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
@@ -9,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials import DISCRIMINANT, MODELS, Samples, calibration_error
+from polysight.host.materials import DISCRIMINANT, MODELS, Model, Samples, SceneErrors, calibration_error
 from polysight.host.polarimetry import fresnel
 from polysight.papers.sensys2026.item import Table, percent
 from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, specimens
@@ -46,18 +47,27 @@ def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, 
     taught = both_angles(group, angles_deg, errors, 41, LIBRARY_SCANS)
     test = both_angles(group, angles_deg, errors, _TEST_SEED, 6 if quick else 40)
     model = MODELS[DISCRIMINANT]("H+V+P").fit(taught)
-    sure, right, count = [], [], 0
+    named, right, sure = by_patch(model, test)
+    told = calibration_error(sure[named], right[named])
+    share = float((named & right).mean())
+    return Found(share, bayes(group, angles_deg, errors, quick), told, _strangers_named(taught, test, quick))
+
+
+def by_patch(
+    model: Model, test: Samples, told: Callable[[Samples], SceneErrors | None] = lambda _: None
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_], Real]:
+    """All patches, scan by scan: whether each got a name, whether that is (or would be) right, and how sure, [patch].
+
+    `told` gives the error budget of a scan.
+    """
+    rows = []
     for scan in np.unique(test.groups):
         mine = test.take(test.groups == scan)
-        found = model.by_scan(mine.x, mine.patches)
+        found = model.by_scan(mine.x, mine.patches, told(mine))
         truth = mine.names[[np.flatnonzero(mine.patches == p)[0] for p in found.patches]]
-        named = found.distance <= 1
-        sure += found.confidence[named].tolist()
-        right += (found.names == truth)[named].tolist()
-        count += truth.size
-    share = float(np.sum(right)) / count
-    told = calibration_error(np.array(sure), np.array(right))
-    return Found(share, bayes(group, angles_deg, errors, quick), told, _strangers_named(taught, test, quick))
+        rows.append((found.distance <= 1, found.names == truth, found.confidence))
+    named, right, sure = (np.concatenate(column) for column in zip(*rows, strict=True))
+    return named, right, sure
 
 
 def bayes(group: str, angles_deg: tuple[float, ...], errors: Errors, quick: bool = False) -> float:

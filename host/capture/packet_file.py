@@ -7,8 +7,6 @@ row has) is at the end of this one. Format: docs/spec/scan-folder.md.
 from __future__ import annotations
 
 import json
-import os
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +17,8 @@ from numpy.typing import NDArray
 from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed
-from polysight.host.capture.segment import damaged, disk_full
-from polysight.shared.errors import DataError, DeviceError
+from polysight.host.capture.segment import damaged, write_durably
+from polysight.shared.errors import DataError
 
 PACKETS = ".pkt"  # suffix, beside the row's file
 FORMAT = 1
@@ -77,14 +75,7 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
     }
     line = json.dumps(head, sort_keys=True, separators=(",", ":")).encode("ascii") + b"\n"
     raw = b"".join([line, log.batches.astype(BATCH).tobytes(), runs.tobytes(), *(part.tobytes() for part in own)])
-    try:
-        with path.open("wb") as f:
-            f.write(raw)
-            f.flush()
-            os.fsync(f.fileno())
-    except OSError as e:
-        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *disk_full(path)) from None
-    return zlib.crc32(raw)
+    return write_durably(path, raw)
 
 
 def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:

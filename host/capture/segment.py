@@ -101,6 +101,11 @@ def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) 
     """Write a row's index durably; returns its CRC-32. `arrivals` is int64 [n, 2]. Raises DeviceError."""
     head = json.dumps({**facts, "arrivals": len(arrivals)}, sort_keys=True, separators=(",", ":"))
     raw = head.encode("ascii") + b"\n" + arrivals.astype(PAIR).tobytes()
+    return write_durably(path, raw)
+
+
+def write_durably(path: Path, raw: bytes) -> int:
+    """Write a file that is on the disk when this returns; returns its CRC-32. Raises DeviceError."""
     try:
         with path.open("wb") as f:
             f.write(raw)

@@ -6,7 +6,6 @@ kill at any moment leaves the row as it was or as it is to be.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,13 +20,14 @@ from polysight.host.capture import (
     read_index,
     read_packets,
     valid_frames,
+    write_durably,
     write_index,
     write_packets,
 )
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact, ManifestWriter
 from polysight.host.store.scan_folder import BoardRow, ScanFolder, utc_now
-from polysight.shared.errors import DataError, DeviceError
+from polysight.shared.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -140,16 +140,7 @@ def _write(scan: ScanFolder, path: Path, again: PlacedAgain) -> Fact:
     facts, _ = read_index(path.with_suffix(".idx"))
     _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))
     new = _free_name(path)
-    try:
-        with new.open("wb") as f:
-            f.write(again.out.tobytes())
-            f.flush()
-            os.fsync(f.fileno())
-        sync_folder(new.parent)
-    except OSError as e:
-        raise DeviceError(
-            f"{new}: cannot be written: {e.strerror}", "the disk is full or fails", "free space"
-        ) from None
+    crc = write_durably(new, again.out.tobytes())
     index_crc = write_index(new.with_suffix(".idx"), {**facts, **placed.facts()}, placed.arrivals)
     packets_crc = write_packets(new.with_suffix(PACKETS), log, again.evidence, placed)
     sync_folder(new.parent)
@@ -158,7 +149,7 @@ def _write(scan: ScanFolder, path: Path, again: PlacedAgain) -> Fact:
         "file": str(new.relative_to(scan.path)),
         "frames_received": int(valid_frames(placed.missing, frames, frame).sum()),
         "missing_bytes": sum(b - a for a, b in placed.missing),
-        "crc32": f"{crc32(again.out.tobytes()):08x}",
+        "crc32": f"{crc:08x}",
         "index_crc32": f"{index_crc:08x}",
         "packets_crc32": f"{packets_crc:08x}",
         "located": placed.located,

@@ -177,7 +177,8 @@ class Radar(Section, frozen=True):
     boards over USB; `native` says by board name where each is, the rest is for all of them. `firmware` is TI's image,
     downloaded into the boards' RAM at each start ("": what their flash holds); a relative path counts from the rig
     file's folder. `calibration_dir` keeps what each board's RF init found and gives it back at its next starts ("":
-    each start calibrates anew). `slow_spi` sends words one by one at 1 MHz.
+    each start calibrates anew). `trace_dir` keeps all that passes between host and boards, a file each time a link is
+    opened ("": nothing). `slow_spi` sends words one by one at 1 MHz.
     """
 
     control: Literal["endless", "line_server", "native"] = "endless"
@@ -191,6 +192,7 @@ class Radar(Section, frozen=True):
     tx_backoff_db: Annotated[int, msgspec.Meta(ge=0)] = 0
     firmware: str = ""
     calibration_dir: str = ""
+    trace_dir: str = ""
     slow_spi: bool = False
 
     def __post_init__(self) -> None:
@@ -358,6 +360,7 @@ def load_instrument(path: Path) -> Instrument:
     folder = path.parent.resolve()  # from now on the working folder does not matter, nor where a manifest is read
     files = {kind: name and str(folder / name) for kind, name in to_builtins(rig.calibration).items()}
     pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
-    places = {key: (name := getattr(rig.radar, key)) and str(folder / name) for key in ("firmware", "calibration_dir")}
+    paths = ("firmware", "calibration_dir", "trace_dir")
+    places = {key: (name := getattr(rig.radar, key)) and str(folder / name) for key in paths}
     radar = msgspec.structs.replace(rig.radar, **places)
     return msgspec.structs.replace(rig, pi=pi, radar=radar, calibration=CalibrationFiles(**files))

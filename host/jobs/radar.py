@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from polysight.host.radar import (
     ReplayedWords,
     Row,
     SystemClock,
-    TracedWords,
     WordLink,
     check_board,
     firmware_of,
@@ -22,8 +20,8 @@ from polysight.host.radar import (
     radar_board,
     read_image,
     require,
+    traced,
 )
-from polysight.shared import __version__
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
 
@@ -113,12 +111,8 @@ def _progress(sent: int, of: int) -> None:
 
 
 def _open(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
-    place = rig.radar.native[name].place
-    words = open_board(place, slow or rig.radar.slow_spi)
-    if trace is None:
-        return words
-    facts = {"board": name, "place": place, "rig": rig.name, "polysight": __version__, "unix_s": round(time.time(), 3)}
-    return TracedWords(words, clock, trace, facts)
+    words = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
+    return words if trace is None else traced(words, clock, trace, rig, name)
 
 
 def _native(config: Path) -> Instrument:

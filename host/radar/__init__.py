@@ -14,7 +14,7 @@ from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.host.radar.native import firmware_of, open_board, plan_lines, radar_board
 from polysight.host.radar.program import TRIGGER_MARGIN_US, chirp_us
 from polysight.host.radar.spi import Clock, SystemClock, WordLink
-from polysight.host.radar.trace import ReplayedWords, TracedWords
+from polysight.host.radar.trace import ReplayedWords, TracedWords, traced
 
 __all__ = [
     "INTER_FRAME_US",
@@ -39,4 +39,5 @@ __all__ = [
     "radar_control",
     "read_image",
     "require",
+    "traced",
 ]

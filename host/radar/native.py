@@ -19,6 +19,7 @@ from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.host.radar.messages import command, encode
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import Clock, SystemClock, WordLink
+from polysight.host.radar.trace import TracedWords, new_trace, traced
 from polysight.host.radar.usb import SCHEME, open_tcp, open_usb
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DeviceError
@@ -105,6 +106,15 @@ class _NoLink:
         return DeviceError(self._error.what, self._error.why, self._error.remedy)
 
 
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ConfigError(
+            f"radar.trace_dir: {folder} cannot be made: {e.strerror}", "a typing error, or no right", "correct the path"
+        ) from None
+
+
 class NativeRadars(RadarControl):
     """Every board of a rig, each by the serial number of its USB chip.
 
@@ -134,6 +144,9 @@ class NativeRadars(RadarControl):
         require(rig, frames)
         self._constraints = [str(c) for c in constraints(rig, frames)]
         self._boards: dict[str, RadarBoard] = {}
+        self._traces: list[TracedWords] = []
+        if rig.radar.trace_dir:
+            _make_folder(Path(rig.radar.trace_dir))
         firmware = firmware_of(rig)
         with ExitStack() as opened:
             opened.callback(self.close)
@@ -159,7 +172,15 @@ class NativeRadars(RadarControl):
                         board.arm(frames)
 
     def _open(self, name: str) -> WordLink:
-        return self._open_words(self._rig.radar.native[name].place)
+        words, folder = self._open_words(self._rig.radar.native[name].place), self._rig.radar.trace_dir
+        if not folder:
+            return words
+        try:
+            found = traced(words, self._clock, new_trace(Path(folder), name), self._rig, name)
+        except OSError:  # a disk that is full: the board is worth more than its trace
+            return words
+        self._traces.append(found)
+        return found
 
     def _reopen(self, board: RadarBoard) -> bool:
         """Open a failed board's link anew; False when it does not come back."""
@@ -209,6 +230,8 @@ class NativeRadars(RadarControl):
                 b.name: round(direct_if_hz(self._rig, b)) for b in self._rig.boards if b.role != "transmit"
             }
             self._constraints = []
+        if self._traces:
+            told["traces"] = [{"file": str(t.file), "ended": t.ended} for t in self._traces]
         return told
 
     def close(self) -> None:

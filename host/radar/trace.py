@@ -6,14 +6,19 @@ all that is needed to look for the cause elsewhere: :class:`ReplayedWords` stand
 
 from __future__ import annotations
 
+import itertools
 import json
 import struct
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from polysight.host.radar.spi import Clock, WordLink
+from polysight.shared import __version__
+from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DeviceError
 
 FORM = 1
@@ -28,7 +33,8 @@ class TracedWords:
     words, clock
         The link, and the time that is written.
     file
-        Written anew, each line at once, so that nothing is missing of a run that was killed.
+        Written anew, each line at once, so that nothing is missing of a run that was killed. A disk that fills up ends
+        the trace, and nothing else: `ended` says why.
     facts
         For the first line: board, place, and what else helps.
 
@@ -42,6 +48,7 @@ class TracedWords:
         self._words, self._clock, self._began = words, clock, clock.now()
         self._file = file.open("w", encoding="utf-8")
         self._level: bool | None = None
+        self.file, self.ended = file, ""
         self._write({"trace": FORM, **facts})
 
     def write(self, words: Sequence[int]) -> None:
@@ -75,7 +82,8 @@ class TracedWords:
     def close(self) -> None:
         """Close link and file. Twice is once."""
         self._words.close()
-        self._file.close()
+        with suppress(OSError):  # what could not be written is tried again here
+            self._file.close()
 
     def note_error(self, what: str) -> None:
         """Write down an error of the link."""
@@ -85,8 +93,28 @@ class TracedWords:
         self._write({"t": round(self._clock.now() - self._began, 6), **what})
 
     def _write(self, line: dict[str, object]) -> None:
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
+        if self.ended:
+            return
+        try:
+            self._file.write(json.dumps(line) + "\n")
+            self._file.flush()
+        except OSError as e:
+            self.ended = f"ended early: {e.strerror}"
+
+
+def traced(words: WordLink, clock: Clock, file: Path, rig: Instrument, board: str) -> TracedWords:
+    """A board's link that is traced into `file`, which begins with what helps to know of rig, place and time."""
+    place, now = rig.radar.native[board].place, round(time.time(), 3)
+    facts = {"board": board, "place": place, "rig": rig.name, "polysight": __version__, "unix_s": now}
+    return TracedWords(words, clock, file, facts)
+
+
+def new_trace(folder: Path, board: str) -> Path:
+    """A file of its own for a link that is opened now: BOARD-TIME.jsonl (UTC), numbered where that is taken."""
+    name = f"{board}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+    ends = itertools.chain([""], (f"-{n}" for n in itertools.count(2)))
+    names = (folder / f"{name}{end}.jsonl" for end in ends)
+    return next(path for path in names if not path.exists())
 
 
 class _Errors:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import msgspec
 import pytest
 
 from polysight.host.radar.interface import RadarState
-from polysight.host.radar.native import NativeRadars
+from polysight.host.radar.native import NativeRadars, radar_board
+from polysight.host.radar.trace import ReplayedWords, read_trace
 from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import RadarBoard, make_image
 from tests.support.radar.boards import BoardWords
@@ -81,6 +85,12 @@ def run_row(radars, usb) -> dict[str, RadarState]:
     return {name: s.state for name, s in radars.states().items()}
 
 
+def traces(radars) -> list[dict[str, str]]:
+    told = radars.report()["traces"]
+    assert isinstance(told, list)
+    return told
+
+
 ALL_DONE = dict.fromkeys(("LS", "RH", "RV"), RadarState.DONE)
 
 
@@ -102,6 +112,34 @@ def test_a_link_that_stays_away_is_a_fault_of_that_board_until_it_is_back(radars
     assert "USB" in told["RH"].detail
     usb.clock.sleep(20.0)
     assert run_row(radars, usb) == ALL_DONE
+
+
+def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
+    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path / "traces")))
+    with NativeRadars(kept, usb.open, clock) as radars:
+        assert run_row(radars, usb) == ALL_DONE
+        usb.pull(0.0)
+        assert run_row(radars, usb) == ALL_DONE
+        told = traces(radars)
+    files = sorted((tmp_path / "traces").iterdir())
+    assert sorted(t["file"] for t in told) == [str(f) for f in files]
+    assert [read_trace(f)[0]["board"] for f in files] == ["LS", "RH", "RH", "RV"]
+    assert any("error" in record for record in read_trace(files[1])[1] + read_trace(files[2])[1])
+    # The first link's trace brings the host through the same bring-up again, without the board.
+    replayed = ReplayedWords(files[0])
+    made = radar_board(rig, "LS", replayed, replayed, None)
+    made.configure()
+    made.arm(FRAMES)
+
+
+def test_a_disk_that_fills_up_ends_a_trace_and_no_row(rig, usb, clock, tmp_path, monkeypatch):
+    monkeypatch.setattr("polysight.host.radar.native.new_trace", lambda *_: Path("/dev/full"))
+    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path)))
+    with NativeRadars(kept, usb.open, clock) as radars:
+        assert run_row(radars, usb) == ALL_DONE
+        told = traces(radars)
+    assert len(told) == 3
+    assert all("No space" in t["ended"] for t in told)
 
 
 def test_a_fatal_event_while_arming_is_no_error_of_the_scan(radars, usb, monkeypatch):

@@ -49,7 +49,8 @@ CLASSES = {"low loss": 0.05, "medium": 0.18, "lossy": np.inf}
 """Material classes by their loss tangent's upper end."""
 GRID = {"columns": 45, "rows": 43, "step_x_mm": 10.0, "step_y_mm": 6.0}
 PLACES = [(x, y) for y in (-34.0, 34.0) for x in (-66.0, 0.0, 66.0)]
-KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named")
+KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet")
+"""What a scene is drawn as; "sheet" is "full" with one thin sheet in air that nobody declares."""
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
 CHI2_68, CHI2_95 = 2.279, 5.991
 
@@ -68,8 +69,7 @@ class PatchFigures:
     leakage_measured: bool
     metal_in_scene: bool
     level: str
-    name: str | None = None
-    probability: float | None = None
+    sheet: bool = False
 
 
 class Cubes:
@@ -103,7 +103,8 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
     materials = KNOWN if kind == "named" else MATERIALS
     names = rng.choice(list(materials), len(PLACES), replace=False).tolist()
-    metal = None if kind == "no metal" or (kind == "full" and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
+    whole = kind in ("full", "sheet")
+    metal = None if kind == "no metal" or (whole and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
     tilted, plates = rng.random() < 0.5, []
     for i, (x, y) in enumerate(PLACES):
         place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
@@ -114,6 +115,9 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     if kind == "no metal":
         plates = plates[: int(rng.integers(1, len(PLACES) + 1))]
     measured = 0.003 if rng.random() < 0.5 else None
+    if kind == "sheet":
+        sheet = int(rng.choice([i for i in range(len(plates)) if i != metal]))
+        plates[sheet] |= {"thickness_mm": rng.uniform(0.5, 5)}
     return decode_scene(
         {
             "name": f"drawn {kind} {seed}", "seed": 1000 + seed, "grid": GRID, "object_distance_mm": 499.0,
@@ -152,7 +156,7 @@ def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Ins
     """One scene, drawn, simulated and judged."""
     rig, scene = load_instrument(packaged(Path("instrument.toml"))), draw_scene(seed, kind)
     options = Options(model=None if kind == "named" else "none")
-    if kind == "full" and not any(p.metal for p in scene.plates):
+    if kind in ("full", "sheet") and not any(p.metal for p in scene.plates):
         options = replace(options, reference=metal_scan(rig, scene))
     if raw or kind in ("no direct path", "noise"):
         with tempfile.TemporaryDirectory(prefix="polysight-coverage-") as folder:
@@ -165,9 +169,9 @@ def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Ins
     return scene, apply_scene(rig, scene), findings, pipeline.plane
 
 
-def figures(seed: int, raw: bool = False) -> list[PatchFigures]:
-    """What coverage is counted from: the patches of one full scene."""
-    scene, rig, findings, _ = judged(seed, "full", raw)
+def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigures]:
+    """What coverage is counted from: the patches of one full scene, or of one with a thin sheet."""
+    scene, rig, findings, _ = judged(seed, kind, raw)
     plates, found = truth_plates(truth(rig, scene, scene.seed)), findings.found
     true, out = match_truth([r.patch for r in found.patches], plates), []
     for r in found.patches:
@@ -183,6 +187,7 @@ def figures(seed: int, raw: bool = False) -> list[PatchFigures]:
                 float(away @ np.linalg.solve(e.covariance, away)), float(np.hypot(*away)) / size,
                 float(np.sqrt(values.mean())) / size, float(np.sqrt(values[0])) / size,
                 found.prior.leakage_measured, any(p.metal for p in scene.plates), findings.verdict.level,
+                plate.thickness_mm is not None,
             )
         )  # fmt: skip
     return out
@@ -252,7 +257,7 @@ def nominal_widths(repeats: int = 5) -> tuple[float, float]:
     return stated, bound
 
 
-def _one(job: tuple[int, bool]) -> list[PatchFigures]:
+def _one(job: tuple[int, str, bool]) -> list[PatchFigures]:
     return figures(*job)
 
 
@@ -292,6 +297,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", type=int, default=40, help="full scenes, from samples (default: 40)")
     parser.add_argument("--raw", type=int, default=4, help="full scenes from raw data (default: 4)")
     parser.add_argument("--without", type=int, default=20, help="scenes that hold nothing to name (default: 20)")
+    parser.add_argument("--sheets", type=int, default=8, help="full scenes with a thin sheet undeclared (default: 8)")
     parser.add_argument("--named", type=int, default=12, help="scenes of the library's materials (default: 12)")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene (default: 0)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (default: 2)")
@@ -300,10 +306,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the tables; 1 when a scene without anything to name got a name or a permittivity."""
-    jobs = [(args.first + i, False) for i in range(args.scenes)] + [(args.first + i, True) for i in range(args.raw)]
+    seeds = range(args.first, args.first + args.scenes)
+    jobs = [(i, "full", False) for i in seeds] + [(args.first + i, "full", True) for i in range(args.raw)]
     print("simulated scenes; regions of the permittivity (real and imaginary part together)")
     with ProcessPoolExecutor(args.jobs) as pool:
         found = list(pool.map(_one, jobs))
+        thin = [r for one in pool.map(figures, [*range(args.first, args.first + args.sheets)], ["sheet"] * args.sheets)
+                for r in one]  # fmt: skip
         kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
         without = list(pool.map(_without, kinds))
         named = [pair for one in pool.map(_names, range(args.first, args.first + args.named)) for pair in one]
@@ -319,6 +328,9 @@ def run(args: argparse.Namespace) -> int:
     for inside in (True, False):
         what = f"  metal {'in the scene' if inside else 'scanned on its own'}"
         out[what.strip()] = _table([r for r in rows if r.metal_in_scene == inside], what)
+    out["beside a sheet"] = _table([r for r in thin if not r.sheet], "  beside a thin sheet, undeclared")
+    out["sheet"] = _table([r for r in thin if r.sheet], "  the sheet itself, as a half space")
+    print(f"  sheets: {args.sheets}; without a permittivity {args.sheets - sum(r.sheet for r in thin)}")
     same = {(r.scene, r.material): r for r in rows}
     apart = [
         abs(r.relative_error - same[r.scene, r.material].relative_error) for r in raw if (r.scene, r.material) in same
@@ -341,7 +353,12 @@ def run(args: argparse.Namespace) -> int:
     )
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
-        content = {"summary": out, "names": reliability, "patches": [asdict(r) for r in rows + raw], "without": without}
+        content = {
+            "summary": out,
+            "names": reliability,
+            "patches": [asdict(r) for r in rows + raw + thin],
+            "without": without,
+        }
         args.json.write_text(json.dumps(content, indent=1) + "\n")
     return int(any(w[3] for w in said))
 

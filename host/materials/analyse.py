@@ -91,7 +91,9 @@ def analyse(
     calibrated = without_leakage(raw, inversion.leakage)
     sh, sv = (smooth_inside(c, found, optics.smooth_px) for c in (calibrated.h, calibrated.v))
     sp = ratio(sh, sv)
-    estimates = dict(zip((p.label for p in judged), inversion.patches, strict=True))
+    labels = [p.label for p in judged]
+    estimates = dict(zip(labels, inversion.patches, strict=True))
+    off = dict(zip(labels, (inversion.misfit * inversion.brightness_std).tolist(), strict=True))
     patches = {
         p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _angle(theta, p), estimates.get(p.label))
         for p in found.patches
@@ -105,8 +107,9 @@ def analyse(
     )
     library = () if classifier is None else classifier.library.names
     return MaterialsResult(
-        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, library=library, tilts=tilts
-    )
+        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, library=library, tilts=tilts,
+        brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
+    )  # fmt: skip
 
 
 def _names(

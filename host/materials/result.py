@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -96,6 +97,8 @@ class MaterialsResult:
         Whether the verdict is `no result`: rows hold no name, no ratio and no permittivity then.
     tilts
         How the plates lie beside the image's plane; already taken out of `h` and `v`.
+    brightness_off
+        Patch number to ln of |H| beside that of a half space of its permittivity; absent where it does not tell.
     """
 
     calibrated: Calibrated
@@ -113,6 +116,7 @@ class MaterialsResult:
     library: tuple[str, ...] = ()
     withheld: bool = False
     tilts: Tilts = LEVEL
+    brightness_off: Mapping[int, float] = field(default_factory=dict)
 
     def rows(self) -> list[dict[str, Any]]:
         """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""

@@ -13,6 +13,7 @@ from polysight.host.verdict import (
     Coverage,
     Reason,
     Verdict,
+    brightness_reasons,
     direct_path_reasons,
     incidence_reasons,
     leakage_reasons,
@@ -84,6 +85,7 @@ def judge(
         reasons += plane_reasons(plane.known, 1e3 * plane.offset_m, tilt, std)
     judged = {r.patch.label for r in found.patches if r.refused is None}
     reasons += tilt_reasons({k: float(np.degrees(found.tilts.across_rad(k))) for k in judged})
+    reasons += brightness_reasons({k: ln for k, ln in found.brightness_off.items() if k in judged})
     if classifier is not None and len(classifier.angles_deg) == 1:
         angle = float(np.degrees(np.mean(found.theta_rad)))
         reasons += incidence_reasons(angle, float(classifier.angles_deg[0]))

@@ -7,6 +7,7 @@ into reasons are in `rules`.
 
 from polysight.host.verdict.rules import (
     Coverage,
+    brightness_reasons,
     direct_path_reasons,
     incidence_reasons,
     leakage_reasons,
@@ -27,6 +28,7 @@ __all__ = [
     "NoResult",
     "Reason",
     "Verdict",
+    "brightness_reasons",
     "direct_path_reasons",
     "incidence_reasons",
     "leakage_reasons",

@@ -28,6 +28,8 @@ PLANE_FAR_MM, PLANE_TILT_DEG = 3.0, 0.5
 PLANE_GATE_MM = 13.0
 PLATE_ACROSS_DEG = 0.5
 """Tilt across the plane of incidence that turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
+BRIGHTNESS_CARE = 0.2
+"""ln of |H| beside a half space's: rough, tilted, high plates stay within 0.13 (simulated), thin sheets reach 0.5."""
 LEAKAGE_SHARE = 0.02
 """Relative error of a permittivity by leakage that is worth a word."""
 LIBRARY_ANGLE_DEG = 0.3
@@ -266,6 +268,20 @@ def passivity_reasons(gaining: Mapping[int, str]) -> list[Reason]:
         )
         for label, what in gaining.items()
     ]  # fmt: skip
+
+
+def brightness_reasons(off: Mapping[int, float]) -> list[Reason]:
+    """Plates brighter or darker than half spaces of their permittivity: patch number to ln of |H| beside theirs."""
+    out = []
+    for label, ln in off.items():
+        if abs(ln) > BRIGHTNESS_CARE:
+            share, than = 100 * abs(float(np.expm1(ln))), "brighter" if ln > 0 else "darker"
+            out.append(Reason(
+                "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
+                "it may be thin, layered, rough, or partly in a shadow: a thin plate's permittivity is another one",
+                "fit it as a layer (polysight permittivity --layer), or lay it flat and free", 1.7,
+            ))  # fmt: skip
+    return out
 
 
 def incidence_reasons(angle_deg: float, library_deg: float | None) -> list[Reason]:

@@ -86,6 +86,19 @@ def test_a_measured_rig_and_a_plain_scene_are_good(examine):
     assert reference["name"] is None  # never judged by itself
 
 
+def test_a_thin_sheet_that_nobody_declared_is_told_and_spoils_no_other(examine):
+    # A millimetre of acrylic is half a wave thick: it hardly reflects, and its ratio is another material's.
+    scene = world(disturbances={"leakage_measured": 0.003})
+    plates = tuple(msgspec.structs.replace(p, thickness_mm=1.0) if p.name == "acrylic" else p for p in scene.plates)
+    findings, true = examine(msgspec.structs.replace(scene, plates=plates))
+    (label,) = [label for label, plate in true.items() if plate.name == "acrylic"]
+    assert findings.verdict.level == "care"
+    assert f"patch {label} is" in reasons(findings)
+    assert "darker" in reasons(findings)
+    others = {k: plate for k, plate in true.items() if k != label}
+    assert np.sqrt(distances(findings, others).mean() / 2) < 1.5
+
+
 @pytest.mark.parametrize("names", [("ceramic", "acrylic", "PET", "wood", "rubber"), ("ceramic",), ("ceramic", "wood")])
 def test_without_metal_nothing_is_said(examine, names):
     findings, _ = examine(world(names))

@@ -10,6 +10,7 @@ from polysight.host.verdict import (
     NoResult,
     Reason,
     Verdict,
+    brightness_reasons,
     direct_path_reasons,
     incidence_reasons,
     leakage_reasons,
@@ -140,6 +141,8 @@ def test_other_rules():
     assert level(plane_reasons(True, 0.2, (0.1, 0.0), 0.1)) == "good"
     assert level(tilt_reasons({1: 0.3, 2: -0.2})) == "good"
     assert level(tilt_reasons({1: 0.3, 2: -0.8})) == "care"
+    assert level(brightness_reasons({1: 0.13, 2: -0.13})) == "good"
+    assert level(brightness_reasons({1: 0.0, 2: -0.3})) == "care"
     assert level(incidence_reasons(55.0, 54.9)) == "good"
     assert level(incidence_reasons(55.5, 54.9)) == "care"
 
@@ -161,6 +164,7 @@ def test_every_reason_says_what_why_and_what_to_do():
         *level_reasons({"H": 9.0, "V": 0.1}),
         *incidence_reasons(57.0, 54.9),
         *tilt_reasons({1: 1.0, 4: -2.0}),
+        *brightness_reasons({1: 0.4, 4: -0.4}),
     ]
     assert len(reasons) >= 16
     for r in reasons:

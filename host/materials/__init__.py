@@ -83,7 +83,7 @@ from polysight.host.materials.published import (
     told_angle,
 )
 from polysight.host.materials.result import MaterialsResult, PatchResult
-from polysight.host.materials.samples import CHANNELS, Model, Samples, SceneErrors, feature_matrix
+from polysight.host.materials.samples import CHANNELS, Model, Samples, SceneErrors, by_angle, feature_matrix
 from polysight.host.materials.segment import (
     Box,
     Patch,
@@ -183,6 +183,7 @@ __all__ = [
     "best_model",
     "box_mask",
     "box_name",
+    "by_angle",
     "calibration_error",
     "check_labels",
     "clean_name",

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import f as f_distribution
 
-from polysight.host.materials import DISCRIMINANT, MODELS, Model, Samples, SceneErrors, calibration_error
+from polysight.host.materials import DISCRIMINANT, MODELS, Model, Samples, SceneErrors, by_angle, calibration_error
 from polysight.host.polarimetry import fresnel
 from polysight.papers.sensys2026.item import Table, percent
 from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw, groups, specimens
@@ -24,12 +25,15 @@ Real = npt.NDArray[np.float64]
 
 
 class Found(NamedTuple):
-    """Patches named right, those that Bayes' rule would, expected calibration error, and strangers that got a name."""
+    """Patches named right, those that Bayes' rule would, expected calibration error, and strangers that got a name.
+
+    `strangers` is (named, of how many), of all and of those that lie outside every known material's 95 % region.
+    """
 
     right: float
     bound: float
     calibration: float
-    strangers_named: float
+    strangers: tuple[int, int, int, int]
 
 
 def both_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, seed: int, scans: int) -> Samples:
@@ -50,7 +54,7 @@ def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, 
     named, right, sure = by_patch(model, test)
     told = calibration_error(sure[named], right[named])
     share = float((named & right).mean())
-    return Found(share, bayes(group, angles_deg, errors, quick), told, _strangers_named(taught, test, quick))
+    return Found(share, bayes(group, angles_deg, errors, quick), told, strangers_named(taught, test, quick))
 
 
 def by_patch(
@@ -106,19 +110,50 @@ def _features(eps: npt.NDArray[np.complex128], angles_deg: tuple[float, ...]) ->
     return np.stack(columns, axis=-1)
 
 
-def _strangers_named(taught: Samples, test: Samples, quick: bool) -> float:
-    """Share of patches that get a name though no patch of their material was ever learnt."""
-    named, count = 0, 0
+def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, int, int, int]:
+    """Patches of materials of which none was ever learnt: named of all, named of those outside every 95 % region.
+
+    Returns the two pairs (named, of how many).
+    """
+    named, outside = [], []
     scans = np.unique(test.groups)[: 2 if quick else 6]
     for name in np.unique(test.names):
-        model = MODELS[DISCRIMINANT]("H+V+P").fit(taught.take(taught.names != name))
+        others = taught.take(taught.names != name)
+        model = MODELS[DISCRIMINANT]("H+V+P").fit(others)
         for scan in scans:
             mine = test.take(test.groups == scan)
             found = model.by_scan(mine.x, mine.patches)
             strange = np.unique(mine.patches[mine.names == name])
-            named += int((found.distance[np.searchsorted(found.patches, strange)] <= 1).sum())
-            count += strange.size
-    return named / count
+            named += (found.distance[np.searchsorted(found.patches, strange)] <= 1).tolist()
+            outside += _outside(mine.take(np.isin(mine.patches, strange)), others).tolist()
+    far = np.array(outside)
+    return int(np.sum(named)), len(named), int(np.array(named)[far].sum()), int(far.sum())
+
+
+def _outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
+    """Whether each patch lies outside the region that holds 95 % of each known material's patches, [patch].
+
+    Of ln|H|, ln|V| and arg P of patches, normal with mean and covariance from so many patches (Hotelling's law).
+    """
+    at, _ = _patch_features(seen)
+    means, names = _patch_features(known)
+    out = np.ones(len(at), np.bool_)
+    for name in np.unique(names):
+        own = means[names == name]
+        n, d = own.shape
+        off = at - own.mean(axis=0)
+        q = np.einsum("pd,de,pe->p", off, np.linalg.inv(np.cov(own.T)), off)
+        out &= q > (n + 1) * (n - 1) * d / (n * (n - d)) * f_distribution.ppf(0.95, d, n - d)
+    return out
+
+
+def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
+    """Mean ln|H|, ln|V| and arg P under each angle, [patch, 3 * angles], and the patches' names."""
+    h, v, inverse = by_angle(samples.x)
+    x = np.concatenate([np.log(h), np.log(v), np.angle(inverse)], axis=1)
+    order = np.unique(samples.patches)
+    means = np.array([x[samples.patches == p].mean(axis=0) for p in order])
+    return means, np.array([samples.names[samples.patches == p][0] for p in order])
 
 
 def spread_table(quick: bool) -> Table:
@@ -131,7 +166,8 @@ def spread_table(quick: bool) -> Table:
             seen = f"{len(groups()[group].materials)} {group}{', two angles' if len(angles) > 1 else ''}"
             told = f"{100 * spread[0]:g} / {100 * spread[1]:g} %"
             rows.append((
-                seen, told, percent(f.right), percent(f.bound), f"{f.calibration:.3f}", percent(f.strangers_named),
+                seen, told, percent(f.right), percent(f.bound), f"{f.calibration:.3f}",
+                "{} of {}".format(*f.strangers[:2]), "{} of {}".format(*f.strangers[2:]),
             ))  # fmt: skip
     head = (
         "Task",
@@ -140,6 +176,7 @@ def spread_table(quick: bool) -> Table:
         "Bayes bound",
         "calibration error",
         "strangers named",
+        "those outside every 95 % region",
     )
     caption = (
         f"Patches of specimens that were never learnt, {LIBRARY_SCANS} other specimens of each material in the library,"

@@ -13,9 +13,10 @@ from polysight.host.imaging.gain_conditions import ImagedWith
 from polysight.host.imaging.geometry import Antennas, ImageGrid, image_grid, row_offsets_m, scan_offsets_m
 from polysight.host.imaging.images import TAPERS, ChannelImages, ImageBuilder, SubBand, SubBandImages, sub_bands
 from polysight.host.imaging.plane import PLANE_REACH_M, UNKNOWN_PLANE, PlaneEstimate, find_plane, on_their_plane
-from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
+from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.host.imaging.resolution import PointResponse, imaging_facts, point_response
 from polysight.host.imaging.tilt import Illumination, Rise, levelled
+from polysight.host.imaging.window import Window, window_weights
 
 __all__ = [
     "PLANE_REACH_M",
@@ -49,4 +50,5 @@ __all__ = [
     "scan_offsets_m",
     "scene_gate_m",
     "sub_bands",
+    "window_weights",
 ]

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-import scipy.signal
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from polysight.host.imaging.geometry import Antennas, image_grid
-from polysight.host.imaging.reduce import Window, reduction, scene_gate_m
+from polysight.host.imaging.reduce import reduction, scene_gate_m
 from polysight.host.imaging.samples import BoardSamples, Image
 from polysight.host.imaging.tilt import Illumination, illumination_geometry, levelled
+from polysight.host.imaging.window import Window, window_weights
 from polysight.host.sync import SyncedRow
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError
@@ -120,7 +120,7 @@ class ImageBuilder:
         antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
         gate = scene_gate_m(antennas, plan, self.grid, depth_m)
         taper = TAPERS[rig.image.apodisation] if taper is None else taper
-        weights = np.outer(_window(taper, plan.rows), _window(taper, plan.columns)).astype(np.float32)
+        weights = np.outer(window_weights(taper, plan.rows), window_weights(taper, plan.columns)).astype(np.float32)
         gated = reduction(rig.chirp, gate, window)
         self._antennas, self._middle_hz = antennas, float(np.mean(gated.frequencies_hz))
         self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
@@ -179,11 +179,6 @@ class ImageBuilder:
         moved, steep = zip(*(illumination_geometry(a, z_m, self._middle_hz) for a in self._antennas), strict=True)
         pitch = self.grid.pixel_m
         return Illumination(footprints, np.stack(moved), np.array(steep), (pitch, pitch))
-
-
-def _window(name: Window, n: int) -> NDArray[np.float64]:
-    """A symmetric window of n points without the zeros at its ends."""
-    return np.asarray(scipy.signal.get_window(name, n + 2, fftbins=False), np.float64)[1:-1]
 
 
 @dataclass(frozen=True)

@@ -16,19 +16,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import scipy.linalg
-import scipy.signal
 from numpy.typing import NDArray
 
 from polysight.host.imaging.geometry import Antennas, ImageGrid
+from polysight.host.imaging.window import Window, window_weights
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.raster import RasterPlan
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-Window = str | tuple[Any, ...]  # as scipy.signal.get_window takes it
 _NOISE = 1e-3  # noise power of one sample beside the gate's, for the direct path's estimate
 REACH = 4  # positions to either side
 _BAND = 0.45  # cycles a position the filter is made for
@@ -92,7 +90,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
     """
     a, b = chirp.linear_samples
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(a, b)
-    weight = np.asarray(scipy.signal.get_window(window, b - a + 2, fftbins=False))[1:-1]
+    weight = window_weights(window, b - a)
     weight = weight / weight.sum()
     band = sweep[-1] - sweep[0]
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S

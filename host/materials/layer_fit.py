@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, optimize, stats
+from scipy import ndimage, optimize, special
 
 from polysight.host.materials.layers import Bands, Layer, average, check_stack
 from polysight.host.materials.permittivity import format_permittivity
@@ -109,7 +109,7 @@ class LayerFit:
                 f"ambiguous: permittivity and thickness are determined to {100 * self.relative_std:.0f} % only;"
                 " measure the thickness"
             )
-        if self.freedom > 0 and stats.chi2.sf(self.chi2, self.freedom) < UNLIKELY:
+        if self.freedom > 0 and special.chdtrc(self.freedom, self.chi2) < UNLIKELY:
             out.append(f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees")
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
             out.append("the data hardly depend on this layer: its error bar is large")

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg, signal
+from scipy import linalg
 
+from polysight.host.imaging import window_weights
 from polysight.host.polarimetry import multilayer
 from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError, PolysightError
@@ -51,7 +52,7 @@ class Spectrum:
         starts = np.linspace(first, last - length, bands)
         # The sum over all samples of a smooth window is that over a few: inner echoes turn slowly with frequency.
         inside = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
-        weight = np.asarray(signal.get_window(window, 2 * _FREQUENCIES + 1, fftbins=False), np.float64)[1::2]
+        weight = window_weights(window, 2 * _FREQUENCIES - 1)[::2]
         frequency = chirp.first_sample_hz + chirp.hz_per_sample * (starts[:, None] + length * inside)
         return cls(frequency, np.tile(weight / weight.sum(), (bands, 1)))
 

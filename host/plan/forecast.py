@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.signal
 from numpy.typing import NDArray
 
 from polysight.host.imaging import (
@@ -19,12 +18,12 @@ from polysight.host.imaging import (
     Antennas,
     Aperture,
     PointResponse,
-    Window,
     image_grid,
     point_response,
     reduction,
     scan_offsets_m,
     scene_gate_m,
+    window_weights,
 )
 from polysight.host.plan.field import FieldLimits, PhaseSlope, field_limits
 from polysight.host.plan.timing import ROW_OVERHEAD_S, ScanTime, payload_bytes, scan_time, tail_s
@@ -327,12 +326,7 @@ def aperture_of(rig: Instrument) -> tuple[Aperture, Real]:
 
 def _tapers(rig: Instrument) -> tuple[Real, Real]:
     name = TAPERS[rig.image.apodisation]
-    return _window(name, rig.grid.rows), _window(name, rig.grid.columns)
-
-
-def _window(name: Window, n: int) -> Real:
-    """As the imager makes it: symmetric, without the zeros at its ends."""
-    return np.asarray(scipy.signal.get_window(name, n + 2, fftbins=False), np.float64)[1:-1]
+    return window_weights(name, rig.grid.rows), window_weights(name, rig.grid.columns)
 
 
 def burst_facts(rig: Instrument) -> BurstFacts:
@@ -360,7 +354,7 @@ def noise_facts(rig: Instrument, noise: Noise) -> NoiseFacts:
     a, b = rig.chirp.linear_samples
     rx = len(rig.antennas.rx_mm)
     position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
-    gain = rx * _gain(_window(_FAST_TIME_WINDOW, b - a))
+    gain = rx * _gain(window_weights(_FAST_TIME_WINDOW, b - a))
     for taper in _tapers(rig):
         gain *= _gain(taper)
     return NoiseFacts(

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
@@ -68,6 +68,8 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     x_m, y_m
         Pixel centres, rig frame, metres; [nx] and [ny].
     """
+    from scipy.signal import fftconvolve  # imported where it is used: it brings scipy.stats along, a second's work
+
     x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
     step = np.array([rig.grid.step_x_mm, rig.grid.step_y_mm]) / 1e3
     count = np.array([rig.grid.columns, rig.grid.rows])
@@ -85,8 +87,7 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         angle, path = _half_bistatic(rig, i, points)
         specular, shortest = _half_bistatic(rig, i, middle)
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
-        deviation = signal.fftconvolve(visited, weight * (angle - specular))
-        mass = signal.fftconvolve(visited, weight)
+        deviation, mass = (fftconvolve(visited, one) for one in (weight * (angle - specular), weight))
         # Sample (row, column) of the full convolution is the pixel at offset + displacement from the midpoint.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, stats
+from scipy import ndimage
 
 from polysight.host.imaging import ImagedWith
 from polysight.host.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
@@ -205,7 +205,7 @@ def _spread(h: Image, v: Image) -> float:
     q = ratio(v, h)
     q = q[np.isfinite(q)]
     parts = np.concatenate([q.real - np.median(q.real), q.imag - np.median(q.imag)])
-    return 1.4826 * float(stats.median_abs_deviation(parts))
+    return 1.4826 * float(np.median(np.abs(parts - np.median(parts))))
 
 
 def _disk(radius: int) -> npt.NDArray[np.bool_]:

@@ -8,12 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.sync import numpy_passes as plain
-
-try:
-    from polysight.host.sync import compiled as fastest
-except ImportError:
-    fastest = plain
-
 from polysight.host.sync.numpy_passes import FOLD as FOLD
 
 _Real, _Complex, _Chosen = NDArray[np.float64], NDArray[np.complex128], NDArray[np.bool_]
@@ -55,4 +49,10 @@ class Passes(Protocol):
 
 def passes_for(rx: int) -> Passes:
     """The fastest passes for a number of RX: compiled ones are for the four of an AWR2243."""
-    return cast(Passes, fastest if rx == 4 else plain)
+    if rx != 4:
+        return cast(Passes, plain)
+    try:  # imported where it is used: numba is half a second's work that most commands never need
+        from polysight.host.sync import compiled as fastest
+    except ImportError:
+        fastest = plain
+    return cast(Passes, fastest)

@@ -1,0 +1,18 @@
+"""Windows over the aperture and over a chirp: symmetric, without the zeros at their ends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Window = str | tuple[Any, ...]
+"""As scipy.signal.get_window takes it; "boxcar" for none."""
+
+
+def window_weights(name: Window, n: int) -> NDArray[np.float64]:
+    """A window of n points, float64 [n]."""
+    from scipy.signal import get_window  # imported where it is used: it brings scipy.stats along, a second's work
+
+    return np.asarray(get_window(name, n + 2, fftbins=False), np.float64)[1:-1]

@@ -21,12 +21,14 @@ Flags = NDArray[np.bool_]
 class Span:
     """Counters of an earlier record: packets that carry them are left over.
 
-    `sure`: packets of that record came, or its place is certain. Otherwise it may never have been sent.
+    `sure`: packets of that record came, or its place is certain. Otherwise it may never have been sent. `missing`: byte
+    ranges of it that did not come, of a record whose place was certain; None: any of it may still come.
     """
 
     start: Counters
     size: int
     sure: bool = True
+    missing: tuple[tuple[int, int], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Past:
         Whether a record may have been sent of which nothing came, and it is not known where.
     guessed
         Whether `base` is not certain: only where its record ended is.
+    anew
+        How many whole records, one behind the other, began with the counters of a card that was just switched on.
     """
 
     base: Counters | None = None
@@ -56,6 +60,7 @@ class Past:
     joined: int = 0
     unseen: bool = False
     guessed: bool = False
+    anew: int = 0
 
     @staticmethod
     def ending_at(start: Counters) -> Past:
@@ -95,6 +100,19 @@ class CounterView:
                 ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
                 steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
                 found |= (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps)
+        return found
+
+    def came_before(self, spans: tuple[Span, ...]) -> Flags:
+        """Whether each has counters that came already: a copy on a slow path, or a card that began anew."""
+        found = np.zeros(self.sizes.size, dtype=np.bool_)
+        for span in spans:
+            if span.sure and span.missing is not None:
+                ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
+                steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
+                inside = (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps)
+                for start, stop in span.missing:
+                    inside &= (ahead + self.sizes <= start) | (ahead >= stop)
+                found |= inside
         return found
 
     def at(self, base: int, line: int) -> Counters:

@@ -30,6 +30,8 @@ from polysight.host.capture.placement import Placed, place_record
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 
+MOST_BYTES = 256 << 20
+"""How much of a file is read: eleven rows of the published scan."""
 _LOOKED_AT = 16  # headers that tell whether a file holds whole packets
 _FULL_SCALE = 32767  # ADC counts
 _MUCH_DC = 0.05 * _FULL_SCALE
@@ -171,14 +173,16 @@ def inspect_bin(path: Path, known: Known = Known()) -> Report:
     Raises DataError when it is absent, or shorter than one chirp.
     """
     try:
-        payload = np.fromfile(path, dtype=np.uint8)
+        size = path.stat().st_size
+        payload = np.fromfile(path, dtype=np.uint8, count=MOST_BYTES)
     except OSError as e:
         raise DataError(f"{path}: cannot be read: {e.strerror}", "the path is wrong", "give a recording") from None
     packets = packets_in_file(payload)
-    if not packets:
-        return inspect_payload(path, payload, known)
-    report = inspect_payload(path, place_packets(packets)[0], known)
-    report.remarks.append("whole packets, not payload: read by their counters, which a program must cut off first")
+    report = inspect_payload(path, place_packets(packets)[0] if packets else payload, known)
+    if packets:
+        report.remarks.append("whole packets, not payload: read by their counters, which a program must cut off first")
+    if size > MOST_BYTES:
+        report.remarks.append(f"only the first {MOST_BYTES >> 20} MiB of {size >> 20} MiB were looked at")
     return report
 
 
@@ -253,14 +257,25 @@ def _not_a_capture(payload: NDArray[np.uint8], words: NDArray[np.int16], guesses
     for magic, kind in _MAGIC.items():
         if head.startswith(magic):
             return f"it begins as {kind}"
-    if not words.any():
-        return "every value is zero"
+    if not (words != words[:1]).any():
+        return f"every value is {'zero' if not words[0] else 'the same'}"
+    if payload[:2].tobytes() in (b"\xff\xfe", b"\xfe\xff") and _is_text(payload[:4096].tobytes()):
+        return "it begins as text (UTF-16)"
     some = words[: 1 << 20].astype(np.float64)
     # The entropy of a periodogram of white noise is Euler's 1 - 0.577 short of that of equal bins.
     white = min(g.disorder / (1 - 0.423 / np.log(g.shape.bins)) for g in guesses) > _WHITE
     if white and some.std() > _UNIFORM:
         return "its values fill the whole range evenly, and have no spectrum in any layout: compressed or random bytes"
     return ""
+
+
+def _is_text(raw: bytes) -> bool:
+    """Whether bytes with a byte order mark are printable in UTF-16."""
+    try:
+        text = raw[: len(raw) // 2 * 2].decode("utf-16")
+    except UnicodeDecodeError:
+        return False
+    return all(c.isprintable() or c.isspace() for c in text)
 
 
 def _over_median(power: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

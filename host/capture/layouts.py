@@ -98,18 +98,15 @@ class Guess:
 
 
 def guess_shapes(payload: NDArray[np.uint8], shapes: list[Shape]) -> list[Guess]:
-    """The layouts, likeliest first: of two whose disorder differs by less than :data:`DRAW` the earlier one wins.
+    """The layouts, likeliest first.
 
-    The likelihood falls by e for each `DRAW` of disorder; it compares the layouts that were tried and no others.
+    The likelihood falls by e for each :data:`DRAW` of disorder, and a little with each place in the order of `shapes`;
+    it compares the layouts that were tried and no others.
     """
     disorder = np.array([spectral_disorder(payload, shape) for shape in shapes])
     weight = np.exp(-(disorder - disorder.min()) / DRAW) * _PRIOR ** np.arange(len(shapes))
-    best, least = 0, np.inf
-    for k, value in enumerate(disorder):
-        if value < least - DRAW:
-            best, least = k, float(value)
-    order = sorted(range(len(shapes)), key=lambda k: (k != best, -weight[k]))
-    return [Guess(shapes[k], float(disorder[k]), float(weight[k] / weight.sum())) for k in order]
+    order = np.argsort(-weight, kind="stable")
+    return [Guess(shapes[k], float(disorder[k]), float(weight[k] / weight.sum())) for k in order.tolist()]
 
 
 def spectral_disorder(payload: NDArray[np.uint8], shape: Shape) -> float:

@@ -101,6 +101,8 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
         batches = np.frombuffer(tail[:size], dtype=BATCH).reshape(-1, 2).astype(np.int64)
         runs = np.frombuffer(tail[size : size + RUN.itemsize * head["runs"]], dtype=RUN)
         own = np.frombuffer(tail[size + runs.nbytes :], dtype=np.uint8)
+        if (np.diff(batches[:, 1], prepend=0) < 0).any():
+            raise ValueError("packets went away between two batches")
         log = _restored(evidence.expected, runs, batches, row, own)
         whole = (head["packets"], head["own_bytes"]) == (int(batches[-1, 1]) if len(batches) else 0, own.size)
         if not whole or log.count != head["kept"] or head["format"] != FORMAT:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from polysight.host.capture.dca1000 import Counters
 from polysight.host.capture.earlier_records import Past
+from polysight.host.capture.next_record import past_after
 from polysight.host.capture.packet_log import PacketLog
-from polysight.host.capture.record_search import Found, find_record, past_after
+from polysight.host.capture.record_search import Found, find_record
 
 Gap = tuple[int, int]
 Bytes = NDArray[np.uint8]

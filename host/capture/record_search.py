@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.capture.dca1000 import Counters
-from polysight.host.capture.earlier_records import CounterView, Past, Span, full_payload, line_of
+from polysight.host.capture.earlier_records import CounterView, Past, full_payload, line_of
 from polysight.host.capture.packet_log import PacketLog
 
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 SMALL_RECORD = 16  # packets: a record as small as this may be delayed as a whole
-_REMEMBERED = 4  # earlier records whose leftovers are known by their counters
 _NEAR = 64  # records
+SWITCHED_ON = Counters(0, 1)  # of the first packet after a reset
 _JOINS, _JOINS_SMALL = 1, 3  # doubtful records in a row, without a seam, after which the next one is believed
 
 
@@ -56,6 +56,8 @@ class Found:
         Whether the records before tell where it starts.
     clock_jumps
         Times at which the clock of the arrivals went backwards; then arrival decides nothing.
+    restarted
+        Whether the card may have begun anew just before it: then it ends where its last packet does.
     """
 
     base: Counters | None
@@ -73,6 +75,7 @@ class Found:
     fresh: bool = False
     foreseen: bool = False
     clock_jumps: int = 0
+    restarted: bool = False
 
 
 @dataclass(frozen=True)
@@ -115,21 +118,69 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
     old = packets.inside(past.spans, sure=True)
     if past.base is not None and len(past.ends) == 1:
         old |= (packets.line == line_of(past.ends[0], full)) & (packets.ahead < past.ends[0])
+    again = packets.came_before(past.spans) & ~early
     live = ~(early | old)
-    if not live.any():
+    sorted_out = Found(None, False, False, "", packets.ahead, packets.steps, nothing, early, old, full,
+                       clock_jumps=jumps)  # fmt: skip
+    found = _found(packets, live, log.expected, frame_bytes, past, sorted_out) if live.any() else None
+    if again.any() and (found is None or not _ends_where_foreseen(found, log)):
+        # Counters that came already, in a row that lacks its end: copies on a slow path, or the card began anew.
+        if found is not None and found.located:
+            why = "packets with counters that came before, and the end is not there: the card may have begun anew"
+            return replace(found, located=False, certain=False, reason=why, restarted=True)
+        unknown = Past(spans=past.spans, joint=past.joint, joined=past.joined, unseen=True, anew=past.anew)
+        packets = CounterView(log, Counters(int(log.byte_counts[again][0]), int(log.sequences[again][0])), full)
+        found = _found(packets, live | again, log.expected, frame_bytes, unknown, replace(sorted_out, old=old & ~again))
+    if found is None:
         why = "every packet is of an earlier record, by its counters or because it came before the first pulse"
-        steps = packets.steps
-        return Found(None, False, False, why, packets.ahead, steps, nothing, early, old, full, clock_jumps=jumps)
-    search = _Search(packets, live, log.expected, frame_bytes, past)
-    line, v = search.best()
-    base = packets.at(v.base, line)
-    offsets = packets.ahead - v.base
+        return replace(sorted_out, reason=why)
+    return found
+
+
+def _found(packets: CounterView, live: Flags, expected: int, frame_bytes: int, past: Past, sorted_out: Found) -> Found:
+    """The record among the packets that may be its own; `sorted_out` says what the others are."""
+    line, v = _Search(packets, live, expected, frame_bytes, past).best()
+    offsets, steps = packets.ahead - v.base, packets.steps - (v.base - line) // packets.full
     own = live & (packets.line == line) & (offsets >= 0)
-    steps = packets.steps - (v.base - line) // full
-    return Found(
-        base, v.certain, v.located, v.reason, offsets, steps, own, early, old, full, v.excess, v.doubtful,
-        v.fresh, v.foreseen, jumps,
+    found = replace(
+        sorted_out, base=packets.at(v.base, line), certain=v.certain, located=v.located, reason=v.reason,
+        offsets=offsets, steps=steps, own=own, excess=v.excess, doubtful=v.doubtful, fresh=v.fresh,
+        foreseen=v.foreseen,
     )  # fmt: skip
+    if v.located and (why := _rival(packets, found, live & ~own, expected)):
+        return replace(found, located=False, certain=False, reason=why)
+    return found
+
+
+def _rival(packets: CounterView, found: Found, rest: Flags, expected: int) -> str:
+    """Why other packets may be the row's record as well as these; "" when they may not.
+
+    The host has started one record, so the card's last one is the row's: unless the card began another by itself.
+    """
+    if later_packets(found, rest, expected, expected).any():
+        return "packets of two records came, one behind the other: which of them is the row's is not known"
+    before = (found.offsets < 0) & (found.steps < 0)
+    if _many(packets, rest & ~before, expected) or (not found.foreseen and _many(packets, rest & before, expected)):
+        return "half of another record came with it: which of them is the row's is not known"
+    return ""
+
+
+def _many(packets: CounterView, which: Flags | Counts, expected: int) -> bool:
+    """Whether these packets hold half of a record's bytes: no network holds back so many."""
+    _, one = np.unique(packets.ahead[which], return_index=True)
+    return 2 * int(packets.sizes[which][one].sum()) >= expected > 0
+
+
+def later_packets(found: Found, rest: Flags, stop: int, expected: int) -> Flags:
+    """Which of the packets have counters not far behind a record that ended at `stop`."""
+    behind = (found.offsets >= stop) & (found.offsets < stop + 2 * expected + found.full)
+    counted = (found.steps > 0) & (found.steps * found.full < stop + 4 * expected + 4 * found.full)
+    return rest & behind & counted
+
+
+def _ends_where_foreseen(found: Found, log: PacketLog) -> bool:
+    """Whether a located record's last byte came, where the records before foretold its start."""
+    return found.located and found.foreseen and int((found.offsets + log.sizes)[found.own].max()) == log.expected
 
 
 class _Search:
@@ -172,10 +223,13 @@ class _Search:
         if bases.size:
             verdict = replace(self._from_past(bases, first, stop, short), foreseen=True)
         else:
-            inside = p.ahead[which] >= stop - self._expected
-            verdict = self._from_itself(int(p.ahead[which][inside].min()), first, stop, last_size)
+            inside = p.ahead[which] >= stop - self._expected  # none where one packet is longer than the row
+            verdict = self._from_itself(int(p.ahead[which][inside].min(initial=last)), first, stop, last_size)
             if verdict.located and self._ended_within(which, stop):
                 why = "a record ended within it: the card may have begun anew"
+                verdict = replace(verdict, located=False, certain=False, reason=why)
+            if verdict.located and self._before_switched_on(verdict.base, first, line):
+                why = "its first bytes would be older than the card's counters: the card began anew within it"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
             if verdict.located and not self._much(which):
                 why = "too little of it came to tell it from an earlier record's end"
@@ -194,7 +248,8 @@ class _Search:
             verdict = replace(verdict, doubtful=True)
         if verdict.doubtful:
             enough = _JOINS if self._expected >= SMALL_RECORD * p.full else _JOINS_SMALL
-            if self._past.joint != start or self._past.joined < enough:
+            joins = self._past.joint == start and self._past.joined >= enough
+            if not joins and not (start == SWITCHED_ON and self._past.anew >= enough):
                 why = "its packets could as well be those of an earlier record that came late"
                 return replace(verdict, located=False, certain=False, reason=why)
         return verdict
@@ -203,6 +258,11 @@ class _Search:
         """Whether a packet that is not full lies before the last: only a record's last one is."""
         sizes = self._p.sizes[which]
         return bool(((sizes < self._p.full) & (self._p.ahead[which] + sizes < stop)).any())
+
+    def _before_switched_on(self, base: int, first: int, line: int) -> bool:
+        """Whether a record from `base` on would reach back behind sequence 1 and byte 0, where counters begin."""
+        at, lost = self._p.at(first, line), first - base
+        return at.byte_count < lost and at.sequence <= lost // self._p.full
 
     def _unclear(self, which: Counts, suspect: bool) -> bool:
         """Whether suspect packets may be an earlier record's: not half of a record that is not small."""
@@ -215,9 +275,8 @@ class _Search:
         return bool(self._ends.size) and near < base < int(self._ends.min())
 
     def _much(self, which: Counts) -> bool:
-        """Whether half of the record's bytes are among these packets: no network holds back so many."""
-        _, one = np.unique(self._p.ahead[which], return_index=True)
-        return 2 * int(self._p.sizes[which][one].sum()) >= self._expected
+        """Whether half of the record's bytes are among these packets."""
+        return _many(self._p, which, self._expected)
 
     def _from_past(self, bases: Counts, first: int, stop: int, short: bool) -> _Verdict:
         """The record starts at one of these bases."""
@@ -271,67 +330,6 @@ class _Search:
             )  # fmt: skip
         why = f"{e - (stop - first)} bytes short, and the record's first byte is not known"
         return _Verdict(first, False, False, why)
-
-
-def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_bytes: int) -> Past:
-    """What is known for the next record.
-
-    `located` is false also where the card said that it dropped data: then only a short last packet tells its end.
-    """
-    e, full = log.expected, found.full
-    if found.base is None:
-        return _after_nothing(past, e, full, frame_bytes)
-    base, ends = found.base, (found.offsets + log.sizes)[found.own]
-    stop = int(ends.max())
-    more = _more_records(found, stop, e)
-    if located and not more:
-        sure = tuple(span for span in past.spans if span.sure)
-        return Past(base, (e,), _remember(sure, Span(base, e)))
-    first = int(found.offsets[found.own].min())
-    short = bool((log.sizes[found.own][ends == stop] < full).all())
-    if more:  # where the last of them ended is not known
-        return Past(spans=_remember(past.spans, Span(base, max(stop, e))), unseen=True)
-    if found.certain:
-        frames = range(-(-stop // frame_bytes) * frame_bytes, e + 1, frame_bytes) if frame_bytes > 1 else range(0)
-        return Past(base, tuple(sorted({*frames, *([stop] if short else [])})), _remember(past.spans, Span(base, e)))
-    back = -(-max(0, first - (stop - e)) // full)  # packets that may be lost before the first
-    low, high = first - back * full, max(stop, first + e) if e % full else stop
-    spans = _remember(past.spans, Span(base.after(low, low // full), high - low))
-    end, joined = base.after(stop, -(-stop // full)), 0
-    if found.doubtful:
-        joined = past.joined + 1 if past.joint == base else 1
-        spans = (*spans, Span(end, e, sure=False))
-    elif e % full == 0 and first + e > stop:
-        spans = (*spans, Span(end, first + e - stop, sure=False))
-    known = Past(spans=spans, joint=end if joined else None, joined=joined, unseen=past.unseen)
-    # A short packet ends its record, wherever that began; one cut short on its way leads to a line without packets.
-    return replace(known, base=base, ends=(stop,), guessed=True) if short and not found.doubtful else known
-
-
-def _more_records(found: Found, stop: int, expected: int) -> bool:
-    """Whether packets have counters behind the record's end: the card has sent another one, nobody knows of what size.
-
-    Or it began anew: packets that are of no record known.
-    """
-    rest = ~(found.own | found.early | found.old)
-    behind = (found.offsets >= stop) & (found.offsets < stop + 2 * expected + found.full)
-    counted = (found.steps > 0) & (found.steps * found.full < stop + 4 * expected + 4 * found.full)
-    return bool((rest & behind & counted).any())
-
-
-def _after_nothing(past: Past, expected: int, full: int, frame_bytes: int) -> Past:
-    """Nothing came: the record may have been sent or not."""
-    if past.base is None or len(past.ends) != 1 or past.guessed:
-        return Past(spans=past.spans, unseen=True)
-    end = past.ends[0]
-    base = past.base.after(end, -(-end // full))
-    spans = _remember(past.spans, Span(base, expected, sure=False))
-    step = frame_bytes if frame_bytes > 1 else max(1, expected)
-    return Past(base, tuple(range(0, expected + 1, step)), spans, unseen=True)
-
-
-def _remember(spans: tuple[Span, ...], span: Span) -> tuple[Span, ...]:
-    return (*spans, span)[-_REMEMBERED:]
 
 
 def _before_pulses(log: PacketLog, not_before_ns: int) -> tuple[Flags, int]:

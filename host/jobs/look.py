@@ -102,14 +102,12 @@ def _refuse_text(file: Path) -> None:
 
 
 def _is_pcap(file: Path) -> bool:
-    """By its name, or by its first bytes where the name does not say."""
-    if file.suffix in (".pcap", ".bin"):
-        return file.suffix == ".pcap"
+    """By its first bytes; or by its name, so that one that is cut off says so."""
     with file.open("rb") as f:
-        return is_pcap(f.read(4))
+        return is_pcap(f.read(4)) or file.suffix == ".pcap"
 
 
-def _scan_of(file: Path) -> ScanFolder | None:
+def scan_of(file: Path) -> ScanFolder | None:
     """The scan a row's file belongs to, where its manifest can be read."""
     folders = file.resolve().parents
     if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
@@ -127,7 +125,7 @@ def inspect_file(file: Path, config: Path | None, plot: Path | None, card_addres
     """
     if file.is_file():
         _refuse_text(file)
-    scan = _scan_of(file)
+    scan = scan_of(file)
     rig = load_instrument(config) if config is not None else None if scan is None else scan.instrument
     known = Known() if rig is None else Known.of_instrument(rig)
     pcap = file.is_file() and _is_pcap(file)

@@ -7,7 +7,10 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from polysight.host.store import PlacedAgain, Replaced, ScanFolder, place_again, replace_rows
+from polysight.host.capture import PACKETS
+from polysight.host.jobs.look import scan_of
+from polysight.host.store import PlacedAgain, Replaced, ScanFolder, damage_of, place_again, replace_rows
+from polysight.shared.errors import DataError
 
 _SHOWN = 8
 
@@ -15,9 +18,16 @@ _SHOWN = 8
 def inspect_placement(file: Path, as_json: bool) -> int:
     """Say how a row's packets are placed by this program; 0 when that is how the row was committed.
 
-    `file` is the row's file, or one of those beside it. Raises DataError.
+    `file` is the row's file, or one of those beside it. Raises DataError when a file is damaged, or is not the one that
+    the scan's manifest has committed.
     """
-    again = place_again(file.with_suffix(".bin"))
+    row = file.with_suffix(".bin")
+    if scan := scan_of(row):
+        if strange := damage_of(scan, row):
+            raise DataError(f"{row}: {strange}", "a damaged file, or one of another row", "`polysight validate SCAN`")
+        if not row.with_suffix(PACKETS).exists():
+            raise DataError(f"{row}: its packets were not kept", "it is simulated, or of an older release", "")
+    again = place_again(row)
     same = again.moved or again.missing == again.placed.missing
     if as_json:
         said = {**again.placed.facts(), "committed_missing": again.missing, "same": same}

@@ -9,7 +9,7 @@ from polysight.host.store.append_only import sync_folder
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.raw import Digests, drop, droppable, require_raw
-from polysight.host.store.replace import PlacedAgain, Replaced, place_again, replace_rows
+from polysight.host.store.replace import PlacedAgain, Replaced, damage_of, place_again, replace_rows
 from polysight.host.store.scan_folder import (
     EVENTS,
     MANIFEST,
@@ -48,6 +48,7 @@ __all__ = [
     "Source",
     "check_same_scan",
     "connection_of",
+    "damage_of",
     "damaged_rows",
     "drop",
     "droppable",

@@ -69,6 +69,18 @@ def place_again(path: Path) -> PlacedAgain:
     return PlacedAgain(evidence, placed, out, missing, moved="frames" in facts)
 
 
+def damage_of(scan: ScanFolder, path: Path) -> str:
+    """What is wrong with a row's files beside the manifest; "" when nothing is. Raises DataError."""
+    for row in scan.committed().values():
+        for board in row.boards.values():
+            if (scan.path / board.file).resolve() == path.resolve():
+                try:
+                    return _strange(path, board)
+                except OSError as e:
+                    return f"{e.filename}: {e.strerror}"
+    return "the manifest has committed no such row"
+
+
 def replace_rows(scan: ScanFolder) -> list[Replaced]:
     """Place every committed row again; those that come out differently are committed anew.
 
@@ -96,14 +108,8 @@ def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, Place
     if not board.packets_crc32:
         return Replaced(row, name, before, before, "its packets were not kept"), None
     try:
-        if f"{crc32(path.with_suffix(PACKETS).read_bytes()):08x}" != board.packets_crc32:
-            return Replaced(
-                row, name, before, before, "its packets are not those that were committed", damaged=True
-            ), None
-        if f"{crc32(path.read_bytes()):08x}" != board.crc32:
-            return Replaced(
-                row, name, before, before, "its bytes are not those that were committed", damaged=True
-            ), None
+        if strange := _strange(path, board):
+            return Replaced(row, name, before, before, strange, damaged=True), None
         again = place_again(path)
     except (DataError, OSError) as e:
         return Replaced(row, name, before, before, str(e), damaged=True), None
@@ -112,6 +118,19 @@ def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, Place
     after = sum(b - a for a, b in again.placed.missing)
     same = again.missing == again.placed.missing and f"{crc32(again.out.tobytes()):08x}" == board.crc32
     return Replaced(row, name, before, after, changed=not same), again
+
+
+def _strange(path: Path, board: BoardRow) -> str:
+    """Which of a row's files is not the one that was committed; "" when all are. Raises OSError."""
+    committed = (
+        (".bin", board.crc32, "its bytes are not those that were committed"),
+        (".idx", board.index_crc32, "its index is not the one that was committed"),
+        (PACKETS, board.packets_crc32, "its packets are not those that were committed"),
+    )
+    for suffix, digest, why in committed:
+        if digest and f"{crc32(path.with_suffix(suffix).read_bytes()):08x}" != digest:
+            return why
+    return ""
 
 
 def _commit(scan: ScanFolder, writer: ManifestWriter, row: int, changed: dict[str, PlacedAgain]) -> None:

@@ -89,6 +89,9 @@ def a_whole_picture(tmp_path: Path) -> bytes:
         (lambda _p: altered(row(2, False), "offset binary").tobytes(), True),
         (lambda _p: np.random.default_rng(1).bytes(1 << 17), False),
         (lambda _p: bytes(1 << 16), False),
+        (lambda _p: b"\xff" * (1 << 16), False),
+        (lambda _p: np.full(1 << 15, 517, "<i2").tobytes(), False),
+        (lambda _p: ("a text, in another code\n" * 3000).encode("utf-16"), False),
         (a_whole_picture, False),
         (lambda _p: Path(sys.executable).resolve().read_bytes()[: 1 << 20], False),
     ],
@@ -232,6 +235,24 @@ def test_plot(tmp_path, kind):
     assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     with pytest.raises(DataError, match="cannot be written"):
         plot_profile(inspect_bin(path), tmp_path / "absent" / "x.png")
+
+
+def test_of_a_huge_file_only_the_beginning_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("polysight.host.capture.inspect.MOST_BYTES", 1 << 20)
+    path = tmp_path / "x.bin"
+    row(4, False).tofile(path)
+    with path.open("r+b") as f:
+        f.truncate(1 << 34)
+    report = inspect_bin(path)
+    assert report.bytes <= 1 << 20
+    assert any("16384 MiB" in remark for remark in report.remarks)
+
+
+@needs_real
+def test_a_packet_capture_is_known_by_its_first_bytes_whatever_its_name(tmp_path, capsys):
+    (tmp_path / "x.bin").write_bytes((REAL_CAPTURES / "test_one_frame.pcap").read_bytes())
+    assert inspect_file(tmp_path / "x.bin", None, None, "", as_json=False) == 0
+    assert "card  " in capsys.readouterr().out
 
 
 def test_too_small_or_absent(tmp_path):

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polysight.host.capture import PACKETS, Evidence, place_record, write_index, write_packets
+from polysight.host.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
 from polysight.host.capture.earlier_records import Past
 from polysight.host.jobs.placement import inspect_placement, replace_folder
 from polysight.host.store import ManifestWriter, ScanFolder, replace_rows
 from polysight.host.store.append_only import crc32
 from polysight.host.store.validation import validate
+from polysight.shared.errors import DataError
 from polysight.shared.raster import plan_raster
 from tests.support.capture.records import Record, log_of, mask_of
 from tests.support.rigs import rig_with
@@ -109,6 +110,37 @@ def test_a_kill_while_rows_are_replaced_loses_nothing(tmp_path):
         replace_rows(scan)
         holds(scan, data, [(9 * 1456, 10 * 1456)])
     gc.collect()  # files that nobody closed are this test's, not the next one's
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".idx", PACKETS])
+@pytest.mark.parametrize("other", [False, True])
+def test_a_damaged_file_is_told_and_never_placed(tmp_path, suffix, other):
+    """One bit of it is turned, or it is another board's."""
+    scan, _ = scan_with(tmp_path / "scan", lost=9)
+    path = scan.path / f"raw/RH/0000{suffix}"
+    raw = bytearray(path.read_bytes())
+    raw[len(raw) // 2] ^= 1
+    path.write_bytes(raw)
+    if other:
+        (scan.path / "raw/RH").rename(scan.path / "raw/x")
+        (scan.path / "raw/RV").rename(scan.path / "raw/RH")
+        (scan.path / "raw/x").rename(scan.path / "raw/RV")
+    board = "RV" if other else "RH"
+    with pytest.raises(DataError, match=r"not (those|the one) that w(ere|as) committed"):
+        inspect_placement(scan.path / f"raw/{board}/0000.bin", as_json=False)
+    left = {r.board: r.damaged for r in replace_rows(scan)}
+    assert left == {"RH": not other, "RV": other}
+
+
+def test_batches_that_take_packets_back_are_damage(tmp_path):
+    scan, _ = scan_with(tmp_path / "scan", lost=9)
+    path = scan.path / f"raw/RH/0000{PACKETS}"
+    line, _, tail = path.read_bytes().partition(b"\n")
+    batches = np.frombuffer(tail, dtype="<i8", count=4).copy()
+    batches[1] += 1 << 40
+    path.write_bytes(line + b"\n" + batches.tobytes() + tail[32:])
+    with pytest.raises(DataError, match="not a readable packet log"):
+        read_packets(path, np.zeros(10**6, np.uint8))
 
 
 def test_a_row_without_its_packets_is_left(tmp_path):

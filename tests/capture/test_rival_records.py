@@ -1,0 +1,133 @@
+"""More than one record among a row's packets, and cards that begin anew near where they began before."""
+
+from __future__ import annotations
+
+import pytest
+
+from polysight.host.capture.earlier_records import Past
+from tests.support.capture.records import FULL, Record, is_original_or_masked, place
+
+FRAME = 4096
+FULL_ENDS = 91 * FRAME
+SHORT_END = 62 * FRAME
+MOST_REFUSED = 8  # perfect records in a row, after anything that may have happened (docs/spec/placement.md)
+
+
+class Card:
+    """Records one behind the other; `reset` begins its counters anew."""
+
+    def __init__(self, size: int, count: int = 0, sequence: int = 1) -> None:
+        self._size, self._count, self._sequence, self._seed = size, count, sequence, 0
+
+    def reset(self) -> None:
+        self._count, self._sequence = 0, 1
+
+    def record(self, resets: tuple[int, ...] = ()) -> Record:
+        """The next record; the counters begin anew before each of the packets `resets`."""
+        self._seed += 1
+        whole = Record.make(self._size, 0, 1, self._seed)
+        packets = []
+        for k in range(len(whole.packets)):
+            if k in resets:
+                self.reset()
+            payload = whole.data[k * FULL : (k + 1) * FULL]
+            packets.append(self._sequence.to_bytes(4, "little") + self._count.to_bytes(6, "little") + payload)
+            self._sequence, self._count = self._sequence + 1, self._count + len(payload)
+        return Record(whole.data, packets)
+
+
+def rows_until_accepted(card: Card, size: int, past: Past, again: bool = False) -> int:
+    """Perfect rows that are refused before one is accepted; none may be wrong."""
+    for refused in range(MOST_REFUSED + 1):
+        if again:
+            card.reset()
+        record = card.record()
+        placed, out = place(size, record.packets, past, FRAME, batch=64)
+        assert is_original_or_masked(record, placed, out)
+        if placed.complete:
+            return refused
+        past = placed.past
+    return MOST_REFUSED + 1
+
+
+@pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
+@pytest.mark.parametrize("resets", [(0, 1), (0, 2), (0, 3), (-1,), (-2,), (0, -1)])
+def test_a_card_that_begins_anew_soon_after_it_was_switched_on(size, resets):
+    """Its counters are those of records that came whole: they are no leftovers, and no perfect row is lost for ever."""
+    card, many = Card(size), -(-size // FULL)
+    past = place(size, card.record().packets, None, FRAME, batch=64)[0].past
+    disturbed = card.record(tuple(k % many for k in resets))
+    placed, out = place(size, disturbed.packets, past, FRAME, batch=64)
+    assert is_original_or_masked(disturbed, placed, out)
+    assert rows_until_accepted(card, size, placed.past) <= MOST_REFUSED
+
+
+@pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
+def test_a_card_whose_counters_begin_anew_with_every_record(size):
+    card = Card(size)
+    past = place(size, card.record().packets, None, FRAME, batch=64)[0].past
+    accepted = []
+    for _ in range(8):
+        card.reset()
+        record = card.record()
+        placed, out = place(size, record.packets, past, FRAME, batch=64)
+        assert is_original_or_masked(record, placed, out)
+        accepted.append(placed.complete)
+        past = placed.past
+    assert all(accepted[2:])
+
+
+@pytest.mark.parametrize("lost", [(), (0,), (-1,)])
+def test_two_whole_records_in_a_first_row_decide_nothing(lost):
+    card = Card(SHORT_END, 5000, 5)
+    own, other = card.record(), card.record()
+    kept = [p for k, p in enumerate(own.packets) if k not in [i % len(own.packets) for i in lost]]
+    placed, out = place(SHORT_END, [*kept, *other.packets], None, FRAME, batch=64)
+    assert is_original_or_masked(own, placed, out)
+
+
+@pytest.mark.parametrize("came", [0.5, 0.8])
+def test_a_silent_row_that_comes_with_the_next_one_is_not_taken_for_it(came):
+    card = Card(SHORT_END)
+    past = place(SHORT_END, card.record().packets, None, FRAME, batch=64)[0].past
+    late = card.record()
+    past = place(SHORT_END, [], past, FRAME)[0].past
+    own = card.record()
+    kept = [p for k, p in enumerate(own.packets) if k % 10 < 10 * came]
+    placed, out = place(SHORT_END, [*late.packets, *kept], past, FRAME, batch=64)
+    assert is_original_or_masked(own, placed, out)
+
+
+@pytest.mark.parametrize("tail", [4, 60, 175])
+def test_the_end_of_a_record_nobody_saw_is_not_taken_for_a_perfect_row(tail):
+    card = Card(SHORT_END)
+    past = place(SHORT_END, card.record().packets, None, FRAME, batch=64)[0].past
+    unseen, own = card.record(), card.record()
+    placed, out = place(SHORT_END, [*unseen.packets[-tail:], *own.packets], past, FRAME, batch=64)
+    assert is_original_or_masked(own, placed, out)
+
+
+def test_frames_too_many_before_a_small_row_decide_nothing():
+    size = 7 * FRAME
+    more = Record.make((7 + 91) * FRAME, 70_000, 9)
+    placed, out = place(size, more.packets, None, FRAME, batch=64)
+    assert is_original_or_masked(Record(more.data[:size], more.packets), placed, out)
+
+
+def test_one_packet_longer_than_the_row():
+    record = Record.make(1024, 0, 1)
+    placed, _ = place(768, record.packets, None, 256)
+    assert not placed.located
+
+
+def test_a_record_does_not_begin_before_the_card_was_switched_on():
+    """The card began anew within the row and dropped data; frames too many make its end look like the row's."""
+    size, head = 30 * FRAME, 23
+    before = Card(size)
+    past = place(size, before.record().packets, None, FRAME, batch=64)[0].past
+    row = before.record()
+    kept = Record.make(size - head * FULL, 0, 1)
+    anew = [p[:10] + row.data[-(size - head * FULL) :][k * FULL : (k + 1) * FULL] for k, p in enumerate(kept.packets)]
+    shifted = [p[:10] + bytes(reversed(p[10:])) for p in anew]  # whose bytes these are nobody can tell
+    placed, _ = place(size, [*row.packets[:head], *shifted], past, FRAME, batch=64)
+    assert not placed.located

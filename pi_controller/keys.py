@@ -11,7 +11,7 @@ from pathlib import Path
 
 import zmq.utils.z85
 
-from polysight.pi_controller.finding import PROGRAM
+from polysight.pi_controller import PROGRAM
 from polysight.shared.errors import ConfigError
 from polysight.shared.sockets import HOST_KEYS
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from polysight.pi_controller.burst import BurstSpec
+from polysight.pi_controller.lines import BurstSpec
 from polysight.shared.config import Stage
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain

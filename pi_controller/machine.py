@@ -107,7 +107,7 @@ class Machine:
             return False
         possible, action = self._rules[self.state, event]
         before = self.state
-        state = action(*args) or possible[0]
+        state: Any = action(*args) or possible[0]
         if state not in possible:
             raise RuntimeError(f"{event} in state {before} does not lead to {state}")
         if state != "same":

@@ -64,19 +64,8 @@ def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refuse
 class Executor:
     """Runs in a thread of its own; :meth:`post` and :attr:`snapshot` are for all threads.
 
-    Parameters
-    ----------
-    stage, loop, ledger
-        The stage, the trigger loop and the events.
-    check_width
-        Whether a pulse that may have been too long is a fault (no hardware one-shot).
-    turned
-        Called with every turn, once a second at least: feeds the watchdog.
-
-    Attributes
-    ----------
-    take_over_key
-        Owner that every run obeys besides its own: of the person at the Pi.
+    With `check_width` a pulse that may have been too long is a fault (no hardware one-shot). `turned` is called with
+    every turn, once a second at least: it feeds the watchdog.
     """
 
     def __init__(
@@ -88,7 +77,7 @@ class Executor:
         turned: Callable[[], None] = lambda: None,
     ) -> None:
         self._loop, self._ledger, self._check_width, self._turned = loop, ledger, check_width, turned
-        self.take_over_key = secrets.token_hex(16)
+        self.take_over_key = secrets.token_hex(16)  # an owner that every run obeys: of the person at the Pi
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._machine = RowMachine(stage, loop, ledger, self._inbox.put)
@@ -265,12 +254,8 @@ class Executor:
     def _pulse(self, request: Request, command: m.Pulse) -> None:
         """Hand a burst to the trigger loop; its reply follows when it has been sent."""
         if self._run is not None:
-            raise RefusedError(
-                PiFault.NOT_READY,
-                f"run {self._run.scan_id} is begun",
-                "pulses would belong to no point",
-                "wait for the scan's end",
-            )
+            begun = f"run {self._run.scan_id} is begun"
+            raise RefusedError(PiFault.NOT_READY, begun, "pulses would belong to no point", "wait for the scan's end")
         self._machine.require("Pulse")
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
@@ -360,22 +345,10 @@ class Executor:
         machine, row, counts = self._machine, self._machine.row, self._loop.counts
         self.snapshot = Snapshot(
             m.StatusReply(
-                state=machine.told,
-                homed=machine.homed,
-                x_mm=machine.stage.x_mm,
-                y_mm=machine.stage.y_mm,
-                scan_id=self._ledger.scan_id,
-                row_index=row.row.index if row else -1,
-                take=row.take if row else 0,
-                points=counts.bursts if row else 0,
-                pulses=counts.pulses if row else 0,
-                last_seq=self._ledger.last_seq,
-                fault=machine.fault,
-                reason=machine.reason,
-                lost_x_mm=machine.lost_mm[0],
-                lost_y_mm=machine.lost_mm[1],
+                state=machine.told, homed=machine.homed, x_mm=machine.stage.x_mm, y_mm=machine.stage.y_mm,
+                scan_id=self._ledger.scan_id, row_index=row.row.index if row else -1, take=row.take if row else 0,
+                points=counts.bursts if row else 0, pulses=counts.pulses if row else 0, last_seq=self._ledger.last_seq,
+                fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
             ),
-            machine.stage.firmware,
-            self._run is not None,
-            machine.stage.config.placing,
-        )
+            machine.stage.firmware, self._run is not None, machine.stage.config.placing,
+        )  # fmt: skip

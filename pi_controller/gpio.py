@@ -135,21 +135,9 @@ class MonotonicClock:
 class TriggerInput:
     """The trigger input: rising edges with kernel time stamps, on their clock.
 
-    Parameters
-    ----------
-    pi
-        Chip and lines.
-    gpiod
-        The module, or a stand-in with its interface.
-    chip_path
-        Chip device; found by the configured label when not given.
-    clock
-        The clock of the chip's edge time stamps.
+    `gpiod` is the module, or a stand-in; `chip_path` replaces the search for the configured label.
 
-    Raises
-    ------
-    DeviceError
-        when the chip or the line cannot be had.
+    Raises DeviceError when the chip or the line cannot be had.
     """
 
     def __init__(self, pi: Pi, gpiod: Any, chip_path: str | None = None, clock: Clock | None = None) -> None:

@@ -14,17 +14,7 @@ from polysight.shared.raster import RasterPlan
 
 
 class Ledger:
-    """The events of the current scan.
-
-    Parameters
-    ----------
-    folder
-        Where journals are.
-    publish
-        Takes packed events, once they are in the journal.
-    warn
-        Takes sentences for the log.
-    """
+    """The events of the current scan. `publish` takes packed events once they are in the journal, `warn` sentences."""
 
     def __init__(
         self,
@@ -96,11 +86,8 @@ class Ledger:
     def commit(self) -> None:
         """Write the batch to the journal, then publish it.
 
-        Raises
-        ------
-        JournalFullError
-            when it cannot be written. From then on events are published with the last good number and not kept, until
-            the scan is opened again; of this batch, only what ends a row or names a fault is published.
+        Raises JournalFullError when it cannot be written. From then on events are published with the last good number
+        and not kept, until the scan is opened again; of this batch, only what ends a row or names a fault is published.
         """
         batch, to_keep, sync = self._outbox, self._to_keep, self._sync
         self._outbox, self._to_keep, self._sync = [], [], False

@@ -28,12 +28,8 @@ STATUS_EVENT_S = 0.24
 RESTS = 3  # statuses at rest after which the end of a motion counts as lost
 MOVING = ("homing", "running", "held", "stopping")
 NOT_ANY_MORE_HOMED = (
-    StageError.NOT_HOMED,
-    StageError.IN_ALARM,
-    StageError.LIMIT_SWITCH,
-    StageError.EMERGENCY_STOP,
-    StageError.DISABLED,
-)
+    StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
+)  # fmt: skip
 
 
 @dataclass
@@ -65,17 +61,7 @@ class RunningRow:
 
 
 class RowMachine(Machine):
-    """The machine with its actions.
-
-    Parameters
-    ----------
-    stage, loop, ledger
-        The stage, the trigger loop and the events.
-    post
-        Puts a call behind everything that waits in the executor's queue.
-    clock
-        Seconds, monotonic.
-    """
+    """The machine with its actions. `post` puts a call behind everything that waits in the executor's queue."""
 
     def __init__(
         self,
@@ -104,18 +90,10 @@ class RowMachine(Machine):
         if row is None or sent.job != row.job or not r.pulses:
             return
         self.emit(
-            m.Capture,
-            row_index=row.row.index,
-            take=row.take,
-            point=sent.point,
-            column=row.row.column(sent.point),
-            edge_ns=sent.edge_ns,
-            first_pulse_ns=r.first_ns,
-            last_pulse_ns=r.last_ns,
-            pulses=r.pulses,
-            width_max_ns=r.width_max_ns,
-            jitter_ns=r.jitter_ns,
-        )
+            m.Capture, row_index=row.row.index, take=row.take, point=sent.point, column=row.row.column(sent.point),
+            edge_ns=sent.edge_ns, first_pulse_ns=r.first_ns, last_pulse_ns=r.last_ns, pulses=r.pulses,
+            width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns,
+        )  # fmt: skip
         row.bursts += 1
         if row.bursts >= row.row.points:
             self.happen("all sent")
@@ -174,13 +152,9 @@ class RowMachine(Machine):
             return
         self._status_told_s = now
         self.emit(
-            m.StageStatus,
-            state=reply.fields.get("state", ""),
-            x_mm=self.stage.x_mm,
-            y_mm=self.stage.y_mm,
-            points=max(0, _number(reply, "points")),
-            alarm=_number(reply, "alarm"),
-        )
+            m.StageStatus, state=reply.fields.get("state", ""), x_mm=self.stage.x_mm, y_mm=self.stage.y_mm,
+            points=max(0, _number(reply, "points")), alarm=_number(reply, "alarm"),
+        )  # fmt: skip
 
     # --- actions: homing and rows -----------------------------------------------------------------------------------
 
@@ -341,16 +315,9 @@ class RowMachine(Machine):
             if row.fault:
                 self._tell_fault(row.fault, row.reason)
         self.emit(
-            m.RowFinished,
-            row_index=row.row.index,
-            take=row.take,
-            status=row.status,
-            points=row.points,
-            **counts._asdict(),
-            fault=row.fault,
-            reason=row.reason,
-            timed_by=self._loop.timed_by(row.job.spec),
-        )
+            m.RowFinished, row_index=row.row.index, take=row.take, status=row.status, points=row.points,
+            **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by(row.job.spec),
+        )  # fmt: skip
         self.row = None
         return "fault" if row.lasting else "ready" if self.homed else "idle"
 

@@ -78,12 +78,10 @@ class StatusWatch:
 
 
 class StageLink:
-    """One open serial link.
+    """One open serial link to `port`. Every method raises StageLostError when the stage does not answer.
 
     Parameters
     ----------
-    port, baud
-        Serial device.
     news
         Takes, from the reader thread, every reply that answers no line, every `ok` (it divides what came before a
         command from what came after), and one :class:`StageLost` when the link dies. Must return at once.
@@ -93,11 +91,6 @@ class StageLink:
         How often the reader looks whether a status byte is due.
     banner_limit_s
         How long to wait for the banner of a stage that the opening reset; without one it is greeted all the same.
-
-    Raises
-    ------
-    StageLostError
-        from every method, when the port cannot be opened, or the stage does not answer.
     """
 
     def __init__(

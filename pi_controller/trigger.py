@@ -31,31 +31,15 @@ SILENT_POINTS = 2  # ... in which it passed so many points: the wire is off
 
 
 class BurstRecord(NamedTuple):
-    """What was sent.
-
-    Attributes
-    ----------
-    pulses
-        Pulses sent.
-    first_ns, last_ns
-        Rising edge of the first and the last pulse: the time read just before the line was set.
-    end_ns
-        When the last pulse was over.
-    width_max_ns
-        Upper bound of the longest pulse: from before the line was set until after it was cleared.
-    jitter_ns
-        Largest lateness of a rising edge against its deadline.
-    fault
-        Number of what went wrong, 0 when nothing did.
-    """
+    """What was sent."""
 
     pulses: int
-    first_ns: int
+    first_ns: int  # rising edge of the first pulse: the time read just before the line was set
     last_ns: int
-    end_ns: int
-    width_max_ns: int = 0
-    jitter_ns: int = 0
-    fault: int = 0
+    end_ns: int  # when the last pulse was over
+    width_max_ns: int = 0  # upper bound: from before the line was set until after it was cleared
+    jitter_ns: int = 0  # largest lateness of a rising edge against its deadline
+    fault: int = 0  # number of what went wrong
 
 
 def send_burst(
@@ -70,22 +54,9 @@ def send_burst(
     When `start_ns` has passed already, all deadlines move with the first pulse: the period matters, not the phase. They
     are computed from the first, so that lateness of one pulse never shifts the next.
 
-    Parameters
-    ----------
-    lines, spec
-        The lines and their clock; how many pulses, how far apart, how wide.
-    start_ns
-        Deadline of the first pulse.
-    previous_rise_ns
-        Last rising edge before this burst, if any.
-    stop
-        Asked before each pulse, or transfer; true ends the burst early.
-
-    Returns
-    -------
-    BurstRecord
-        `fault`: PERIOD_TOO_SHORT when a pulse was left out that would have come too early for the radar, or
-        PULSE_TOO_LONG when one may have been longer than 4 us.
+    `previous_rise_ns` is the last rising edge before this burst; `stop` is asked before each pulse, or transfer, and
+    ends the burst early. The record's fault is PERIOD_TOO_SHORT when a pulse was left out that would have come too
+    early for the radar, PULSE_TOO_LONG when one may have been longer than 4 us.
     """
     if isinstance(lines, BitLines):
         return _send_bits(lines, spec, start_ns, previous_rise_ns, stop)

@@ -25,22 +25,13 @@ RP1_CHIP = "pinctrl-rp1"
 ONE_LINE = 'use wiring = "spi", or "fanout", with a clock buffer behind one line (docs/how-to/wiring.md)'
 
 
-def lines_of(instrument: Instrument, simulated: bool) -> type[GpiodLines | SpiLines | WireLines]:
-    """Which lines drive SYNC_IN of this rig."""
-    if simulated:
-        return SpiWireLines if instrument.pi.wiring == "spi" else WireLines
-    return SpiLines if instrument.pi.wiring == "spi" else GpiodLines
-
-
 def open_lines(
     instrument: Instrument, wires: Path | None, warn: Callable[[str], None], model: str | None = None
 ) -> TriggerLines:
     """The rig's lines on GPIO, or on simulated wires. `warn` takes what this wiring costs on this computer.
 
-    Raises
-    ------
-    ConfigError, DeviceError
-        when they cannot be had, or this wiring cannot work on this computer (`model`: what it calls itself).
+    Raises ConfigError or DeviceError when they cannot be had, or this wiring cannot work on this computer (`model`:
+    what it calls itself).
     """
     if wires is not None:
         return (SpiWireLines if instrument.pi.wiring == "spi" else WireLines)(wires, instrument.pi)
@@ -72,13 +63,7 @@ def skew_in_if_hz(lines: int, apart_ns: float, slope_hz_per_s: float) -> float:
 
 
 def check_wiring(instrument: Instrument, model: str) -> str:
-    """Compare the wiring with the computer (`model`: from :func:`read_model`). Returns a warning, or nothing.
-
-    Raises
-    ------
-    ConfigError
-        when this wiring cannot work on this computer.
-    """
+    """Compare the wiring with the computer. Returns a warning, or nothing. Raises ConfigError for what cannot work."""
     pi, chirp = instrument.pi, instrument.chirp
     name = model or "this computer"
     if pi.wiring == "gpiomem":

@@ -10,16 +10,17 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from polysight.pi_controller.finding import AS_THE_SERVICE
+from polysight.pi_controller import AS_THE_SERVICE
 from polysight.shared import __version__
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.faults import explain
 from polysight.shared.raster import WIDTH_TEXT
 
-Command = Callable[[argparse.Namespace], int]
-AddCommand = Callable[[str, Command, str, str], argparse.ArgumentParser]  # name, action, help, example
+# Commands import what they need when they are called: `--help` needs nothing.
+Command = Callable[[argparse.Namespace, Instrument], int]
 
 
 def _write(text: str) -> None:
@@ -27,51 +28,44 @@ def _write(text: str) -> None:
     sys.stdout.flush()
 
 
-def _port(args: argparse.Namespace, instrument: Instrument) -> str:
-    return args.stage_port or instrument.stage.port
-
-
-def _run(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.service import Options, run
 
-    options = Options(args.wires, args.stage_port, args.journal, args.command_address, args.event_address)
-    return run(load_instrument(args.config), options)
+    return run(instrument, Options(args.wires, args.stage_port, args.journal, args.command_address, args.event_address))
 
 
-def _check(args: argparse.Namespace) -> int:
+def _check(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.checks import check_all
     from polysight.pi_controller.client import refuse_beside_service
 
-    instrument = load_instrument(args.config)
-    journal = args.journal or Path(instrument.pi.journal_dir)
     refuse_beside_service(instrument)
-    failed, findings = 0, []
-    for f in check_all(instrument, args.wires, _port(args, instrument), journal):
-        failed += f.verdict == "fail"
-        findings.append(f._asdict())
+    port, journal = args.stage_port or instrument.stage.port, args.journal or Path(instrument.pi.journal_dir)
+    findings = []
+    for f in check_all(instrument, args.wires, port, journal):
+        findings.append(f)
         if not args.json:
             _write(f"{f.verdict:5} {f.name}: {f.found}" + (f"\n        do: {f.remedy}" if f.remedy else ""))
     if args.json:
-        _write(json.dumps(findings))
-    return 1 if failed else 0
+        _write(json.dumps([f._asdict() for f in findings]))
+    return int(any(f.verdict == "fail" for f in findings))
 
 
-def _pulse(args: argparse.Namespace) -> int:
+def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller import realtime
-    from polysight.pi_controller.bringup import pulse
-    from polysight.pi_controller.burst import BurstSpec
     from polysight.pi_controller.client import refuse_beside_service
-    from polysight.pi_controller.service import open_lines
+    from polysight.pi_controller.lines import BurstSpec
+    from polysight.pi_controller.service import log
+    from polysight.pi_controller.trigger import send_bursts
+    from polysight.pi_controller.wiring import open_lines
 
-    instrument = load_instrument(args.config)
     refuse_beside_service(instrument)
-    lines = open_lines(instrument, args.wires)
+    lines = open_lines(instrument, args.wires, log)
     try:
         if args.wires is None:
             for sentence in dict.fromkeys(realtime.prepare_process() + realtime.prepare_thread()):  # each once
-                sys.stderr.write(f"polysight-pi: {sentence}\n")
+                log(sentence)
         spec = BurstSpec.of(instrument.burst, check_width=False)
-        records = pulse(lines, spec, args.count, round(args.pause_ms * 1e6))
+        records = send_bursts(lines, spec, args.count, round(args.pause_ms * 1e6))
     finally:
         lines.close()
     width, jitter = max(r.width_max_ns for r in records), max(r.jitter_ns for r in records)
@@ -89,45 +83,39 @@ def _pulse(args: argparse.Namespace) -> int:
     return 1 if faults else 0
 
 
-def _jog(args: argparse.Namespace) -> int:
-    from polysight.pi_controller.bringup import bench_stage
+def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import refuse_beside_service
+    from polysight.pi_controller.stage import bench_stage
 
-    instrument = load_instrument(args.config)
     refuse_beside_service(instrument)
-    with bench_stage(instrument.stage, _port(args, instrument)) as stage:
+    with bench_stage(instrument.stage, args.stage_port or instrument.stage.port) as stage:
         speed_mm_s = instrument.stage.travel_speed_mm_s if args.speed is None else args.speed
-        here = stage.jog(args.dx, args.dy, speed_mm_s)
-    _tell_position(args, here.x_mm, here.y_mm)
-    return 0
+        return _tell_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
 
 
-def _home(args: argparse.Namespace) -> int:
-    from polysight.pi_controller.bringup import bench_stage
+def _home(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import home_by_service
+    from polysight.pi_controller.stage import bench_stage
 
-    instrument = load_instrument(args.config)
     status = home_by_service(instrument)
-    if status is not None:
-        _tell_position(args, status.x_mm, status.y_mm)
-        if status.lost_x_mm or status.lost_y_mm:
-            lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
-            sys.stderr.write(f"polysight-pi: steps were lost since the homing before: {lost}; look at the drive\n")
-        return 0
-    with bench_stage(instrument.stage, _port(args, instrument)) as stage:
-        here = stage.home()
-    _tell_position(args, here.x_mm, here.y_mm)
+    if status is None:
+        with bench_stage(instrument.stage, args.stage_port or instrument.stage.port) as stage:
+            return _tell_position(args, stage.home())
+    if status.lost_x_mm or status.lost_y_mm:
+        lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
+        sys.stderr.write(f"polysight-pi: steps were lost since the homing before: {lost}; look at the drive\n")
+    return _tell_position(args, status)
+
+
+def _tell_position(args: argparse.Namespace, at: Any) -> int:
+    where = {"x_mm": at.x_mm, "y_mm": at.y_mm}
+    _write(json.dumps(where) if args.json else f"stage at x {at.x_mm:.3f} mm, y {at.y_mm:.3f} mm")
     return 0
 
 
-def _tell_position(args: argparse.Namespace, x_mm: float, y_mm: float) -> None:
-    _write(json.dumps({"x_mm": x_mm, "y_mm": y_mm}) if args.json else f"stage at x {x_mm:.3f} mm, y {y_mm:.3f} mm")
-
-
-def _events(args: argparse.Namespace) -> int:
+def _events(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import follow_events, replay_events
 
-    instrument = load_instrument(args.config)
     if args.scan_id:
         events = replay_events(instrument, args.scan_id, args.from_seq)
     else:
@@ -159,124 +147,11 @@ def _keys(args: argparse.Namespace) -> int:
     return 0
 
 
-def _take_over(args: argparse.Namespace) -> int:
+def _take_over(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import take_over
 
-    instrument = load_instrument(args.config)
     _write(f"the state is {take_over(instrument, args.what, args.journal or Path(instrument.pi.journal_dir))}")
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="polysight-pi",
-        description="The Raspberry Pi half of the instrument: drives the stage, answers its triggers with SYNC_IN "
-        "pulses, and tells the host.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="examples:\n  polysight-pi check\n  polysight-pi run --config instrument.toml",
-    )
-    parser.add_argument("--version", action="version", version=f"polysight-pi {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    def add(name: str, action: Command, text: str, example: str) -> argparse.ArgumentParser:
-        p = commands.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            epilog=f"example:  polysight-pi {name} {example}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        p.set_defaults(action=action)
-        p.add_argument(
-            "--config", type=Path, default=Path("instrument.toml"), metavar="FILE", help="rig file (%(default)s)"
-        )
-        return p
-
-    _add_service(add)
-    _add_bench(add)
-    _add_events(add)
-    _add_keys(add)
-    _add_take_over(add)
-    return parser
-
-
-def _stage_port(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--stage-port", metavar="TTY", help="serial port of the stage, instead of stage.port")
-
-
-def _wires(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
-
-
-def _journal(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--journal", type=Path, metavar="DIR", help="folder of the journals, instead of pi.journal_dir")
-
-
-def _json(p: argparse.ArgumentParser) -> None:
-    p.add_argument("--json", action="store_true", help="print JSON, for programs")
-
-
-def _add_service(add: AddCommand) -> None:
-    """`run`, and `check` before it."""
-    p = add("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml")
-    _wires(p)
-    _stage_port(p)
-    _journal(p)
-    p.add_argument("--command-address", metavar="tcp://HOST:PORT", help="instead of pi.command_address")
-    p.add_argument("--event-address", metavar="tcp://HOST:PORT", help="instead of pi.event_address")
-
-    p = add(
-        "check", _check, "check every line, port, permission, key and disk; nothing moves", "--config instrument.toml"
-    )
-    _wires(p)
-    _stage_port(p)
-    _journal(p)
-    _json(p)
-
-
-def _add_bench(add: AddCommand) -> None:
-    """What drives lines and stage by hand: `pulse`, `jog`, `home`."""
-    p = add("pulse", _pulse, "send bursts on SYNC_IN and tell their width and jitter", "--count 100")
-    _wires(p)
-    p.add_argument("--count", type=_positive, default=10, metavar="N", help="how many bursts (%(default)s)")
-    p.add_argument("--pause-ms", type=float, default=10.0, metavar="MS", help="pause between bursts (%(default)s)")
-    _json(p)
-
-    p = add("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5")
-    _stage_port(p)
-    p.add_argument("--dx", type=float, default=0.0, metavar="MM", help="along x, millimetres (0)")
-    p.add_argument("--dy", type=float, default=0.0, metavar="MM", help="along y, millimetres (0)")
-    p.add_argument("--speed", type=_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)")
-    _json(p)
-
-    p = add("home", _home, "home the stage, through the running service if there is one", "--config instrument.toml")
-    _stage_port(p)
-    _json(p)
-
-
-def _add_events(add: AddCommand) -> None:
-    p = add("events", _events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1")
-    p.add_argument("--scan-id", metavar="ID", help="replay this scan from the journal instead of following live events")
-    p.add_argument("--from-seq", type=_positive, default=1, metavar="N", help="first event of a replay (%(default)s)")
-    p.add_argument("--count", type=_positive, metavar="N", help="stop after so many")
-    p.add_argument(
-        "--limit-s", type=float, default=10.0, metavar="S", help="give up after so long without an event (%(default)s)"
-    )
-
-
-def _add_keys(add: AddCommand) -> None:
-    p = add("keys", _keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys")
-    p.add_argument("--dir", type=Path, metavar="DIR", help="folder, instead of pi.key_dir")
-    p.add_argument("--replace", action="store_true", help="replace keys that are there already")
-    p.add_argument("--client", metavar="NAME", help="make keys for one more client, and allow it")
-    p.add_argument("--revoke", metavar="NAME", help="allow this client no more, at once")
-    p.add_argument("--list", action="store_true", help="list the clients that are allowed")
-
-
-def _add_take_over(add: AddCommand) -> None:
-    p = add("take-over", _take_over, "command a run that another program began, as a person at the Pi", "abort")
-    p.add_argument("what", choices=("hold", "resume", "abort", "end"), help="what to do with it")
-    _journal(p)
 
 
 def _positive(text: str) -> int:
@@ -293,11 +168,90 @@ def _speed(text: str) -> float:
     return value
 
 
+def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
+    return names, how
+
+
+WIRES = _option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
+STAGE_PORT = _option("--stage-port", metavar="TTY", help="serial port of the stage, instead of stage.port")
+JOURNAL = _option("--journal", type=Path, metavar="DIR", help="folder of the journals, instead of pi.journal_dir")
+JSON = _option("--json", action="store_true", help="print JSON, for programs")
+COUNT = {"type": _positive, "metavar": "N"}
+MM = {"type": float, "default": 0.0, "metavar": "MM"}
+# name, action, help, example, options
+COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
+    ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
+        WIRES, STAGE_PORT, JOURNAL,
+        _option("--command-address", metavar="tcp://HOST:PORT", help="instead of pi.command_address"),
+        _option("--event-address", metavar="tcp://HOST:PORT", help="instead of pi.event_address"),
+    )),
+    ("check", _check, "check every line, port, permission, key and disk; nothing moves", "--config instrument.toml", (
+        WIRES, STAGE_PORT, JOURNAL, JSON,
+    )),
+    ("pulse", _pulse, "send bursts on SYNC_IN and tell their width and jitter", "--count 100", (
+        WIRES, JSON, _option("--count", **COUNT, default=10, help="how many bursts (%(default)s)"),
+        _option("--pause-ms", type=float, default=10.0, metavar="MS", help="pause between bursts (%(default)s)"),
+    )),
+    ("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5", (
+        STAGE_PORT, JSON, _option("--dx", **MM, help="along x, millimetres (0)"),
+        _option("--dy", **MM, help="along y, millimetres (0)"),
+        _option("--speed", type=_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)"),
+    )),
+    ("home", _home, "home the stage, through the running service if there is one", "--config instrument.toml", (
+        STAGE_PORT, JSON,
+    )),
+    ("events", _events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1", (
+        _option("--scan-id", metavar="ID", help="replay this scan from the journal instead of following live events"),
+        _option("--from-seq", **COUNT, default=1, help="first event of a replay (%(default)s)"),
+        _option("--count", **COUNT, help="stop after so many"),
+        _option("--limit-s", type=float, default=10.0, metavar="S",
+                help="give up after so long without an event (%(default)s)"),
+    )),
+    ("keys", _keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys", (
+        _option("--dir", type=Path, metavar="DIR", help="folder, instead of pi.key_dir"),
+        _option("--replace", action="store_true", help="replace keys that are there already"),
+        _option("--client", metavar="NAME", help="make keys for one more client, and allow it"),
+        _option("--revoke", metavar="NAME", help="allow this client no more, at once"),
+        _option("--list", action="store_true", help="list the clients that are allowed"),
+    )),
+    ("take-over", _take_over, "command a run that another program began, as a person at the Pi", "abort", (
+        _option("what", choices=("hold", "resume", "abort", "end"), help="what to do with it"), JOURNAL,
+    )),
+)  # fmt: skip
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="polysight-pi",
+        description="The Raspberry Pi half of the instrument: drives the stage, answers its triggers with SYNC_IN "
+        "pulses, and tells the host.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="examples:\n  polysight-pi check\n  polysight-pi run --config instrument.toml",
+    )
+    parser.add_argument("--version", action="version", version=f"polysight-pi {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, action, text, example, options in COMMANDS:
+        p = commands.add_parser(
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            epilog=f"example:  polysight-pi {name} {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        p.set_defaults(action=action)
+        p.add_argument(
+            "--config", type=Path, default=Path("instrument.toml"), metavar="FILE", help="rig file (%(default)s)"
+        )
+        for names, how in options:
+            p.add_argument(*names, **how)
+    return parser
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point. Exit status 0 only when it worked; an error is one message on stderr, without a trace."""
     args = _parser().parse_args(argv)
     try:
-        return args.action(args)
+        return args.action(args) if args.action is _keys else args.action(args, load_instrument(args.config))
     except PolysightError as e:
         sys.stderr.write(f"error: {e}\n")
         return e.exit_status

@@ -1,7 +1,7 @@
 """The row executor: one thread that takes commands, stage news and bursts from one queue, in order.
 
-It answers the host's commands and keeps the run; what stage and row do is machine.py. docs/spec/wire.md says what each
-command does in each state.
+It answers the host's commands and keeps the run; what stage and row do is in machine.py and row_machine.py.
+docs/spec/wire.md says what each command does.
 """
 
 from __future__ import annotations
@@ -14,17 +14,14 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from polysight.pi_controller.burst import BurstSpec
 from polysight.pi_controller.journal import JournalFullError
 from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.machine import Machine
-from polysight.pi_controller.row_ending import Parts
+from polysight.pi_controller.lines import BurstSpec
+from polysight.pi_controller.row_machine import RowMachine
 from polysight.pi_controller.rows import RefusedError, check_pulses, check_run, row_of
-from polysight.pi_controller.running_row import RunningRow
-from polysight.pi_controller.stage_driver import StageDriver
+from polysight.pi_controller.stage import StageDriver
 from polysight.pi_controller.stage_link import StageLost, StageNews
-from polysight.pi_controller.states import MOVING
-from polysight.pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
+from polysight.pi_controller.trigger import BenchBurst, BurstSent, LoopFault, TriggerLoop
 from polysight.shared import messages as m
 from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.faults import PiFault, explain
@@ -59,26 +56,16 @@ class Snapshot(NamedTuple):
 def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
     """A refusal in words of bounded length; what is not said is the table's."""
     table = explain(number)
-    words = (what, why or table.why, remedy or table.remedy)
-    return m.Refused(number=int(number), **dict(zip(("what", "why", "remedy"), (w[:1000] for w in words), strict=True)))
+    return m.Refused(
+        number=int(number), what=what[:1000], why=(why or table.why)[:1000], remedy=(remedy or table.remedy)[:1000]
+    )
 
 
 class Executor:
     """Runs in a thread of its own; :meth:`post` and :attr:`snapshot` are for all threads.
 
-    Parameters
-    ----------
-    stage, loop, ledger
-        The stage, the trigger loop and the events.
-    check_width
-        Whether a pulse that may have been too long is a fault (no hardware one-shot).
-    turned
-        Called with every turn, once a second at least: feeds the watchdog.
-
-    Attributes
-    ----------
-    take_over_key
-        Owner that every run obeys besides its own: of the person at the Pi.
+    With `check_width` a pulse that may have been too long is a fault (no hardware one-shot). `turned` is called with
+    every turn, once a second at least: it feeds the watchdog.
     """
 
     def __init__(
@@ -90,23 +77,32 @@ class Executor:
         turned: Callable[[], None] = lambda: None,
     ) -> None:
         self._loop, self._ledger, self._check_width, self._turned = loop, ledger, check_width, turned
-        self.take_over_key = secrets.token_hex(16)
+        self.take_over_key = secrets.token_hex(16)  # an owner that every run obeys: of the person at the Pi
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._machine = Machine(Parts(stage, loop, ledger, self._inbox.put, self._row_ended))
+        self._machine = RowMachine(stage, loop, ledger, self._inbox.put)
         self._run: m.BeginRun | None = None
         self._last_row: tuple[int, int] | None = None
-        self._after_row: Callable[[], None] | None = None
+        self._after_row: Request | None = None
         self._replies: list[tuple[Request, m.AnyReply]] = []
         self._pulsing: list[Request] = []
         self._ending = self._ended = False
         self.crash: BaseException | None = None
+        self._commands: dict[type, Callable[[Any], m.AnyReply | None]] = {
+            m.Home: lambda _: self._accept("Home"),
+            m.RunRow: self._run_row,
+            m.Hold: lambda _: self._accept("Hold"),
+            m.Resume: lambda _: self._accept("Resume"),
+            m.Abort: lambda c: self._accept("Abort", c.reason or "asked for by the host"),
+            m.BeginRun: self._begin,
+            m.EndRun: self._end_run,
+        }
         self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
         self._refresh()
 
     # --- for other threads ------------------------------------------------------------------------------------------
 
-    def post(self, item: Request | StageNews | BurstSent | BenchBurst | LoopFault | Callable[[], None]) -> None:
+    def post(self, item: Request | StageNews | BurstSent | BenchBurst | LoopFault | Callable[[], object]) -> None:
         """Hand something over; returns at once."""
         self._inbox.put(item)
 
@@ -163,7 +159,7 @@ class Executor:
         try:
             self._ledger.commit()
         except JournalFullError as e:
-            self._machine.fail(PiFault.JOURNAL_FULL, str(e), wait=True)
+            self._machine.happen("lasting fault", PiFault.JOURNAL_FULL, str(e))
             self._ledger.commit()
         self._refresh()
         replies, self._replies = self._replies, []
@@ -176,32 +172,35 @@ class Executor:
     def _hear(self, command: m.AnyCommand) -> None:
         """A command of this run's host is being answered: until its reply is out, no `Alive` can come."""
         run = self._run
-        mine = run is not None and (run.scan_id, run.owner)
-        if isinstance(command, OF_THE_RUN) and (command.scan_id, command.owner) == mine:
+        if run and isinstance(command, OF_THE_RUN) and (command.scan_id, command.owner) == (run.scan_id, run.owner):
             self._machine.hear_host()
 
     def _take(self, item: Any) -> None:
+        machine, row = self._machine, self._machine.row
         if isinstance(item, BurstSent):
-            self._machine.take_burst(item)
+            machine.take_burst(item)
         elif isinstance(item, BenchBurst):
-            self._replies += [(request, item.told()) for request in self._pulsing]
-            self._pulsing.clear()
+            self._answer_pulses(item.told())
         elif isinstance(item, LoopFault):
-            self._machine.take_loop_fault(item)
-            reply = refused(item.number, item.detail)
-            self._replies += [(request, reply) for request in self._pulsing]  # every request gets a reply
-            self._pulsing.clear()
+            machine.take_loop_fault(item)
+            self._answer_pulses(refused(item.number, item.detail))  # every request gets a reply
         elif isinstance(item, Request):
             reply = self._reply_to(item)
             self._hear(item.command)  # before the limits are looked at: it may have taken long
             if reply is not None:
                 self._replies.append((item, reply))
         elif isinstance(item, Reply):
-            self._machine.take_stage(item)
+            machine.take_stage(item)
         elif isinstance(item, StageLost):
-            self._machine.fail(PiFault.STAGE_LOST, item.reason)
+            machine.happen("stage lost", PiFault.STAGE_LOST, item.reason)
         else:
             item()
+        if row is not None and machine.row is not row:
+            self._row_ended((row.row.index, row.take))
+
+    def _answer_pulses(self, reply: m.AnyReply) -> None:
+        self._replies += [(request, reply) for request in self._pulsing]
+        self._pulsing.clear()
 
     # --- commands ---------------------------------------------------------------------------------------------------
 
@@ -220,36 +219,18 @@ class Executor:
             return refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
 
     def _on_command(self, request: Request) -> m.AnyReply | None:
-        command = request.command
+        command, run = request.command, self._run
         if isinstance(command, m.Replay):
             return self._replay(command)
         if self._ending:
             raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
-        if isinstance(command, OWNED):
-            self._check_owner(command.owner)
-        if isinstance(command, m.BeginRun):
-            return self._begin(request, command)
-        if isinstance(command, m.EndRun):
-            return self._end_run(command)
+        if run and isinstance(command, OWNED) and command.owner not in (run.owner, self.take_over_key):
+            raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
         if isinstance(command, m.Pulse):
             return self._pulse(request, command)
-        if isinstance(command, m.Home):
-            self._machine.home()
-            return self._accept()
-        if isinstance(command, m.RunRow):
-            return self._run_row(command)
-        if isinstance(command, m.Hold | m.Resume):
-            self._machine.hold(isinstance(command, m.Hold))
-            return self._accept()
-        if isinstance(command, m.Abort):
-            self._machine.abort(command.reason or "asked for by the host")
-            return self._accept()
-        raise RefusedError(PiFault.BAD_REQUEST, f"{type(command).__name__} is not answered here")
-
-    def _check_owner(self, owner: str) -> None:
-        """Refuse who neither began the run nor stands at the Pi. Raises RefusedError."""
-        if self._run is not None and owner not in (self._run.owner, self.take_over_key):
-            raise RefusedError(PiFault.NOT_OWNER, f"run {self._run.scan_id} is another program's")
+        if isinstance(command, m.BeginRun) and self._begins_later(request, command):
+            return None
+        return self._commands[type(command)](command)
 
     def _replay(self, command: m.Replay) -> m.ReplayReply:
         limit = command.limit
@@ -264,15 +245,18 @@ class Executor:
             limit = min(limit, REPLAYED_IN_A_ROW)
         return self._ledger.replay(command.scan_id, command.from_seq, limit)
 
-    def _accept(self) -> m.Accepted:
-        return m.Accepted(state=self._machine.state)
+    def _accept(self, event: str = "", *args: Any) -> m.Accepted:
+        """Carry out a command of the state machine. Raises RefusedError."""
+        if event:
+            self._machine.command(event, *args)
+        return m.Accepted(state=self._machine.told)
 
     def _pulse(self, request: Request, command: m.Pulse) -> None:
         """Hand a burst to the trigger loop; its reply follows when it has been sent."""
-        state = self._machine.state
-        if self._run is not None or state in MOVING or state == "done":
-            why = f"run {self._run.scan_id} is begun" if self._run else f"the state is {state}"
-            raise RefusedError(PiFault.NOT_READY, why, "pulses would belong to no point", "wait for the scan's end")
+        if self._run is not None:
+            begun = f"run {self._run.scan_id} is begun"
+            raise RefusedError(PiFault.NOT_READY, begun, "pulses would belong to no point", "wait for the scan's end")
+        self._machine.require("Pulse")
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
         spec = check_pulses(command.pulses, command.period_us, command.width_us, self._check_width)
@@ -282,49 +266,43 @@ class Executor:
         self._pulsing.append(request)
         self._loop.send(spec)
 
-    def _begin(self, request: Request, run: m.BeginRun) -> m.AnyReply | None:
+    def _begins_later(self, request: Request, run: m.BeginRun) -> bool:
+        """Check a run. If a row runs, it is ended first, and the request is taken again then. Raises RefusedError."""
         check_run(run, self._machine.stage.config)
-        other = self._run is not None and (run.scan_id, run.owner) != (self._run.scan_id, self._run.owner)
-        if self._run is not None and other and self._machine.host_lives:
+        begun = self._run
+        other = begun is not None and (run.scan_id, run.owner) != (begun.scan_id, begun.owner)
+        if begun is not None and other and self._machine.host_lives:
             raise RefusedError(
                 PiFault.NOT_READY,
-                f"run {self._run.scan_id} is begun, and its host lives",
+                f"run {begun.scan_id} is begun, and its host lives",
                 "another program, perhaps on another machine, scans with this Pi",
                 "wait for that scan's end, or stop it there",
             )
-        if self._machine.row is None:
-            return self._begin_now(run)
+        if self._machine.row is not None:
+            # The host that asked for the running row is gone; what it would have recorded is not committed.
+            self._after_row = request
+            self._machine.happen("Abort", f"run {run.scan_id} was begun anew")
+        return self._machine.row is not None
 
-        def begin_later() -> None:
-            self._take(request)
-
-        # The host that asked for the running row is gone; what it would have recorded is not committed.
-        self._after_row = begin_later
-        self._machine.end_row("aborted", PiFault.ABORTED, f"run {run.scan_id} was begun anew", wait=True)
-        return None
-
-    def _begin_now(self, run: m.BeginRun) -> m.Accepted:
+    def _begin(self, run: m.BeginRun) -> m.Accepted:
         try:
             resumed, lost = self._ledger.open(run.scan_id, run.plan, run.last_seq)
         except JournalFullError as e:
             raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
         self._run, self._last_row = None, None  # whichever was begun: the ledger is this scan's now
-        self._machine.end_run()
+        self._machine.happen("EndRun")
         self._keep(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
         self._run = run
-        self._machine.begin_run(run.heartbeat_ms)
-        return self._accept()
+        return self._accept("BeginRun", run.heartbeat_ms)
 
     def _end_run(self, command: m.EndRun) -> m.Accepted:
         if self._run is None and command.scan_id == self._ledger.scan_id:
             return self._accept()  # a repeated request
         self._need_run(command.scan_id)
-        if self._machine.row is not None:
-            raise RefusedError(PiFault.NOT_READY, "a row is running", "", "abort it, or wait for its end")
+        self._machine.require("EndRun")
         self._keep(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
         self._run = None
-        self._machine.end_run()
-        return self._accept()
+        return self._accept("EndRun")
 
     def _keep(self, kind: type[m.RunStarted | m.RunStopped], **fields: Any) -> None:
         """Emit an event whose command is accepted only when it is on the disk. Raises RefusedError."""
@@ -333,7 +311,7 @@ class Executor:
         try:
             self._ledger.commit()
         except JournalFullError as e:
-            self._machine.fail(PiFault.JOURNAL_FULL, str(e), wait=True)
+            self._machine.happen("lasting fault", PiFault.JOURNAL_FULL, str(e))
             raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
 
     def _need_run(self, scan_id: str) -> m.BeginRun:
@@ -343,56 +321,34 @@ class Executor:
         return self._run
 
     def _run_row(self, command: m.RunRow) -> m.Accepted:
-        run, machine = self._need_run(command.scan_id), self._machine
+        run, current = self._need_run(command.scan_id), self._machine.row
         wanted = (command.row_index, command.take)
-        current = machine.row and (machine.row.row.index, machine.row.take)
-        if wanted in (current, self._last_row):
+        if wanted in (current and (current.row.index, current.take), self._last_row):
             return self._accept()  # a repeated request: the row runs, or has run
-        if machine.state != "ready":
-            raise RefusedError(
-                PiFault.NOT_READY,
-                f"the state is {machine.state}" + (f": {machine.reason}" if machine.reason else ""),
-                remedy="wait for the row's end" if current else "home the stage",
-            )
+        self._machine.require("RunRow")
         row = row_of(run.plan, command.row_index)
         spec = BurstSpec(run.pulses, us_to_ns(run.period_us), us_to_ns(run.width_us), self._check_width)
-        machine.start_row(row, command.take, spec, run.speed_mm_s)
-        return self._accept()
+        return self._accept("RunRow", row, command.take, spec, run.speed_mm_s)
 
-    def _row_ended(self, row: RunningRow) -> None:
-        self._last_row = (row.row.index, row.take)
-        then, self._after_row = self._after_row, None
-        if then is not None:
-            then()
+    def _row_ended(self, row: tuple[int, int]) -> None:
+        self._last_row = row
+        begins, self._after_row = self._after_row, None
+        if begins is not None:
+            self._take(begins)
         self._ended = self._ending
 
     def _end(self) -> None:
         self._ending = True
-        self._ended = not self._machine.end()
-
-    # --- small things -----------------------------------------------------------------------------------------------
+        self._ended = not self._machine.terminate()
 
     def _refresh(self) -> None:
-        machine = self._machine
-        row, counts = machine.row, self._loop.counts
+        machine, row, counts = self._machine, self._machine.row, self._loop.counts
         self.snapshot = Snapshot(
             m.StatusReply(
-                state=machine.state,
-                homed=machine.homed,
-                x_mm=machine.stage.x_mm,
-                y_mm=machine.stage.y_mm,
-                scan_id=self._ledger.scan_id,
-                row_index=row.row.index if row else -1,
-                take=row.take if row else 0,
-                points=counts.bursts if row else 0,
-                pulses=counts.pulses if row else 0,
-                last_seq=self._ledger.last_seq,
-                fault=machine.fault,
-                reason=machine.reason,
-                lost_x_mm=machine.lost_mm[0],
-                lost_y_mm=machine.lost_mm[1],
+                state=machine.told, homed=machine.homed, x_mm=machine.stage.x_mm, y_mm=machine.stage.y_mm,
+                scan_id=self._ledger.scan_id, row_index=row.row.index if row else -1, take=row.take if row else 0,
+                points=counts.bursts if row else 0, pulses=counts.pulses if row else 0, last_seq=self._ledger.last_seq,
+                fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
             ),
-            machine.stage.firmware,
-            self._run is not None,
-            machine.stage.config.placing,
-        )
+            machine.stage.firmware, self._run is not None, machine.stage.config.placing,
+        )  # fmt: skip

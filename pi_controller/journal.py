@@ -16,7 +16,7 @@ import struct
 import zlib
 from array import array
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -34,35 +34,28 @@ _HEAD = struct.Struct("<III")
 
 
 class JournalFullError(DeviceError):
-    """The journal cannot be written. Nothing of the failed batch is in it."""
+    """The journal cannot be written. Nothing of the failed write is in it."""
+
+    def __init__(self, path: Path, e: OSError) -> None:
+        why = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else "the disk is read-only or broken"
+        super().__init__(f"journal {path} cannot be written: {e.strerror}", why, "free space on the Pi")
 
 
 def _crc(seq: int, payload: bytes) -> int:
     return zlib.crc32(payload, zlib.crc32(seq.to_bytes(4, "little")))
 
 
-def frame(seq: int, payload: bytes) -> bytes:
-    """One record as bytes."""
-    return _HEAD.pack(len(payload), seq, _crc(seq, payload)) + payload
-
-
 def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     """Good records of an open journal from its beginning: (offset, sequence, payload). Ends at the first bad one.
 
-    Raises
-    ------
-    DataError
-        when the file is no journal at all.
+    Raises DataError when the file is no journal at all.
     """
     magic = file.read(len(MAGIC))
     if not magic.strip(b"\0"):
         return  # made, and the power was cut before its first bytes were on the disk
     if magic != MAGIC[: len(magic)]:
-        raise DataError(
-            f"{getattr(file, 'name', 'journal')}: not a journal",
-            "another program wrote this file",
-            "move it out of the journal folder",
-        )
+        name = getattr(file, "name", "journal")
+        raise DataError(f"{name}: not a journal", "another program wrote it", "move it out of the journal folder")
     offset, last = len(MAGIC), 0
     while len(head := file.read(_HEAD.size)) == _HEAD.size:
         length, seq, crc = _HEAD.unpack(head)
@@ -86,60 +79,46 @@ def _holds_records(tail: bytes) -> bool:
 
 
 class Journal:
-    """The journal of one scan, open for appending.
+    """The journal of one scan, open for appending: made when absent, cut at its last good record otherwise.
 
-    Parameters
-    ----------
-    path
-        The file; made when absent, cut at its last good record otherwise.
+    `damage` says what was cut off, when that was more than the torn record of a power cut: a copy is kept then.
 
-    Attributes
-    ----------
-    damage
-        What was cut off, when that was more than the torn record of a power cut: a copy is kept. Empty otherwise.
-
-    Raises
-    ------
-    DataError
-        when the file exists and is no journal.
-    JournalFullError
-        when it cannot be made or written.
+    Raises DataError when the file exists and is no journal, JournalFullError when it cannot be made or written.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.damage = path, ""
+        self._offsets, self._seqs = array("Q"), array("I")
+        self._passed = 0  # numbers up to this one are the host's
+        self._synced = True
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as e:
-            raise _full(path, e) from None
-        self._offsets, self._seqs = array("Q"), array("I")  # of all records, those of the batch included
-        self._passed = 0  # numbers up to this one are the host's
-        self._batch: list[bytes] = []
-        self._synced = True
+            raise JournalFullError(path, e) from None
         try:
             self._recover()
         except OSError as e:
             os.close(self._fd)
-            raise _full(path, e) from None
+            raise JournalFullError(path, e) from None
         except DataError:
             os.close(self._fd)
             raise
 
     def _recover(self) -> None:
         self._end = len(MAGIC)
-        with path_reader(self.path) as file:
+        with self.path.open("rb") as file:
             for offset, seq, payload in records(file):
                 self._offsets.append(offset)
                 self._seqs.append(seq)
                 self._end = offset + _HEAD.size + len(payload)
             file.seek(self._end)
             tail = file.read()
-        self.cut_bytes = len(tail)
-        self.damage = ""
         if _holds_records(tail):
-            copy = self._keep_copy()
+            names = (self.path.with_name(f"{self.path.name}{DAMAGED}{n or ''}") for n in (0, *range(2, 1000)))
+            copy = next(name for name in names if not name.exists())
+            shutil.copyfile(self.path, copy)
             self.damage = (
-                f"{self.path}: damaged behind event {self.last_seq}, {self.cut_bytes} bytes that followed are cut off;"
+                f"{self.path}: damaged behind event {self.last_seq}, {len(tail)} bytes that followed are cut off;"
                 f" the file as it was is {copy}; the disk or card fails: replace it"
             )
         if not self._seqs:
@@ -151,18 +130,10 @@ class Journal:
             os.fsync(folder)
         finally:
             os.close(folder)
-        self._batched_end = self._end
-
-    def _keep_copy(self) -> Path:
-        """A copy of the file beside it, under a name that is free."""
-        names = [self.path.with_name(self.path.name + DAMAGED + number) for number in ("", *map(str, range(2, 1000)))]
-        copy = next(name for name in names if not name.exists())
-        shutil.copyfile(self.path, copy)
-        return copy
 
     @property
     def last_seq(self) -> int:
-        """Sequence number of the newest record, appended or still in the batch; 0 when there is none."""
+        """Sequence number of the newest record; 0 when there is none."""
         return max(self._passed, self._seqs[-1] if self._seqs else 0)
 
     def number_behind(self, seq: int) -> int:
@@ -171,54 +142,35 @@ class Journal:
         self._passed = max(self._passed, seq)
         return lost
 
-    def append(self, payload: bytes) -> int:
-        """Add a record to the batch and return its sequence number. :meth:`commit` writes it."""
-        seq = self.last_seq + 1
-        record = frame(seq, payload)
-        self._offsets.append(self._batched_end)
-        self._seqs.append(seq)
-        self._batch.append(record)
-        self._batched_end += len(record)
-        return seq
+    def write(self, payloads: Sequence[bytes], sync: bool = False) -> None:
+        """Append records, all or none; with `sync`, wait until everything is on the disk.
 
-    def commit(self, sync: bool = False) -> None:
-        """Write the batch; with `sync`, wait until it is on the disk.
-
-        Raises
-        ------
-        JournalFullError
-            when the disk is full or broken. The batch is then dropped and the file is as before.
+        Raises JournalFullError when the disk is full or broken. The file is then as before.
         """
-        if not self._batch and (self._synced or not sync):
-            return
-        data = memoryview(b"".join(self._batch))
+        offsets, seqs, data = array("Q"), array("I"), bytearray()
+        for seq, payload in enumerate(payloads, self.last_seq + 1):
+            offsets.append(self._end + len(data))
+            seqs.append(seq)
+            data += _HEAD.pack(len(payload), seq, _crc(seq, payload)) + payload
         done = 0
         try:
             while done < len(data):
-                done += os.pwrite(self._fd, data[done:], self._end + done)
-            if sync:
+                done += os.pwrite(self._fd, memoryview(data)[done:], self._end + done)
+            if sync and (data or not self._synced):
                 os.fsync(self._fd)
         except OSError as e:
-            self._roll_back()
-            raise _full(self.path, e) from None
-        self._batch.clear()
-        self._end = self._batched_end
-        self._synced = sync
-
-    def _roll_back(self) -> None:
-        with suppress(OSError):  # what is left of the batch is overwritten, or cut off when the file is next opened
-            os.ftruncate(self._fd, self._end)
-        whole = len(self._offsets) - len(self._batch)
-        del self._offsets[whole:], self._seqs[whole:]
-        self._batch.clear()
-        self._batched_end = self._end
+            with suppress(OSError):  # what is left is overwritten, or cut off when the file is next opened
+                os.ftruncate(self._fd, self._end)
+            raise JournalFullError(self.path, e) from None
+        self._end += len(data)
+        self._offsets += offsets
+        self._seqs += seqs
+        self._synced = sync or (self._synced and not data)
 
     def read(self, from_seq: int, limit: int) -> list[bytes]:
-        """Payloads of committed records from `from_seq` on, at most `limit` of them."""
-        whole = len(self._offsets) - len(self._batch)
-        first = bisect_left(self._seqs, from_seq)
-        found = []
-        part = slice(first, min(whole, first + limit))
+        """Payloads from `from_seq` on, at most `limit` of them. Raises DataError for a damaged one."""
+        first, found = bisect_left(self._seqs, from_seq), []
+        part = slice(first, first + limit)
         for seq, offset in zip(self._seqs[part], self._offsets[part], strict=True):
             length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
             payload = os.pread(self._fd, length, offset + _HEAD.size)
@@ -228,9 +180,9 @@ class Journal:
         return found
 
     def close(self) -> None:
-        """Write what is left and close. Raises JournalFullError."""
+        """Wait until everything is on the disk, and close. Raises JournalFullError."""
         try:
-            self.commit(sync=True)
+            self.write((), sync=True)
         finally:
             os.close(self._fd)
 
@@ -238,12 +190,7 @@ class Journal:
 class JournalFolder:
     """The folder of journals, held by one process at a time.
 
-    Raises
-    ------
-    ConfigError
-        when the folder cannot be made or written.
-    DeviceError
-        when another process holds it.
+    Raises ConfigError when the folder cannot be made or written, DeviceError when another process holds it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -273,6 +220,28 @@ class JournalFolder:
         """The journal of a scan, made when absent."""
         return Journal(self.path_of(scan_id))
 
+    def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
+        """Payloads from `from_seq` on and the newest sequence number of a scan that is not open; ([], 0) if absent."""
+        found, last = [], 0
+        with suppress(FileNotFoundError), self.path_of(scan_id).open("rb") as file:
+            for _, last, payload in records(file):
+                if last >= from_seq and len(found) < limit:
+                    found.append(payload)
+        return found, last
+
+    def check_room(self, scan_id: str, positions: int) -> None:
+        """Refuse a scan for whose journal, or the rest of it, the disk has no room. Raises JournalFullError."""
+        path = self.path_of(scan_id)
+        try:
+            there = path.stat().st_size if path.exists() else 0
+            free = shutil.disk_usage(self.path).free
+        except OSError as e:
+            raise JournalFullError(self.path, e) from None
+        needed = max(0, positions * CAPTURE_BYTES - there) + SPARE_BYTES
+        if free < needed:
+            room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions"
+            raise JournalFullError(self.path, OSError(errno.ENOSPC, room))
+
     def write_secret(self, name: str, secret: str) -> None:
         """Write a file that this program's user alone can read. Raises ConfigError."""
         path = self.path / name
@@ -283,45 +252,6 @@ class JournalFolder:
         except OSError as e:
             raise ConfigError(f"{path}: {e.strerror}", "the disk is full or read-only", "free space there") from None
 
-    def check_room(self, scan_id: str, positions: int) -> None:
-        """Refuse a scan for whose journal, or the rest of it, the disk has no room. Raises JournalFullError."""
-        path = self.path_of(scan_id)
-        try:
-            there = path.stat().st_size if path.exists() else 0
-            needed = max(0, positions * CAPTURE_BYTES - there) + SPARE_BYTES
-            free = shutil.disk_usage(self.path).free
-        except OSError as e:
-            raise _full(self.path, e) from None
-        if free < needed:
-            raise JournalFullError(
-                f"{self.path}: {free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions",
-                "the Pi's disk is full",
-                "remove old journals there",
-            )
-
-    def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
-        """Payloads from `from_seq` on and the newest sequence number of a scan that is not open; ([], 0) if absent."""
-        found, last = [], 0
-        try:
-            with path_reader(self.path_of(scan_id)) as file:
-                for _, seq, payload in records(file):
-                    last = seq
-                    if seq >= from_seq and len(found) < limit:
-                        found.append(payload)
-        except FileNotFoundError:
-            pass
-        return found, last
-
     def close(self) -> None:
         """Let another process have the folder."""
         os.close(self._lock)
-
-
-def path_reader(path: Path) -> BinaryIO:
-    """A buffered reader of a journal file."""
-    return path.open("rb")
-
-
-def _full(path: Path, e: OSError) -> JournalFullError:
-    why = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else "the disk is read-only or broken"
-    return JournalFullError(f"journal {path} cannot be written: {e.strerror}", why, "free space on the Pi")

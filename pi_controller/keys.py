@@ -6,12 +6,14 @@ name. Without that file `host.key` alone is allowed, as before there was one. It
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import zmq.utils.z85
+from zmq.auth import create_certificates, load_certificate
 
-from polysight.pi_controller.finding import PROGRAM
+from polysight.pi_controller import PROGRAM
 from polysight.shared.errors import ConfigError
 from polysight.shared.sockets import HOST_KEYS
 
@@ -26,39 +28,34 @@ class AllowedKeys:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._seen: tuple[float, int] | None = None
         self._names: dict[str, str] = {}
+        self._seen = (-1, -1)
+        with suppress(OSError):
+            self._names = read_allowed(folder)
 
     def name_of(self, key: bytes) -> str:
         """Name of the client with this public key (32 bytes); empty when it is not allowed."""
-        path = self._folder / ALLOWED
         with suppress(OSError):  # gone or unreadable: what was allowed before stays so
-            stat = path.stat()
+            stat = (self._folder / ALLOWED).stat()
             if self._seen != (stat.st_mtime_ns, stat.st_size):
                 self._names = read_allowed(self._folder)
                 self._seen = (stat.st_mtime_ns, stat.st_size)
-        if self._seen is None:
-            self._names = read_allowed(self._folder)
         return self._names.get(zmq.utils.z85.encode(key).decode("ascii"), "") if len(key) == 32 else ""
 
 
 def read_allowed(folder: Path) -> dict[str, str]:
     """Public keys (Z85 text) and names of the clients that may connect. A key folder without the file allows `host`."""
-    names: dict[str, str] = {}
     try:
-        for line in (folder / ALLOWED).read_text(encoding="utf-8").splitlines():
-            key, _, name = line.strip().partition(" ")
-            if len(key) == KEY_CHARACTERS:
-                names[key] = name.strip() or "nameless"
+        lines = (folder / ALLOWED).read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         with suppress(OSError, ValueError):
-            names[_public(folder / "host.key")] = "host"
-    return names
+            return {_public(folder / "host.key"): "host"}
+        return {}
+    keys = (line.strip().partition(" ") for line in lines)
+    return {key: name.strip() or "nameless" for key, _, name in keys if len(key) == KEY_CHARACTERS}
 
 
 def _public(certificate: Path) -> str:
-    from zmq.auth import load_certificate
-
     return load_certificate(certificate)[0].decode("ascii")
 
 
@@ -68,26 +65,40 @@ def _write_allowed(folder: Path, names: dict[str, str]) -> None:
     new.replace(folder / ALLOWED)
 
 
+def _create(folder: Path, name: str) -> list[Path]:
+    public, secret = map(Path, create_certificates(folder, name))
+    secret.chmod(0o600)
+    return [public, secret]
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Tell in plain words that the folder cannot be written. Raises ConfigError."""
+    try:
+        yield
+    except OSError as e:
+        raise ConfigError(
+            f"keys cannot be written to {folder}: {e.strerror}",
+            "another user's folder, or the disk is full",
+            f"as the service's user: `sudo -u polysight {PROGRAM} keys`; or choose --dir",
+        ) from None
+
+
 def allow(folder: Path, name: str) -> list[Path]:
     """Make keys for one more client and allow them. Returns its files; the secret one goes to the client alone.
 
-    Raises
-    ------
-    ConfigError
-        when the name is taken, or none, or the folder cannot be written.
+    Raises ConfigError when the name is taken, or none, or the folder cannot be written.
     """
-    from zmq.auth import create_certificates
-
     if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
-        raise ConfigError(f"client {name!r} cannot be added", "its name is taken, or has other signs than a-z 0-9 - _",
-                          "choose another name, or revoke that client first")  # fmt: skip
-    try:
-        public, secret = map(Path, create_certificates(folder, name))
-        secret.chmod(0o600)
-        _write_allowed(folder, read_allowed(folder) | {_public(public): name})
-    except OSError as e:
-        raise _unwritable(folder, e) from None
-    return [public, secret]
+        raise ConfigError(
+            f"client {name!r} cannot be added",
+            "its name is taken, or has other signs than a-z 0-9 - _",
+            "choose another name, or revoke that client first",
+        )
+    with _writing(folder):
+        made = _create(folder, name)
+        _write_allowed(folder, read_allowed(folder) | {_public(made[0]): name})
+    return made
 
 
 def revoke(folder: Path, name: str) -> None:
@@ -96,44 +107,17 @@ def revoke(folder: Path, name: str) -> None:
     left = {key: other for key, other in names.items() if other != name}
     if left == names:
         raise ConfigError(f"no client {name!r} is allowed", "a typing error", f"allowed: {', '.join(names.values())}")
-    try:
+    with _writing(folder):
         _write_allowed(folder, left)
-    except OSError as e:
-        raise _unwritable(folder, e) from None
-
-
-def _unwritable(folder: Path, e: OSError) -> ConfigError:
-    return ConfigError(
-        f"keys cannot be written to {folder}: {e.strerror}",
-        "another user's folder, or the disk is full",
-        f"as the service's user: `sudo -u polysight {PROGRAM} keys`; or choose --dir",
-    )
 
 
 def make_keys(folder: Path, replace: bool = False) -> list[Path]:
     """Make `pi.key`, `pi.key_secret`, `host.key` and `host.key_secret`, the secret ones readable by the owner alone.
 
-    Parameters
-    ----------
-    folder
-        Made when absent.
-    replace
-        Whether keys that are there already may be replaced.
-
-    Returns
-    -------
-    list of Path
-        The files.
-
-    Raises
-    ------
-    ConfigError
-        when there are keys already, or the folder cannot be written.
+    Returns the files. Raises ConfigError when there are keys already (unless `replace`), or the folder cannot be
+    written.
     """
-    from zmq.auth import create_certificates
-
-    made = []
-    try:
+    with _writing(folder):
         there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
         if there and not replace:
             raise ConfigError(
@@ -142,11 +126,6 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
                 f"keep them, or give --replace, then {COPY}",
             )
         folder.mkdir(parents=True, exist_ok=True)
-        for name in PARTIES:
-            public, secret = map(Path, create_certificates(folder, name))
-            secret.chmod(0o600)
-            made += [public, secret]
+        made = [path for name in PARTIES for path in _create(folder, name)]
         _write_allowed(folder, {_public(folder / "host.key"): "host"})
-    except OSError as e:
-        raise _unwritable(folder, e) from None
     return made

@@ -8,33 +8,13 @@ from collections.abc import Callable
 import msgspec
 
 from polysight.pi_controller.journal import Journal, JournalFolder, JournalFullError
+from polysight.shared import messages as m
 from polysight.shared.errors import DataError, ProtocolError
-from polysight.shared.messages import (
-    JOURNALLED,
-    AnyEvent,
-    Capture,
-    Fault,
-    ReplayReply,
-    RowFinished,
-    RunStarted,
-    pack,
-    unpack_event,
-)
 from polysight.shared.raster import RasterPlan
 
 
 class Ledger:
-    """The events of the current scan.
-
-    Parameters
-    ----------
-    folder
-        Where journals are.
-    publish
-        Takes packed events, once they are in the journal.
-    warn
-        Takes sentences for the log.
-    """
+    """The events of the current scan. `publish` takes packed events once they are in the journal, `warn` sentences."""
 
     def __init__(
         self,
@@ -44,15 +24,15 @@ class Ledger:
     ) -> None:
         self._folder, self._publish, self._warn = folder, publish, warn
         self._journal: Journal | None = None
-        self._outbox: list[tuple[AnyEvent, bytes]] = []
-        self._sync = False
-        self.broken = False
+        self._outbox: list[tuple[m.AnyEvent, bytes]] = []
+        self._to_keep: list[bytes] = []
+        self._sync = self.broken = False
         self.scan_id = ""
 
     @property
     def last_seq(self) -> int:
         """Sequence number of the newest event of the current scan."""
-        return self._journal.last_seq if self._journal else 0
+        return self._journal.last_seq + len(self._to_keep) if self._journal else 0
 
     def open(self, scan_id: str, plan: RasterPlan, host_seq: int) -> tuple[bool, int]:
         """Make `scan_id` the current scan. The next event is numbered behind `host_seq`, the newest the host has.
@@ -91,53 +71,47 @@ class Ledger:
             self._journal, self.scan_id = journal, scan_id
         return begun is not None or host_seq > 0, journal.number_behind(host_seq)
 
-    def add(self, event: AnyEvent) -> None:
+    def add(self, event: m.AnyEvent) -> None:
         """Number an event and add it to the batch. An event that is not journalled carries the last number."""
-        event = msgspec.structs.replace(event, scan_id=self.scan_id, t_mono_ns=time.monotonic_ns())
-        if isinstance(event, JOURNALLED) and self._journal is not None and not self.broken:
-            event = msgspec.structs.replace(event, seq=self.last_seq + 1)
-            raw = pack(event)
-            self._journal.append(raw)
-            self._sync |= not isinstance(event, Capture)
-        else:
-            event = msgspec.structs.replace(event, seq=self.last_seq)
-            raw = pack(event)
+        kept = isinstance(event, m.JOURNALLED) and self._journal is not None and not self.broken
+        event = msgspec.structs.replace(
+            event, scan_id=self.scan_id, t_mono_ns=time.monotonic_ns(), seq=self.last_seq + kept
+        )
+        raw = m.pack(event)
         self._outbox.append((event, raw))
+        if kept:
+            self._to_keep.append(raw)
+            self._sync |= not isinstance(event, m.Capture)
 
     def commit(self) -> None:
         """Write the batch to the journal, then publish it.
 
-        Raises
-        ------
-        JournalFullError
-            when it cannot be written. From then on events are published with the last good number and not kept, until
-            the scan is opened again; of this batch, only what ends a row or names a fault is published.
+        Raises JournalFullError when it cannot be written. From then on events are published with the last good number
+        and not kept, until the scan is opened again; of this batch, only what ends a row or names a fault is published.
         """
-        if not self._outbox:
-            return
-        batch, self._outbox = self._outbox, []
+        batch, to_keep, sync = self._outbox, self._to_keep, self._sync
+        self._outbox, self._to_keep, self._sync = [], [], False
         try:
-            if self._journal is not None and not self.broken:
-                self._journal.commit(self._sync)
+            if to_keep and self._journal is not None:
+                self._journal.write(to_keep, sync)
         except JournalFullError:
             self.broken = True
             for event, _ in batch:
-                if isinstance(event, RowFinished | Fault) or not isinstance(event, JOURNALLED):
+                if isinstance(event, m.RowFinished | m.Fault) or not isinstance(event, m.JOURNALLED):
                     self.add(event)
             self._publish([raw for _, raw in self._outbox])
             self._outbox = []
             raise
-        finally:
-            self._sync = False
-        self._publish([raw for _, raw in batch])
+        if batch:
+            self._publish([raw for _, raw in batch])
 
-    def replay(self, scan_id: str, from_seq: int, limit: int) -> ReplayReply:
+    def replay(self, scan_id: str, from_seq: int, limit: int) -> m.ReplayReply:
         """Journalled events of any scan."""
         if self._journal is not None and scan_id == self.scan_id:
-            found, last = self._journal.read(from_seq, limit), self._journal.last_seq
+            found, last = self._journal.read(from_seq, limit), self.last_seq
         else:
             found, last = self._folder.read(scan_id, from_seq, limit)
-        return ReplayReply(events=[unpack_event(raw) for raw in found], last_seq=last)
+        return m.ReplayReply(events=[m.unpack_event(raw) for raw in found], last_seq=last)
 
     def close(self) -> None:
         """Close the current journal."""
@@ -149,5 +123,5 @@ class Ledger:
 def _plan_of(journal: Journal) -> RasterPlan | None:
     """The plan of the first event; None when there is no event yet."""
     first = journal.read(1, 1)
-    event = unpack_event(first[0]) if first else None
-    return event.plan if isinstance(event, RunStarted) else None
+    event = m.unpack_event(first[0]) if first else None
+    return event.plan if isinstance(event, m.RunStarted) else None

@@ -18,9 +18,7 @@ SWITCH_INTERVAL_S = 100e-6
 
 
 def prepare_process() -> list[str]:
-    """Lock memory, freeze the garbage collector's heap, and let threads take over from each other quickly.
-
-    Real-time scheduling, where permitted, is for this thread and those it starts.
+    """Lock memory, freeze the garbage collector's heap, let threads take over quickly, ask for real-time scheduling.
 
     Returns what was not permitted, one sentence each, with what to do.
     """
@@ -38,10 +36,7 @@ def prepare_process() -> list[str]:
 
 
 def prepare_thread(priority: int = PRIORITY) -> list[str]:
-    """The trigger thread's priority, and the shortest timer slack, for the calling thread.
-
-    Returns what was not permitted, one sentence each, with what to do.
-    """
+    """The trigger thread's priority and the shortest timer slack. Returns what was not permitted, as above."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
         return ["timer slack stays at 50 us: pulses may be that late", *_schedule(priority)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from polysight.pi_controller.burst import BurstSpec
+from polysight.pi_controller.lines import BurstSpec
 from polysight.shared.config import Stage
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain
@@ -59,13 +59,7 @@ def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
 
 
 def check_run(run: BeginRun, stage: Stage) -> None:
-    """Compare a run with this rig.
-
-    Raises
-    ------
-    RefusedError
-        PERIOD_TOO_SHORT, PULSE_TOO_LONG, or BAD_REQUEST, with the values that do not go together.
-    """
+    """Compare a run with this rig. Raises RefusedError with the values that do not go together."""
     plan, period_ns = run.plan, check_pulses(run.pulses, run.period_us, run.width_us).period_ns
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")

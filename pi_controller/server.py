@@ -12,11 +12,10 @@ import queue
 import time
 import traceback
 from pathlib import Path
-from typing import Protocol
 
 import zmq
 
-from polysight.pi_controller.executor import HUNG_S, Request, Snapshot, refused
+from polysight.pi_controller.executor import HUNG_S, Executor, Request, Snapshot, refused
 from polysight.pi_controller.keys import AllowedKeys
 from polysight.shared import __version__
 from polysight.shared import messages as m
@@ -29,48 +28,10 @@ REPLIES_WAITING = 1000  # for clients that do not read; what is more is dropped,
 Envelope = tuple[bytes, ...]
 
 
-class Answerer(Protocol):
-    """What the server needs of the executor."""
-
-    snapshot: Snapshot
-    crash: BaseException | None
-
-    @property
-    def stands_still_s(self) -> float:
-        """For how long it has not turned."""
-        ...
-
-    def full(self) -> bool:
-        """Whether too many commands wait."""
-        ...
-
-    def post(self, item: Request, /) -> None:
-        """Take a command; its reply comes by the request's `answer`."""
-        ...
-
-    def host_alive(self, scan_id: str, owner: str, /) -> m.Accepted | m.Refused:
-        """Take a sign of life."""
-        ...
-
-
 class Server:
-    """Binds both sockets.
+    """Binds both sockets; `backend`, the name of the trigger lines, is told in HelloReply.
 
-    Parameters
-    ----------
-    command_address, event_address
-        `tcp://host:port`; the port may be `*`.
-    key_dir
-        CURVE keys, and which clients' are allowed, for addresses that are not loopback.
-    heartbeat_ms
-        Interval of heartbeat events.
-    backend
-        Name of the trigger lines, told in HelloReply.
-
-    Raises
-    ------
-    ConfigError, DeviceError
-        when an address is wrong, in use, or has no keys.
+    Raises ConfigError or DeviceError when an address is wrong, in use, or has no keys.
     """
 
     def __init__(
@@ -104,7 +65,7 @@ class Server:
         self._stop = True
         os.eventfd_write(self._wake, 1)
 
-    def run(self, executor: Answerer) -> None:
+    def run(self, executor: Executor) -> None:
         """Serve until :meth:`stop`, or until the executor has crashed."""
         poller = zmq.Poller()
         poller.register(self._wake, zmq.POLLIN)
@@ -119,15 +80,23 @@ class Server:
             ready = dict(poller.poll(max(0, math.ceil((next_beat - now) * 1e3))))
             if self._wake in ready:
                 os.eventfd_read(self._wake)
-                self._drain()
+                self.drain()
             if self._door in ready:
                 self._admit()
             if self._commands in ready:
                 self._receive(executor)
 
     def drain(self) -> None:
-        """Send what was handed over. For the end, after :meth:`run`."""
-        self._drain()
+        """Send what was handed over. In the thread of :meth:`run`, or after it."""
+        while True:
+            try:
+                envelope, raw = self._out.get_nowait()
+            except queue.Empty:
+                return
+            if envelope:
+                self._reply(envelope, raw)
+            else:
+                self._events.send_multipart([EVENT_TOPIC, raw])
 
     def _admit(self) -> None:
         """Answer ZeroMQ's question (ZAP, RFC 27) whether a client with this public key may connect."""
@@ -137,7 +106,7 @@ class Server:
         code, text = (b"200", b"OK") if name else (b"400", b"this key is not allowed")
         self._door.send_multipart([version, number, code, text, key.hex().encode(), b""])
 
-    def _receive(self, executor: Answerer) -> None:
+    def _receive(self, executor: Executor) -> None:
         """Take one command: its envelope (who sent it, up to the empty frame), and one frame of content."""
         frames = self._commands.recv_multipart(copy=False)
         parts = [f.bytes for f in frames]
@@ -163,18 +132,7 @@ class Server:
         self._context.destroy(linger=LINGER_MS)
         os.close(self._wake)
 
-    def _drain(self) -> None:
-        while True:
-            try:
-                envelope, raw = self._out.get_nowait()
-            except queue.Empty:
-                return
-            if envelope:
-                self._reply(envelope, raw)
-            else:
-                self._events.send_multipart([EVENT_TOPIC, raw])
-
-    def _take(self, raw: bytes, envelope: Envelope, executor: Answerer) -> m.AnyReply | None:
+    def _take(self, raw: bytes, envelope: Envelope, executor: Executor) -> m.AnyReply | None:
         """The reply to a command; None when the executor will give it. Nothing that arrives here ends the program."""
         try:
             command = m.unpack_command(raw)
@@ -204,30 +162,22 @@ class Server:
     def _hello(self, snapshot: Snapshot) -> m.HelloReply:
         status = snapshot.status
         return m.HelloReply(
-            pi_release=__version__,
-            firmware=snapshot.firmware,
-            backend=self._backend,
-            state=status.state,
-            scan_id=status.scan_id,
-            last_seq=status.last_seq,
-            t_unix_ns=time.time_ns(),
-            in_run=snapshot.in_run,
+            pi_release=__version__, firmware=snapshot.firmware, backend=self._backend, state=status.state,
+            scan_id=status.scan_id, last_seq=status.last_seq, t_unix_ns=time.time_ns(), in_run=snapshot.in_run,
             stage=snapshot.placing,
-        )
+        )  # fmt: skip
 
-    def _beat(self, executor: Answerer) -> None:
+    def _beat(self, executor: Executor) -> None:
         """Tell that this program lives; while the executor hangs, it does not."""
         if executor.stands_still_s > HUNG_S:
             return
         snapshot = executor.snapshot
         # Everything up to the snapshot's number has been handed over before the snapshot was taken, so draining first
         # keeps a heartbeat from announcing an event that has not been sent.
-        self._drain()
+        self.drain()
+        status = snapshot.status
         beat = m.Heartbeat(
-            scan_id=snapshot.status.scan_id,
-            seq=snapshot.status.last_seq,
-            t_mono_ns=time.monotonic_ns(),
-            state=snapshot.status.state,
+            scan_id=status.scan_id, seq=status.last_seq, t_mono_ns=time.monotonic_ns(), state=status.state,
             period_ms=self._heartbeat_ms,
-        )
+        )  # fmt: skip
         self._events.send_multipart([EVENT_TOPIC, m.pack(beat)])

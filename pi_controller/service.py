@@ -13,16 +13,12 @@ from polysight.pi_controller import realtime
 from polysight.pi_controller.executor import Executor
 from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, JournalFullError
 from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.lines_gpiod import GpiodLines, load_gpiod
-from polysight.pi_controller.lines_gpiomem import GpiomemLines
-from polysight.pi_controller.lines_spi import SpiLines
-from polysight.pi_controller.lines_wires import SpiWireLines, WireLines
+from polysight.pi_controller.lines import TriggerLines
 from polysight.pi_controller.server import Server
-from polysight.pi_controller.stage_driver import StageDriver
+from polysight.pi_controller.stage import StageDriver
 from polysight.pi_controller.stage_link import StageNews
-from polysight.pi_controller.trigger_lines import TriggerLines
-from polysight.pi_controller.trigger_loop import BenchBurst, BurstSent, LoopFault, TriggerLoop
-from polysight.pi_controller.wiring import check_wiring, read_model
+from polysight.pi_controller.trigger import BenchBurst, BurstSent, LoopFault, TriggerLoop
+from polysight.pi_controller.wiring import open_lines
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 
@@ -46,41 +42,8 @@ def log(text: str) -> None:
     sys.stderr.flush()
 
 
-def gpio_lines(instrument: Instrument) -> type[GpiodLines | SpiLines]:
-    """Which lines drive the pins of this rig."""
-    kinds: dict[str, type[GpiodLines | SpiLines]] = {"gpiomem": GpiomemLines, "spi": SpiLines}
-    return kinds.get(instrument.pi.wiring, GpiodLines)
-
-
-def open_lines(instrument: Instrument, wires: Path | None, model: str | None = None) -> TriggerLines:
-    """GPIO lines, or simulated wires. What this wiring costs on this computer is told in the log.
-
-    Raises
-    ------
-    ConfigError, DeviceError
-        when they cannot be had, or this wiring cannot work on this computer (`model`: what it calls itself).
-    """
-    if wires is not None:
-        return (SpiWireLines if instrument.pi.wiring == "spi" else WireLines)(wires, instrument.pi)
-    warning = check_wiring(instrument, read_model() if model is None else model)
-    if warning:
-        log(warning)
-    return gpio_lines(instrument)(instrument.pi, load_gpiod())
-
-
-def _prepare_trigger_thread() -> None:
-    realtime.prepare_thread()  # what is not permitted to it was not permitted to the process, which has said so
-
-
 class Service:
-    """The Pi half as a whole.
-
-    Parameters
-    ----------
-    instrument, options
-        The rig, and what replaces parts of it.
-    lines
-        Trigger lines to use instead of opening those of the rig.
+    """The Pi half as a whole; `lines` are used instead of opening those of the rig.
 
     Raises
     ------
@@ -89,32 +52,24 @@ class Service:
     """
 
     def __init__(self, instrument: Instrument, options: Options, lines: TriggerLines | None = None) -> None:
-        self._simulated = options.wires is not None
-        pi = instrument.pi
+        pi, simulated = instrument.pi, options.wires is not None
         with ExitStack() as opened:
             folder = JournalFolder(options.journal or Path(pi.journal_dir))
             opened.callback(folder.close)
-            self.server = Server(
-                options.command_address or pi.command_address,
-                options.event_address or pi.event_address,
-                Path(pi.key_dir),
-                pi.heartbeat_ms,
-                (lines or (WireLines if self._simulated else gpio_lines(instrument))).name,
-            )
+            lines = lines or open_lines(instrument, options.wires, log)
+            # What is not permitted to its thread was not permitted to the process, which has said so.
+            prepare = (lambda: None) if simulated else realtime.prepare_thread
+            self._loop = TriggerLoop(lines, self._post, prepare)
+            opened.callback(self._loop.stop)
+            addresses = options.command_address or pi.command_address, options.event_address or pi.event_address
+            self.server = Server(*addresses, Path(pi.key_dir), pi.heartbeat_ms, lines.name)
             opened.callback(self.server.close)
             self._ledger = Ledger(folder, self.server.publish, log)
             opened.callback(self._close_ledger)
             stage = StageDriver(instrument.stage, options.stage_port or instrument.stage.port, self._post)
             opened.callback(stage.close)
-            loop = TriggerLoop(
-                lines or open_lines(instrument, options.wires),
-                self._post,
-                (lambda: None) if self._simulated else _prepare_trigger_thread,
-            )
-            opened.callback(loop.stop)
-            self._loop = loop
             turned = partial(realtime.notify_systemd, "WATCHDOG=1")
-            self.executor = Executor(stage, loop, self._ledger, not pi.one_shot, turned)
+            self.executor = Executor(stage, self._loop, self._ledger, not pi.one_shot, turned)
             folder.write_secret(TAKE_OVER_KEY, self.executor.take_over_key)
             stage.connect()
             self._opened = opened.pop_all()
@@ -129,13 +84,7 @@ class Service:
             log(str(e))
 
     def serve(self) -> None:
-        """Serve until :meth:`stop`; then stop the stage and end the row.
-
-        Raises
-        ------
-        DeviceError
-            when a part of this program failed.
-        """
+        """Serve until :meth:`stop`; then stop the stage and end the row. Raises DeviceError when a part failed."""
         self._loop.start()
         self.executor.start()
         self.server.run(self.executor)
@@ -151,17 +100,15 @@ class Service:
         self.server.stop()
 
     def close(self) -> None:
-        """Outputs low, everything closed."""
+        """Outputs low first, then everything is closed."""
+        self._loop.stop()
         self._opened.close()
 
 
 def run(instrument: Instrument, options: Options) -> int:
     """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout when it serves.
 
-    Raises
-    ------
-    ConfigError, DeviceError
-        when it cannot start.
+    Raises ConfigError or DeviceError when it cannot start.
     """
     if options.wires is not None:
         realtime.die_with_parent(signal.SIGTERM)

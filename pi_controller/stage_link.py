@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import serial
 
-from polysight.pi_controller.supervision import StatusWatch
 from polysight.shared.errors import DeviceError, ProtocolError
 from polysight.shared.faults import StageError, explain
 from polysight.shared.stage_line import MAX_LINE_BYTES, MAX_SEQUENCE, PROTOCOL_VERSION, Command, Immediate, Reply
@@ -51,13 +50,38 @@ class StageLost(NamedTuple):
 StageNews = Reply | StageLost
 
 
+class StatusWatch:
+    """When to ask the stage for its status, and when it has been silent for too long."""
+
+    def __init__(self, silence_s: float, now_s: float) -> None:
+        self._silence_s, self._asked_s = silence_s, now_s
+        self._unanswered_since_s: float | None = None
+        self.interval_s = 0.0  # 0: it is not asked
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether to ask now."""
+        if not self.interval_s or now_s - self._asked_s < self.interval_s:
+            return False
+        self._asked_s = now_s
+        if self._unanswered_since_s is None:
+            self._unanswered_since_s = now_s
+        return True
+
+    def heard(self) -> None:
+        """The stage has said something."""
+        self._unanswered_since_s = None
+
+    def silent_s(self, now_s: float) -> float:
+        """For how long it has been silent; 0 as long as that is no longer than allowed."""
+        silent_s = 0.0 if self._unanswered_since_s is None else now_s - self._unanswered_since_s
+        return silent_s if silent_s > self._silence_s else 0.0
+
+
 class StageLink:
-    """One open serial link.
+    """One open serial link to `port`. Every method raises StageLostError when the stage does not answer.
 
     Parameters
     ----------
-    port, baud
-        Serial device.
     news
         Takes, from the reader thread, every reply that answers no line, every `ok` (it divides what came before a
         command from what came after), and one :class:`StageLost` when the link dies. Must return at once.
@@ -67,11 +91,6 @@ class StageLink:
         How often the reader looks whether a status byte is due.
     banner_limit_s
         How long to wait for the banner of a stage that the opening reset; without one it is greeted all the same.
-
-    Raises
-    ------
-    StageLostError
-        from every method, when the port cannot be opened, or the stage does not answer.
     """
 
     def __init__(
@@ -95,7 +114,6 @@ class StageLink:
                 "check stage.port in instrument.toml and `ls -l /dev/ttyACM* /dev/ttyUSB*`",
             ) from None
         self._write_lock = threading.Lock()
-        self._request_lock = threading.Lock()
         self._answers: queue.SimpleQueue[Reply | None] = queue.SimpleQueue()
         self._banner: Reply | None = None
         self._banner_seen = threading.Event()
@@ -103,7 +121,7 @@ class StageLink:
         self._sequence = 0
         self._last_line = b""
         self._watch = StatusWatch(silence_s, time.monotonic())
-        self._lost = ""
+        self.lost = ""  # why the link is dead
         self._closing = False
         self.bad_lines = 0
         self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
@@ -129,20 +147,14 @@ class StageLink:
         self._greeted = True
 
     def request(self, verb: str, *args: int) -> Reply:
-        """Send a line, again with the same sequence number when it is lost or damaged, until it is answered.
+        """Send a line, again with its number when it is lost or damaged, until it is answered.
 
-        Raises
-        ------
-        StageRefusedError
-            when the stage refuses it.
-        StageLostError
-            when it does not answer.
+        Raises StageRefusedError when the stage refuses it, StageLostError when it does not answer.
         """
-        with self._request_lock:
+        answer = self._exchange(verb, args)
+        if answer.number == StageError.SEQUENCE and verb != "HELLO":
+            self._exchange("HELLO", ())
             answer = self._exchange(verb, args)
-            if answer.number == StageError.SEQUENCE and verb != "HELLO":
-                self._exchange("HELLO", ())
-                answer = self._exchange(verb, args)
         if answer.kind == "error":
             raise StageRefusedError(verb, answer.number)
         return answer
@@ -159,7 +171,7 @@ class StageLink:
             if answer is not None and answer.number not in SEND_AGAIN:
                 return answer
         raise StageLostError(
-            f"stage at {self.port} does not answer {verb}" + (f": {self._lost}" if self._lost else ""),
+            f"stage at {self.port} does not answer {verb}" + (f": {self.lost}" if self.lost else ""),
             "cable unplugged, board without the sketch, or wrong port",
             "check the USB cable, stage.port and stage.baud; `make flash` puts the sketch on the board",
         )
@@ -192,11 +204,6 @@ class StageLink:
         """Ask for the status from now on: the heartbeat of a moving stage. 0 stops asking."""
         self._watch.interval_s = interval_s
 
-    @property
-    def lost(self) -> str:
-        """Why the link is dead; empty while it lives."""
-        return self._lost
-
     def close(self) -> None:
         """Close the port and end the reader."""
         self._closing = True
@@ -207,8 +214,8 @@ class StageLink:
         self._serial.close()
 
     def _write(self, data: bytes) -> None:
-        if self._lost:
-            raise StageLostError(f"stage at {self.port} is lost: {self._lost}", "see above", "polysight-pi home")
+        if self.lost:
+            raise StageLostError(f"stage at {self.port} is lost: {self.lost}", "see above", "polysight-pi home")
         try:
             with self._write_lock:
                 self._serial.write(data)
@@ -219,16 +226,16 @@ class StageLink:
             ) from None
 
     def _die(self, reason: str) -> None:
-        if self._lost or self._closing:
+        if self.lost or self._closing:
             return
-        self._lost = reason
+        self.lost = reason
         self._answers.put(None)
         if self._greeted:
             self._news(StageLost(f"stage at {self.port}: {reason}"))
 
     def _read(self) -> None:
         buffer = b""
-        while not self._closing and not self._lost:
+        while not self._closing and not self.lost:
             try:
                 data = self._serial.read(1)
                 data += self._serial.read(self._serial.in_waiting)

@@ -1,15 +1,19 @@
-"""Whether the wiring of the SYNC_IN lines is right for this computer, and what several lines cost in the IF.
+"""Opens the lines of a rig, after checking that their wiring suits this computer.
 
-The kernel takes a request of several lines as one, but no Pi's GPIO driver writes them as one: they change one after
-another (bcm2835 and bcm2711 tens of nanoseconds apart, rp1 of the Pi 5 some 200). Lines that differ by `t` shift the
-boards' IF by `slope * t` against each other.
+No Pi's GPIO driver writes several lines at once: they change one after another, on bcm2835 and bcm2711 tens of
+nanoseconds apart, on rp1 (Pi 5) some 200. Lines that differ by `t` shift the boards' IF by `slope * t`.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
+from polysight.pi_controller.gpio import GpiodLines, load_gpiod
+from polysight.pi_controller.lines import TriggerLines
+from polysight.pi_controller.sim_lines import SpiWireLines, WireLines
+from polysight.pi_controller.spi import SpiLines
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 
@@ -18,6 +22,23 @@ MODEL_FILE = Path("/proc/device-tree/model")
 APART_NS = 50
 APART_ON_PI_5_NS = 200
 RP1_CHIP = "pinctrl-rp1"
+ONE_LINE = 'use wiring = "spi", or "fanout", with a clock buffer behind one line (docs/how-to/wiring.md)'
+
+
+def open_lines(
+    instrument: Instrument, wires: Path | None, warn: Callable[[str], None], model: str | None = None
+) -> TriggerLines:
+    """The rig's lines on GPIO, or on simulated wires. `warn` takes what this wiring costs on this computer.
+
+    Raises ConfigError or DeviceError when they cannot be had, or this wiring cannot work on this computer (`model`:
+    what it calls itself).
+    """
+    if wires is not None:
+        return (SpiWireLines if instrument.pi.wiring == "spi" else WireLines)(wires, instrument.pi)
+    warning = check_wiring(instrument, read_model() if model is None else model)
+    if warning:
+        warn(warning)
+    return (SpiLines if instrument.pi.wiring == "spi" else GpiodLines)(instrument.pi, load_gpiod())
 
 
 def read_model(file: Path = MODEL_FILE) -> str:
@@ -42,36 +63,14 @@ def skew_in_if_hz(lines: int, apart_ns: float, slope_hz_per_s: float) -> float:
 
 
 def check_wiring(instrument: Instrument, model: str) -> str:
-    """Compare the wiring with the computer.
-
-    Parameters
-    ----------
-    instrument
-        The rig.
-    model
-        From :func:`read_model`.
-
-    Returns
-    -------
-    str
-        A warning with its figures; empty when there is nothing to warn of.
-
-    Raises
-    ------
-    ConfigError
-        when this wiring cannot work on this computer.
-    """
-    pi, chirp, generation = instrument.pi, instrument.chirp, pi_generation(model)
+    """Compare the wiring with the computer. Returns a warning, or nothing. Raises ConfigError for what cannot work."""
+    pi, chirp = instrument.pi, instrument.chirp
     name = model or "this computer"
-    if pi.wiring == "gpiomem" and (generation is None or generation > 4):
-        raise ConfigError(
-            f'wiring = "gpiomem" is for a Raspberry Pi 1 to 4, not for {name}',
-            "it writes registers that only those have",
-            'use wiring = "fanout" with a clock buffer (docs/how-to/wiring.md)',
-        )
+    if pi.wiring == "gpiomem":
+        raise ConfigError('wiring = "gpiomem" is not driven any more', "it wrote registers past the kernel", ONE_LINE)
     if pi.wiring != "lines" or len(pi.sync_out) == 1:
         return ""
-    on_rp1 = pi.gpio_chip == RP1_CHIP or (generation or 0) >= 5
+    on_rp1 = pi.gpio_chip == RP1_CHIP or (pi_generation(model) or 0) >= 5
     apart_ns = APART_ON_PI_5_NS if on_rp1 else APART_NS
     shift_hz = skew_in_if_hz(len(pi.sync_out), apart_ns, chirp.slope_hz_per_s)
     figures = (
@@ -81,8 +80,6 @@ def check_wiring(instrument: Instrument, model: str) -> str:
     )
     if on_rp1:
         raise ConfigError(
-            f'wiring = "lines" does not work on {name}: {figures}',
-            "the Pi 5's GPIO driver paces its writes",
-            'use wiring = "fanout" with a clock buffer (docs/how-to/wiring.md)',
+            f'wiring = "lines" does not work on {name}: {figures}', "the Pi 5's GPIO driver paces its writes", ONE_LINE
         )
     return f'wiring = "lines": {figures}; a clock buffer behind one line (wiring = "fanout") has no such skew'

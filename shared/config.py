@@ -84,7 +84,7 @@ class Pi(Section, frozen=True):
     heartbeat_ms: Count = 500
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
-    gpiomem: str = "/dev/gpiomem"
+    gpiomem: str = "/dev/gpiomem"  # read, as `wiring = "gpiomem"`, and not driven any more
     spi_device: str = "/dev/spidev0.0"
     host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # how often the host says that it lives; 0: never
 

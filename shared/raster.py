@@ -100,6 +100,7 @@ class Stage(Section, frozen=True):
     centre_x_mm: NonNegative = 400.0
     centre_y_mm: NonNegative = 250.0
     backlash_mm: NonNegative = 0.0
+    home_after_scan: bool = False  # counts lost steps; a stage without switches takes any place for its corner
 
     def __post_init__(self) -> None:
         require(self.centre_x_mm <= self.travel_x_mm, "centre_x_mm must lie within travel_x_mm")

@@ -57,6 +57,32 @@ def make_ready(
     else:
         say("home", "homing the stage")
         pi.home()
+    return _await_ready(pi, stop, scan_id)
+
+
+def count_lost_steps(pi: PiClient, stop: StopRequest, say: Callable[[str, str], None]) -> tuple[float, float] | None:
+    """Home once more after the last row, against the switches; None where that was not possible, or not wanted.
+
+    Returns how far in x and y, millimetres, the switches are from where they were by the count of steps: what the
+    drives have lost since the homing before.
+
+    Raises
+    ------
+    ScanError
+        when the stage does not become ready by it.
+    """
+    if stop.after_row or pi.status().state != "ready":
+        return None
+    say("home", "homing the stage once more, to see whether steps were lost")
+    pi.home()
+    if not _await_ready(pi, stop, ""):
+        return None
+    status = pi.status()
+    return status.lost_x_mm, status.lost_y_mm
+
+
+def _await_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
+    """Wait until the stage is ready; False when asked to stop now meanwhile. Raises ScanError."""
     deadline = time.monotonic() + _HOMING_LIMIT_S
     while True:
         status = pi.status()

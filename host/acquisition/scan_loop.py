@@ -18,7 +18,7 @@ from polysight.host.acquisition.progress import (
     time_left,
     usual_row_s,
 )
-from polysight.host.acquisition.ready import check_disk, check_may_move, make_ready
+from polysight.host.acquisition.ready import check_disk, check_may_move, count_lost_steps, make_ready
 from polysight.host.acquisition.row import RowState, RowTaker, RowTransaction
 from polysight.host.acquisition.take import ON_REQUEST, Take, commit_row, gave_up, reasons, reject_row
 from polysight.host.radar import RadarControl
@@ -28,6 +28,7 @@ from polysight.shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
 from polysight.shared.raster import Row
 
 _LOOK_S = 0.05
+_LOST_MM = 0.05  # told as a warning from here on: 9 degrees of phase at 77 GHz
 
 
 class RunningScan:
@@ -58,6 +59,7 @@ class RunningScan:
         self._told_stop = False
         self._was_ready = False  # the stage was, in this run
         self._remedy: Fact = {}  # of the error that ended the scan
+        self._lost: Fact = {}  # what homing after the last row found
         self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
 
     def run(self) -> ScanResult:
@@ -80,6 +82,7 @@ class RunningScan:
                 self._queue.add_earlier(sorted(self._committed))
                 self._keep_radar_report({})
                 self._rows(events)
+                self._count_lost_steps()
                 self._end(begun)
                 events.sync()
         except BaseException as e:
@@ -167,6 +170,25 @@ class RunningScan:
         else:
             self.result.exit_status = "abort"
             self.result.reason = f"stopped on request, {left} of {self._plan.rows} rows are missing"
+
+    def _count_lost_steps(self) -> None:
+        """Home after the last row, and say what the drives have lost. What fails here ends no scan: it is whole."""
+        if not (self._instrument.stage.home_after_scan and self._was_ready and self.result.exit_status == "success"):
+            return
+        try:
+            lost_mm = count_lost_steps(self._pi, self._stop, self._say)
+        except PolysightError as e:
+            warning = f"every row is committed; lost steps were not counted: {e.what}"
+        else:
+            self._lost = {"lost_mm": lost_mm} if lost_mm else {}
+            if lost_mm is None or max(map(abs, lost_mm)) < _LOST_MM:
+                return
+            warning = (
+                f"the drives lost {lost_mm[0]:.3f} mm in x and {lost_mm[1]:.3f} mm in y since the homing before:"
+                " rows may be displaced; look at belts, screws and drivers, and scan again"
+            )
+        self.result.warnings.append(warning)
+        self._say("warning", warning)
 
     def _row(self, row: Row, first_take: int, taker: RowTaker, events: EventWriter) -> None:
         """Take a row until it is whole or the retakes are used up; commit it. Returns uncommitted when aborted."""
@@ -280,6 +302,7 @@ class RunningScan:
                 "exit_status": status,
                 "reason": reason,
                 **self._remedy,
+                **self._lost,
                 "rows_committed": len(self._committed),
                 "events_refetched": self._pi.gaps_filled,
                 "ended_utc": utc_now(),

@@ -65,9 +65,9 @@ def test_a_pi_that_never_ends_homing_is_not_waited_for_for_ever(monkeypatch):
 
 
 def test_the_machine_and_the_host_wait_by_the_same_limit():
-    from polysight.pi_controller import bringup, machine
+    from polysight.pi_controller import machine, stage
 
-    assert machine.HOMING_LIMIT_S == bringup.MOTION_LIMIT_S == HOMING_LIMIT_S < ready._HOMING_LIMIT_S
+    assert machine.LIMITS_S["homing"] == stage.MOTION_LIMIT_S == HOMING_LIMIT_S < ready._HOMING_LIMIT_S
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4])

@@ -62,7 +62,7 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
     assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
 
 
-@pytest.mark.parametrize(("fault", "homes"), [(102, 0), (109, 1)])
+@pytest.mark.parametrize(("fault", "homes"), [(102, 0), (109, 2)])
 def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp_path, fault, homes):
     rig.pi.state, rig.pi.fault, rig.pi.latched = "fault", fault, "told"
     if homes:
@@ -71,13 +71,16 @@ def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp
         with pytest.raises(ScanError, match=explain(fault).what) as e:
             run_scan(rig.instrument, tmp_path / "s")
         assert "polysight-pi home" in e.value.remedy
-    assert commands(rig.pi).count(m.Home) == homes
+    assert commands(rig.pi).count(m.Home) == homes, "at the start, and after the last row"
 
 
 def test_fault_of_a_row_alone_is_retaken_without_homing(rig, tmp_path):
     rig.pi.fail_rows[1, 1] = 108
     assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
-    assert commands(rig.pi).count(m.Home) == 1
+    sent = commands(rig.pi)
+    assert sent.index(m.Home) < sent.index(m.RunRow), "the one at the start"
+    last_row = len(sent) - 1 - sent[::-1].index(m.RunRow)
+    assert m.Home not in sent[sent.index(m.RunRow) : last_row], "none between rows"
 
 
 def test_pi_started_anew_between_rows_ends_the_scan_at_once(rig, tmp_path):
@@ -90,7 +93,7 @@ def test_pi_started_anew_between_rows_ends_the_scan_at_once(rig, tmp_path):
     assert "2 of 4 rows are safe" in e.value.remedy
     assert commands(rig.pi).count(m.Home) == 1
     assert resume_scan(tmp_path / "s").exit_status == "success"
-    assert commands(rig.pi).count(m.Home) == 2, "somebody asked for it"
+    assert commands(rig.pi).count(m.Home) == 3, "somebody asked for it, and after the last row"
 
 
 def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):

@@ -141,8 +141,7 @@ def test_journal(tmp_path):
     """Magic, then `<length, seq, crc32(seq + payload)>`, little-endian, and the event: with struct and zlib alone."""
     journal = Journal(tmp_path / "s.journal")
     sent = [{"scan_id": "s", "seq": k, "t_mono_ns": k, "exit_status": "abort", "reason": "x" * k} for k in (1, 2, 3)]
-    for event in sent:
-        journal.append(pack(RunStopped(**event)))
+    journal.write([pack(RunStopped(**event)) for event in sent])
     journal.close()
     raw = (tmp_path / "s.journal").read_bytes()
     assert raw[:8] == b"PSJRNL1\n"

@@ -7,9 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_burst
-from polysight.pi_controller.trigger_lines import Edge
-from polysight.pi_controller.trigger_loop import BurstSent, Counts, LoopFault, RowJob, TriggerLoop
+from polysight.pi_controller.lines import BurstSpec, Edge
+from polysight.pi_controller.trigger import (
+    FIRST_PULSE_DELAY_NS,
+    BurstSent,
+    Counts,
+    LoopFault,
+    RowJob,
+    TriggerLoop,
+    send_burst,
+)
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import MIN_PERIOD_NS
 from tests.support.pi.fake_lines import FakeLines, gone

@@ -12,9 +12,9 @@ from collections import namedtuple
 import msgspec
 import pytest
 
-from polysight.pi_controller import checks, lines_spi
-from polysight.pi_controller.checks_lines import check_lines, measure_clock
-from polysight.pi_controller.finding import attempt
+from polysight.pi_controller import checks
+from polysight.pi_controller import spi as lines_spi
+from polysight.pi_controller.checks import attempt, check_lines, measure_clock
 from polysight.pi_controller.keys import make_keys
 from polysight.simulators import gpio
 from tests.support.pi.program import run

@@ -7,8 +7,8 @@ import socket
 
 import pytest
 
-from polysight.pi_controller.burst import BurstRecord
 from polysight.pi_controller.cli import main
+from polysight.pi_controller.trigger import BurstRecord
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.simulators.loopback import on_free_subnet
@@ -173,8 +173,8 @@ def test_no_speed_is_not_taken_for_another_one(config, speed, capsys):
 
 def test_pulse_says_why_it_did_not_work(config, monkeypatch, capsys):
     late = BurstRecord(2, 0, 1, 2, 1000, 900, PiFault.PERIOD_TOO_SHORT)
-    monkeypatch.setattr("polysight.pi_controller.service.open_lines", lambda *_: FakeLines())
-    monkeypatch.setattr("polysight.pi_controller.bringup.pulse", lambda *_: [late, late._replace(fault=0), late])
+    monkeypatch.setattr("polysight.pi_controller.wiring.open_lines", lambda *_: FakeLines())
+    monkeypatch.setattr("polysight.pi_controller.trigger.send_bursts", lambda *_: [late, late._replace(fault=0), late])
     monkeypatch.setattr("polysight.pi_controller.realtime.prepare_process", list)
     monkeypatch.setattr("polysight.pi_controller.realtime.prepare_thread", list)
     assert main(["pulse", "--config", str(config)]) == 1
@@ -187,7 +187,7 @@ def test_what_the_system_refuses_is_a_message(config, monkeypatch, capsys):
     def refuse(_):
         raise PermissionError(13, "Permission denied", "/dev/gpiochip0")
 
-    monkeypatch.setattr("polysight.pi_controller.cli._jog", refuse)
+    monkeypatch.setattr("polysight.pi_controller.client.refuse_beside_service", refuse)
     assert main(["jog", "--config", str(config)]) == 5
     said = capsys.readouterr().err
     assert "/dev/gpiochip0: Permission denied" in said

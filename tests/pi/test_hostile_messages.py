@@ -179,7 +179,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     row = 0
     stage.pace_s = 0.05
     host.accepted(m.RunRow(scan_id="scan", row_index=row, take=1, owner="mine"))
-    while sent < amount:
+    while sent < amount or not taken:
         reply = stranger.ask(draw(rng, valid))
         assert reply is not None
         sent += 1
@@ -195,7 +195,6 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
                 while isinstance(host.ask(run), m.Refused) and time.monotonic() < deadline:
                     time.sleep(0.01)
             host.accepted(m.Alive(scan_id="scan", owner="mine"))
-    assert taken >= 1
     assert resident_bytes() - before < BOUND_BYTES
     assert pi.service.executor.crash is None
     host.accepted(m.Abort(owner="mine"))

@@ -20,6 +20,7 @@ from polysight.pi_controller.journal import (
 )
 from polysight.pi_controller.ledger import Ledger
 from polysight.shared.errors import ConfigError, DataError, DeviceError
+from polysight.shared.messages import RunStopped, unpack_event
 from polysight.shared.raster import RasterPlan
 
 payloads = st.lists(st.binary(max_size=40), max_size=12)
@@ -28,8 +29,7 @@ payloads = st.lists(st.binary(max_size=40), max_size=12)
 def written(path, records):
     path.unlink(missing_ok=True)
     j = Journal(path)
-    for r in records:
-        j.append(r)
+    j.write(records)
     j.close()
     return path.read_bytes()
 
@@ -83,8 +83,8 @@ def test_replay_from_any_sequence_over_a_restart(tmp_path_factory, first, second
     written(path, first)
     j = Journal(path)
     assert j.last_seq == len(first)
-    assert [j.append(r) for r in second] == list(range(len(first) + 1, len(first) + len(second) + 1))
-    j.commit()
+    j.write(second)
+    assert j.last_seq == len(first + second)
     assert j.read(seq, limit) == (first + second)[seq - 1 : seq - 1 + limit]
     j.close()
     folder = JournalFolder(path.parent)
@@ -92,20 +92,24 @@ def test_replay_from_any_sequence_over_a_restart(tmp_path_factory, first, second
     folder.close()
 
 
-def test_what_is_in_the_batch_is_not_on_the_disk_until_committed(tmp_path):
-    j = Journal(tmp_path / "a.journal")
-    j.append(b"x")
-    assert (j.last_seq, j.read(1, 9)) == (1, [])
-    j.commit(sync=True)
-    assert j.read(1, 9) == [b"x"]
-    j.close()
+def test_what_is_in_the_batch_is_neither_kept_nor_published_until_committed(tmp_path):
+    folder, published = JournalFolder(tmp_path), []
+    ledger = Ledger(folder, published.extend)
+    ledger.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    for _ in range(2):
+        ledger.add(RunStopped(scan_id="", seq=0, t_mono_ns=0, exit_status="abort"))
+    assert (ledger.last_seq, ledger.replay("s", 1, 9).events, published) == (2, [], [])
+    ledger.commit()
+    assert [e.seq for e in ledger.replay("s", 1, 9).events] == [1, 2]
+    assert [unpack_event(raw).seq for raw in published] == [1, 2]
+    ledger.close()
+    folder.close()
 
 
 @pytest.mark.parametrize("room", [0, 1, 13, 25])
 def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
     j = Journal(tmp_path / "a.journal")
-    j.append(b"kept")
-    j.commit()
+    j.write([b"kept"])
     real, left = os.pwrite, [room]
 
     def full(fd, data, offset):
@@ -116,13 +120,12 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
         return n
 
     monkeypatch.setattr(journal_module.os, "pwrite", full)
-    j.append(b"lost 1")
-    j.append(b"lost 2")
     with pytest.raises(JournalFullError, match="No space left"):
-        j.commit()
+        j.write([b"lost 1", b"lost 2"])
     assert (j.last_seq, j.read(1, 9)) == (1, [b"kept"])
     monkeypatch.undo()
-    assert j.append(b"again") == 2
+    j.write([b"again"])
+    assert j.last_seq == 2
     j.close()
     assert reopened(tmp_path / "a.journal") == [b"kept", b"again"]
 
@@ -155,7 +158,7 @@ def test_numbers_go_on_behind_what_the_host_has(tmp_path_factory, first, passed,
     j = Journal(path)
     assert j.number_behind(passed) == max(0, passed - len(first))
     begin = max(passed, len(first)) + 1
-    assert [j.append(r) for r in second] == list(range(begin, begin + len(second)))
+    j.write(second)
     j.close()
     j = Journal(path)
     numbered = {i + 1: r for i, r in enumerate(first)} | {begin + i: r for i, r in enumerate(second)}
@@ -170,7 +173,8 @@ def test_what_a_power_cut_leaves_of_a_new_journal_is_an_empty_one(tmp_path, left
     path.write_bytes(left)
     j = Journal(path)
     assert (j.last_seq, path.read_bytes()) == (0, MAGIC)
-    assert j.append(b"x") == 1
+    j.write([b"x"])
+    assert j.last_seq == 1
     j.close()
     assert reopened(path) == [b"x"]
 

@@ -14,9 +14,9 @@ from zmq.auth import load_certificate
 
 from polysight.host.acquisition.pi_client import PiClient
 from polysight.pi_controller import checks
+from polysight.pi_controller.checks import attempt
 from polysight.pi_controller.cli import main
 from polysight.pi_controller.executor import Snapshot
-from polysight.pi_controller.finding import attempt
 from polysight.pi_controller.keys import COPY, allow, make_keys, read_allowed, revoke
 from polysight.pi_controller.server import Server
 from polysight.shared import messages as m

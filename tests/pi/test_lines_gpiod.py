@@ -7,9 +7,9 @@ pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip in
 
 from gpiod import line
 
-from polysight.pi_controller.burst import FIRST_PULSE_DELAY_NS, BurstSpec, send_burst
-from polysight.pi_controller.lines_gpiod import EVENT_BUFFER, GpiodLines, find_chip, load_gpiod
-from polysight.pi_controller.trigger_loop import Counts, RowJob, TriggerLoop
+from polysight.pi_controller.gpio import EVENT_BUFFER, GpiodLines, find_chip, load_gpiod
+from polysight.pi_controller.lines import BurstSpec
+from polysight.pi_controller.trigger import FIRST_PULSE_DELAY_NS, Counts, RowJob, TriggerLoop, send_burst
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
 from tests.support.pi.fake_gpiod import FakeChip

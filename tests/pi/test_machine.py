@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.pi_controller.burst import BurstSpec
-from polysight.pi_controller.machine import Machine
-from polysight.pi_controller.row_ending import Parts
+from polysight.pi_controller.lines import BurstSpec, Edge
+from polysight.pi_controller.machine import LIMITS_S, RULES, TOLD, State
+from polysight.pi_controller.row_machine import RowMachine
 from polysight.pi_controller.rows import RefusedError
-from polysight.pi_controller.stage_driver import SILENT_HEARTBEATS, STATUS_PER_HEARTBEAT, read_slice_s
-from polysight.pi_controller.states import MOVES
-from polysight.pi_controller.supervision import StatusWatch, TriggerWatch
-from polysight.pi_controller.trigger_lines import Edge
-from polysight.pi_controller.trigger_loop import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop
+from polysight.pi_controller.stage import SILENT_HEARTBEATS, STATUS_PER_HEARTBEAT, read_slice_s
+from polysight.pi_controller.stage_link import StatusWatch
+from polysight.pi_controller.trigger import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop, TriggerWatch
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault, StageError
 from polysight.shared.raster import Row
 from polysight.shared.stage_line import Immediate, Reply
+from tests.support.paths import REPO
 from tests.support.pi.fake_driver import FakeDriver
 from tests.support.pi.fake_lines import FakeLines
 
 SPEC = BurstSpec(2, 1_500_000, 1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
 SAFE_WITHIN_S = 0.5
+ROW_STATES = ("running", "held", "stopping", "done", "ending")
+SPEC_PAGE = (REPO / "docs/spec/wire.md").read_text(encoding="utf-8").split("## State machine\n")[1].split("\n## ")[0]
 
 
 class FakeLedger:
@@ -46,8 +48,8 @@ class Bench:
         self.lines, self.stage, self.ledger = FakeLines(), FakeDriver(), FakeLedger()
         self.posted: list[Any] = []
         self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
-        parts: Any = (self.stage, self.loop, self.ledger, self.posted.append, lambda _: None, lambda: self.t)
-        self.machine = Machine(Parts(*parts))
+        parts: Any = (self.stage, self.loop, self.ledger, self.posted.append, lambda: self.t)
+        self.machine = RowMachine(*parts)
         self.seqno = 0
 
     def run_posted(self) -> None:
@@ -70,8 +72,8 @@ class Bench:
             self.run_posted()
 
     def homed(self) -> Bench:
-        self.machine.begin_run(0)
-        self.machine.home()
+        self.machine.command("BeginRun", 0)
+        self.machine.command("Home")
         self.run_posted()
         self.stage_says(Reply("ok", self.stage.number))
         self.stage_says(Reply("done", self.stage.number))
@@ -79,7 +81,7 @@ class Bench:
         return self
 
     def start(self) -> None:
-        self.machine.start_row(ROW, 1, SPEC, 20.0)
+        self.machine.command("RunRow", ROW, 1, SPEC, 20.0)
         self.row_number = self.stage.number
 
     def stage_says(self, reply: Reply) -> None:
@@ -107,23 +109,28 @@ class Bench:
 def test_a_row_passes_every_state():
     bench = Bench()
     machine, seen = bench.machine, []
-    go = machine._states.go
-    machine._states.go = lambda state: (seen.append(state), go(state))[1]  # type: ignore[method-assign]
-    machine.home()
+    enter = machine._enter
+    machine._enter = lambda state: (seen.append(state), enter(state))[1]  # type: ignore[method-assign]
+    machine.command("Home")
     bench.run_posted()
     bench.stage_says(Reply("ok", bench.stage.number))
     bench.stage_says(Reply("done", bench.stage.number))
     assert machine.state == "homed", "no run is begun"
-    machine.begin_run(0)
+    machine.command("BeginRun", 0)
     bench.start()
-    machine.hold(True)
-    machine.hold(False)
-    for _ in range(3):
-        bench.edge()
+    machine.command("Hold")
+    machine.command("Resume")
+    bench.edge()
+    bench.edge()
     bench.stage_says(Reply("done", bench.row_number, fields={"points": "3"}))
-    machine.end_run()
-    assert seen == ["homing", "homed", "ready", "running", "held", "running", "done", "ready", "homed"]
-    assert bench.of(m.RowFinished)[-1].status == "done"
+    bench.edge()
+    bench.start()
+    machine.command("Abort", "enough")
+    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    machine.command("EndRun")
+    row = ["running", "held", "running", "done", "ending", "ready", "running", "stopping", "ending", "ready"]
+    assert seen == ["homing", "homed", "ready", *row, "homed"]
+    assert [e.status for e in bench.of(m.RowFinished)] == ["done", "aborted"]
 
 
 def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
@@ -144,12 +151,12 @@ def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
 def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms):
     """From its last sign of life to outputs dead and the stage told to stop, in virtual time."""
     bench = Bench().homed()
-    bench.machine.begin_run(heartbeat_ms)
+    bench.machine.command("BeginRun", heartbeat_ms)
     bench.start()
-    bench.machine.hold(held) if held else None
+    bench.machine.command("Hold") if held else None
     for _ in range(beats):
         bench.later(heartbeat_ms / 1e3)
-        bench.machine.host.heard(bench.t)
+        bench.machine.hear_host()
     assert bench.armed, "a host that is heard is not lost"
     last = bench.t
     while bench.armed:
@@ -211,7 +218,7 @@ def test_a_lost_trigger_line_stops_everything_at_once(lasting):
     assert bench.machine.state == ("fault" if lasting else "ready")
     if lasting:
         with pytest.raises(RefusedError):
-            bench.machine.home()
+            bench.machine.command("Home")
 
 
 def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
@@ -244,13 +251,13 @@ def test_the_first_fault_wins():
     bench = Bench().homed()
     bench.start()
     bench.machine.take_loop_fault(LoopFault(bench.machine.row.job, PiFault.EDGE_LOST, "2 edges lost"))  # type: ignore[union-attr]
-    bench.machine.fail(PiFault.STAGE_LOST, "silent")
+    bench.machine.happen("stage lost", PiFault.STAGE_LOST, "silent")
     bench.run_posted()
     assert (bench.machine.fault, bench.machine.reason) == (PiFault.EDGE_LOST, "2 edges lost")
     assert [e.number for e in bench.of(m.Fault)] == [PiFault.EDGE_LOST, PiFault.STAGE_LOST], "both are told"
     finished = bench.of(m.RowFinished)[-1]
     assert (finished.fault, finished.reason) == (PiFault.EDGE_LOST, "2 edges lost")
-    bench.machine.home()
+    bench.machine.command("Home")
     assert bench.machine.fault == 0
 
 
@@ -268,26 +275,25 @@ def test_whatever_happens(start, actions):
     machine = bench.machine
     if start == "in a row":
         bench.start()
-    states = [machine.state]
     for action in actions:
         before = machine.fault, machine.reason
         cleared = False
         try:
             if action == "home":
-                machine.home()
+                machine.command("Home")
                 bench.run_posted()
                 cleared = True
-            elif action == "begin" and machine.row is None:
-                machine.begin_run(100)
-            elif action == "end run" and machine.row is None:
-                machine.end_run()
-            elif action == "row" and machine.state == "ready":
+            elif action == "begin":
+                machine.command("BeginRun", 100)
+            elif action == "end run":
+                machine.command("EndRun")
+            elif action == "row":
                 bench.start()
                 cleared = True
             elif action in ("hold", "resume"):
-                machine.hold(action == "hold")
+                machine.command(action.title())
             elif action == "abort":
-                machine.abort("asked for")
+                machine.command("Abort", "asked for")
             elif action == "edge":
                 bench.edge()
             elif action == "status":
@@ -306,17 +312,69 @@ def test_whatever_happens(start, actions):
             elif action == "edge lost" and machine.row is not None:
                 machine.take_loop_fault(LoopFault(machine.row.job, PiFault.EDGE_LOST, "lost"))
             elif action == "stage lost":
-                machine.fail(PiFault.STAGE_LOST, "silent")
+                machine.happen("stage lost", PiFault.STAGE_LOST, "silent")
             elif action == "time":
                 bench.later(0.45)
         except RefusedError:
             continue
         bench.run_posted()
-        states.append(machine.state)
         if before[0] and not cleared:
             assert (machine.fault, machine.reason) == before, "the first fault wins"
         assert bench.armed <= (machine.row is not None), "nothing answers an edge without a row"
-        if machine.state in ("idle", "homing", "homed", "ready", "fault") and machine.row is None:
-            assert not bench.armed
+        assert (machine.row is not None) == (machine.state in ROW_STATES)
         assert (machine.row is not None) == (len(bench.of(m.RowStarted)) == len(bench.of(m.RowFinished)) + 1)
-    assert set(states) <= set(MOVES)
+    if machine.row is not None:
+        machine.happen("Resume")  # a held row waits for somebody
+        bench.later(400.0)
+        assert machine.row is None, "every row ends"
+
+
+# --- the table and its page -------------------------------------------------------------------------------------------
+
+
+def cells(row: str) -> list[list[str]]:
+    """Words in backquotes of each cell of a table's row."""
+    return [re.findall(r"`([^`]+)`", cell) for cell in row.strip("|").split("|")]
+
+
+def test_the_page_shows_the_rules():
+    shown = [cells(row) for row in SPEC_PAGE.splitlines() if row.startswith("| `")]
+    rules = [(e[0], tuple(s), tuple(to)) for e, s, to, *_ in (r for r in shown if len(r) == 4)]
+    assert rules == [(r.event, tuple(r.states.split()), tuple(r.leads_to.split())) for r in RULES]
+    told = {s[0]: (to[0] if to else s[0]) for s, to, *_ in (r for r in shown if len(r) == 3)}
+    assert told == {s: TOLD.get(s, s) for s in get_args(State)}
+    limits = {
+        row[0][0]: float(n[0]) for row in shown if len(row) == 3 for n in [row_seconds(SPEC_PAGE, row[0][0])] if n
+    }
+    assert limits == LIMITS_S
+
+
+def row_seconds(page: str, state: str) -> list[str]:
+    line = next(x for x in page.splitlines() if x.startswith(f"| `{state}` |") and x.count("|") == 4)
+    return re.findall(r"(\d+(?:\.\d+)?) s\b", line.split("|")[3])
+
+
+def test_the_rules_are_whole():
+    """Every state can be reached and left, an event has one rule in a state, and rules name only states that are."""
+    states = set(get_args(State))
+    named = [(s, r.event) for r in RULES for s in r.states.split()]
+    assert len(set(named)) == len(named)
+    assert {s for s, _ in named} == states
+    assert {s for r in RULES for s in r.leads_to.split()} <= states | {"same"}
+    reached, todo = set(), ["idle"]
+    while todo:
+        state = todo.pop()
+        if state not in reached:
+            reached.add(state)
+            todo += [to for r in RULES if state in r.states.split() for to in r.leads_to.split() if to != "same"]
+    assert reached == states
+    lasting = {s for r in RULES if r.event == "stage lost" for s in r.states.split()}
+    assert lasting == states, "losing the stage is answered in every state"
+
+
+def test_an_action_leads_where_the_rule_says(monkeypatch):
+    bench = Bench().homed()
+    monkeypatch.setitem(bench.machine._rules, ("ready", "Home"), (["homing"], lambda: "running"))
+    with pytest.raises(RuntimeError, match="Home in state ready does not lead to running"):
+        bench.machine.command("Home")
+    assert bench.machine.state == "ready"

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from polysight.pi_controller.executor import REPLAYED_IN_A_ROW, Executor, Request
 from polysight.pi_controller.journal import JournalFolder
 from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.trigger_loop import TriggerLoop
+from polysight.pi_controller.trigger import TriggerLoop
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import RasterPlan

@@ -330,7 +330,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(inst
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr("threading.excepthook", lambda _: None)
-    monkeypatch.setattr("polysight.pi_controller.machine.Machine.take_burst", fail)
+    monkeypatch.setattr("polysight.pi_controller.row_machine.RowMachine.take_burst", fail)
     service = Service(instrument, Options(wires=hub, stage_port=stage.port))
     with ThreadPoolExecutor(1) as pool:
         served = pool.submit(service.serve)

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.pi_controller.burst import BurstSpec, send_burst
-from polysight.pi_controller.lines_wires import SpiWireLines
+from polysight.pi_controller.lines import FASTEST_HZ, SHORTEST_BYTES, SLOWEST_HZ, BurstSpec, SpiBurst, spi_burst
 from polysight.pi_controller.service import Options, Service
-from polysight.pi_controller.spi_pulses import FASTEST_HZ, SHORTEST_BYTES, SLOWEST_HZ, SpiBurst, spi_burst
+from polysight.pi_controller.sim_lines import SpiWireLines
+from polysight.pi_controller.trigger import send_burst
 from polysight.shared import messages as m
 from polysight.shared.config import Pi
 from polysight.shared.errors import ConfigError
@@ -36,7 +36,7 @@ def ones(data: bytes) -> list[int]:
 @given(bursts)
 def test_one_set_bit_a_pulse_at_its_place(burst):
     pulses, period_ns, width_ns = burst
-    made = spi_burst(pulses, period_ns, width_ns, ROOMY)
+    made = spi_burst(BurstSpec(pulses, period_ns, width_ns), ROOMY)
     assert SLOWEST_HZ <= made.clock_hz <= FASTEST_HZ
     assert 500 <= made.bit_ns <= 2000
     assert MIN_WIDTH_NS <= made.bit_ns <= MAX_WIDTH_NS
@@ -53,22 +53,22 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
 
 @given(bursts, st.integers(SHORTEST_BYTES, 65_536))
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
-    needed = len(spi_burst(*burst, ROOMY).data)
-    slowest = len(spi_burst(*burst[:2], 2000, ROOMY).data)
+    needed = len(spi_burst(BurstSpec(*burst), ROOMY).data)
+    slowest = len(spi_burst(BurstSpec(*burst[:2], 2000), ROOMY).data)
     if slowest > bufsiz:
         with pytest.raises(ConfigError) as e:
-            spi_burst(*burst, bufsiz)
+            spi_burst(BurstSpec(*burst), bufsiz)
         assert f"bytes, spidev {bufsiz}" in e.value.what
         wanted = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
         assert slowest <= wanted
-        spi_burst(*burst, wanted)
+        spi_burst(BurstSpec(*burst), wanted)
     else:
-        assert len(spi_burst(*burst, bufsiz).data) <= min(bufsiz, max(needed, slowest))
+        assert len(spi_burst(BurstSpec(*burst), bufsiz).data) <= min(bufsiz, max(needed, slowest))
 
 
 def test_the_published_burst_fits_every_pi_as_it_comes():
     b = published_rig().burst
-    made = spi_burst(b.pulses, round(b.period_us * 1e3), round(b.width_us * 1e3))
+    made = spi_burst(BurstSpec.of(b))
     assert (made.clock_hz, len(made.data)) == (1_000_000, 2815)
     assert [y - x for x, y in itertools.pairwise(made.bits)] == [1500] * 15
 

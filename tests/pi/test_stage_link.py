@@ -4,7 +4,7 @@ import queue
 
 import pytest
 
-from polysight.pi_controller.bringup import bench_stage
+from polysight.pi_controller.stage import bench_stage
 from polysight.pi_controller.stage_link import StageLink, StageLost, StageLostError, StageRefusedError
 from polysight.shared.faults import StageError
 from polysight.shared.stage_line import Command, Immediate, Reply

@@ -226,7 +226,7 @@ import os, sys
 from datetime import timedelta
 from pathlib import Path
 import gpiod, msgspec
-from polysight.pi_controller.lines_gpiod import GpiodLines, find_chip
+from polysight.pi_controller.gpio import GpiodLines, find_chip
 from polysight.shared.config import load_instrument
 chip = Path(os.environ["GPIOSHIM_CHIP"])
 assert find_chip("pinctrl-bcm2835", gpiod, chip.parent) == str(chip)

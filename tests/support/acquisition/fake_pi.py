@@ -23,6 +23,7 @@ class FakePi:
         self.homed = False
         self.run: m.BeginRun | None = None
         self.state: m.State = "idle"
+        self.homings, self.home_fails, self.lost_mm = 0, set(), (0.0, 0.0)
         self.lose_events = 0  # leave out so many events of PUB
         self.lose_replies = 0
         self.fail_rows: dict[tuple[int, int], int] = {}  # (row, take): fault number
@@ -95,7 +96,8 @@ class FakePi:
         if isinstance(c, m.Status):
             return m.StatusReply(
                 state=self.state, homed=self.homed, x_mm=0, y_mm=0, scan_id=scan, row_index=-1, take=0, points=0,
-                pulses=0, last_seq=last, fault=self.fault, reason=self.latched,
+                pulses=0, last_seq=last, fault=self.fault, reason=self.latched, lost_x_mm=self.lost_mm[0],
+                lost_y_mm=self.lost_mm[1],
             )  # fmt: skip
         if isinstance(c, m.EndRun) and (self.hanging is not None or self.run is None):
             return m.Refused(number=111, what="a row is running" if self.run else "no run is begun")
@@ -106,6 +108,9 @@ class FakePi:
             self._emit(m.RunStopped, exit_status=c.exit_status, reason=c.reason)
         elif isinstance(c, m.Home):
             self.homed, self.state, self.fault, self.latched = True, "ready", 0, ""
+            self.homings += 1
+            if self.homings in self.home_fails:
+                self.homed, self.state, self.fault, self.latched = False, "fault", 102, "the switch was not found"
         elif isinstance(c, m.Replay):
             events = self.journal.get(c.scan_id, [])
             few = events[c.from_seq - 1 :][: min(c.limit, 3)]  # never more than a few, as of a Pi whose row runs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable
 
-from polysight.pi_controller.trigger_lines import Edge
+from polysight.pi_controller.lines import Edge
 from polysight.shared.errors import DeviceError
 
 

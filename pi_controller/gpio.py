@@ -1,7 +1,4 @@
-"""Lines of the Raspberry Pi through libgpiod v2. Runs on any Linux GPIO chip; never run on a Pi by this project yet.
-
-gpiod is imported when the lines are opened, so that everything else runs where it is not installed.
-"""
+"""Lines of the Raspberry Pi through libgpiod v2. Runs on any Linux GPIO chip; never run on a Pi by this project yet."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from polysight.pi_controller.trigger_lines import Clock, Edge
+from polysight.pi_controller.lines import Clock, Edge
 from polysight.shared.config import Pi
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.faults import PiFault
@@ -57,13 +54,7 @@ def load_gpiod() -> ModuleType:
 
 
 def find_chip(name: str, gpiod: Any, devices: Path = Path("/dev")) -> str:
-    """Path of a GPIO chip given by its label (numbers change between kernels) or path.
-
-    Raises
-    ------
-    DeviceError
-        when there is none, listing the labels that there are.
-    """
+    """Path of a GPIO chip by label (numbers change between kernels) or path. Raises DeviceError with the labels."""
     if name.startswith("/"):
         return name
     labels = []
@@ -87,16 +78,10 @@ def find_chip(name: str, gpiod: Any, devices: Path = Path("/dev")) -> str:
 def trigger_settings(pi: Pi, gpiod: Any) -> Any:
     """Settings of the trigger input: rising edges, stamped by the kernel with CLOCK_MONOTONIC, bias, debouncing."""
     line = gpiod.line
-    bias = {
-        "pull-down": line.Bias.PULL_DOWN,
-        "pull-up": line.Bias.PULL_UP,
-        "disabled": line.Bias.DISABLED,
-        "as-is": line.Bias.AS_IS,
-    }
     return gpiod.LineSettings(
         direction=line.Direction.INPUT,
         edge_detection=line.Edge.RISING,
-        bias=bias[pi.trigger_bias],
+        bias=line.Bias[pi.trigger_bias.upper().replace("-", "_")],
         debounce_period=timedelta(microseconds=pi.trigger_debounce_us),
         event_clock=line.Clock.MONOTONIC,
     )
@@ -113,16 +98,12 @@ def request(gpiod: Any, path: str, lines: tuple[int, ...], settings: Any, buffer
     try:
         return gpiod.request_lines(path, {lines: settings}, consumer=CONSUMER, event_buffer_size=buffer)
     except (OSError, ValueError) as e:
-        raise _refused(gpiod, path, lines, e) from None
-
-
-def _refused(gpiod: Any, path: str, lines: tuple[int, ...], e: OSError | ValueError) -> DeviceError:
-    number = e.errno if isinstance(e, OSError) else errno.EINVAL
-    why, remedy = _REASONS.get(number or 0, (f"the kernel says: {e}", "gpioinfo shows what the chip can do"))
-    if number == errno.EBUSY:
-        why = _holders(gpiod, path, lines)
-    names = ", ".join(map(str, lines))
-    return DeviceError(f"fault {int(PiFault.TRIGGER_LINE_LOST)}: GPIO line {names} of {path}: {why}", str(e), remedy)
+        number = e.errno if isinstance(e, OSError) else errno.EINVAL
+        why, remedy = _REASONS.get(number or 0, (f"the kernel says: {e}", "gpioinfo shows what the chip can do"))
+        if number == errno.EBUSY:
+            why = _holders(gpiod, path, lines)
+        where = f"GPIO line {', '.join(map(str, lines))} of {path}"
+        raise DeviceError(f"fault {int(PiFault.TRIGGER_LINE_LOST)}: {where}: {why}", str(e), remedy) from None
 
 
 def _holders(gpiod: Any, path: str, lines: tuple[int, ...]) -> str:
@@ -154,18 +135,21 @@ class MonotonicClock:
 class TriggerInput:
     """The trigger input: rising edges with kernel time stamps, on their clock.
 
-    Raises
-    ------
-    DeviceError
-        when the chip or the line cannot be had.
+    `gpiod` is the module, or a stand-in; `chip_path` replaces the search for the configured label.
+
+    Raises DeviceError when the chip or the line cannot be had.
     """
 
     def __init__(self, pi: Pi, gpiod: Any, chip_path: str | None = None, clock: Clock | None = None) -> None:
-        clock = clock or MonotonicClock()
-        self.now_ns, self.sleep_until = clock.now_ns, clock.sleep_until
+        self._clock = clock or MonotonicClock()
+        self.now_ns = self._clock.now_ns
         self._events: deque[Any] = deque()
         path = chip_path or find_chip(pi.gpio_chip, gpiod)
         self._input = request(gpiod, path, (pi.trigger_in,), trigger_settings(pi, gpiod), EVENT_BUFFER)
+
+    def sleep_until(self, t_ns: int) -> None:
+        """Return at `t_ns`, never before it."""
+        self._clock.sleep_until(t_ns)
 
     def wait_edge(self, limit_s: float) -> Edge | None:
         """The next rising edge. Raises DeviceError when the line is gone."""
@@ -179,32 +163,19 @@ class TriggerInput:
         event = self._events.popleft()
         return Edge(event.timestamp_ns, event.line_seqno)
 
+    def flush(self) -> None:
+        """Nothing is buffered."""
+
     def close(self) -> None:
         """Release the line."""
         self._input.release()
 
 
-class GpiodLines:
-    """Trigger input with kernel time stamps, SYNC_IN outputs with a defined inactive level.
+class GpiodLines(TriggerInput):
+    """The trigger input, and SYNC_IN outputs that are low from the start and, through the kernel, after this program.
 
-    Outputs go low when the lines are released, also by the kernel when this process dies.
-
-    Parameters
-    ----------
-    pi
-        Chip and lines. `wiring = "lines"` drives several outputs in one request: the kernel writes them one after
-        another (docs/how-to/wiring.md).
-    gpiod
-        The module, or a stand-in with its interface.
-    chip_path
-        Chip device; found by the configured label when not given.
-    clock
-        The clock of the chip's edge time stamps.
-
-    Raises
-    ------
-    DeviceError
-        when the chip or a line cannot be had.
+    `wiring = "lines"` drives several outputs in one request; the kernel writes them one after another. Parameters and
+    errors are those of :class:`TriggerInput`.
     """
 
     name: str = GPIOD
@@ -216,15 +187,10 @@ class GpiodLines:
         self._off = dict.fromkeys(pi.sync_out, line.Value.INACTIVE)
         self._output = request(gpiod, path, pi.sync_out, output_settings(gpiod))
         try:
-            self._input = TriggerInput(pi, gpiod, path, clock)
+            super().__init__(pi, gpiod, path, clock)
         except DeviceError:
             self._output.release()
             raise
-        self.now_ns = self._input.now_ns
-
-    def wait_edge(self, limit_s: float) -> Edge | None:
-        """The next rising edge. Raises DeviceError when the line is gone."""
-        return self._input.wait_edge(limit_s)
 
     def sleep_until(self, t_ns: int) -> None:
         """Return at `t_ns`, never before it.
@@ -233,9 +199,9 @@ class GpiodLines:
         processor's caches (measured on a busy machine: periods off by 0.8 instead of 5 us, pulses of 3.5 instead of 5).
         """
         if t_ns - self.now_ns() > SPIN_NS + WARM_NS:
-            self._input.sleep_until(t_ns - WARM_NS)
+            super().sleep_until(t_ns - WARM_NS)
             self.set_output(False)
-        self._input.sleep_until(t_ns)
+        super().sleep_until(t_ns)
 
     def set_output(self, active: bool) -> None:
         """Set all SYNC_IN lines in one call. Raises DeviceError when they are gone."""
@@ -244,16 +210,13 @@ class GpiodLines:
         except OSError as e:
             raise _gone(e) from None
 
-    def flush(self) -> None:
-        """Nothing is buffered."""
-
     def close(self) -> None:
         """Outputs low, lines released."""
         try:
             self.set_output(False)
         finally:
             self._output.release()
-            self._input.close()
+            super().close()
 
 
 def _gone(e: OSError) -> DeviceError:

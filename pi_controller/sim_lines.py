@@ -9,36 +9,21 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from polysight.pi_controller.spi_pulses import DEFAULT_BUFSIZ, SpiBurst
-from polysight.pi_controller.trigger_lines import Edge
+from polysight.pi_controller.lines import DEFAULT_BUFSIZ, Edge, SpiBurst
 from polysight.shared.config import Pi
 from polysight.shared.messages import WIRES
 from polysight.shared.wires import WireClient, WireEdge
 
 
 class WireLines:
-    """Trigger lines on simulated wires.
-
-    Parameters
-    ----------
-    path
-        Unix socket of the hub.
-    pi
-        Which lines.
-
-    Raises
-    ------
-    DeviceError
-        when no hub listens at `path`.
-    """
+    """Trigger lines on simulated wires; `path` is the hub's socket. Raises DeviceError when no hub listens there."""
 
     name: str = WIRES
 
     def __init__(self, path: Path, pi: Pi, timeout_s: float = 10.0) -> None:
         self._trigger, self._outputs = pi.trigger_in, pi.sync_out
         self._client = WireClient(path, listen=(pi.trigger_in,), timeout_s=timeout_s)
-        self._now_ns = 0
-        self._seqno = 0
+        self._now_ns = self._seqno = 0
         self._active = False
         self._unsent: list[WireEdge] = []
 

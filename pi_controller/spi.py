@@ -1,7 +1,7 @@
 """SYNC_IN on MOSI of an SPI controller (spidev), the trigger input through libgpiod. Not run on a Pi yet.
 
-One burst is one transfer, one system call: spi_pulses.py makes its bits. The kernel ends a transfer that has begun also
-when this program is killed, and its last bits are low; the line is low before, between and after.
+One burst is one transfer, one system call. The kernel ends a transfer that has begun also when this program is killed,
+and its last bits are low; the line is low before, between and after.
 Source of the ioctl: Linux, include/uapi/linux/spi/spidev.h.
 """
 
@@ -16,9 +16,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from polysight.pi_controller.lines_gpiod import TriggerInput
-from polysight.pi_controller.spi_pulses import DEFAULT_BUFSIZ, SpiBurst
-from polysight.pi_controller.trigger_lines import Clock, Edge
+from polysight.pi_controller.gpio import TriggerInput
+from polysight.pi_controller.lines import DEFAULT_BUFSIZ, Clock, SpiBurst
 from polysight.shared.config import Pi
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
@@ -39,16 +38,16 @@ _REASONS = {
 }
 
 
-def read_bufsiz(file: Path = BUFSIZ) -> int:
+def read_bufsiz() -> int:
     """Longest transfer that spidev takes, bytes."""
     try:
-        return int(file.read_text())
+        return int(BUFSIZ.read_text())
     except (OSError, ValueError):
         return DEFAULT_BUFSIZ
 
 
 class SpiDevice:
-    """A spidev device. Raises DeviceError when it cannot be had; the line is low from then on."""
+    """A spidev device, low from the start. Raises DeviceError when it cannot be had."""
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -86,14 +85,8 @@ class SpiDevice:
         os.close(self._fd)
 
 
-class SpiLines:
-    """Trigger input with kernel time stamps; SYNC_IN on MOSI.
-
-    Raises
-    ------
-    DeviceError
-        when the SPI device, the chip or the trigger line cannot be had.
-    """
+class SpiLines(TriggerInput):
+    """Trigger input with kernel time stamps; SYNC_IN on MOSI. Raises DeviceError when one cannot be had."""
 
     name: str = SPI
 
@@ -101,15 +94,10 @@ class SpiLines:
         self.bufsiz = read_bufsiz()
         self._device = SpiDevice(pi.spi_device)
         try:
-            self._input = TriggerInput(pi, gpiod, chip_path, clock)
+            super().__init__(pi, gpiod, chip_path, clock)
         except DeviceError:
             self._device.close()
             raise
-        self.now_ns, self.sleep_until = self._input.now_ns, self._input.sleep_until
-
-    def wait_edge(self, limit_s: float) -> Edge | None:
-        """The next rising edge. Raises DeviceError when the line is gone."""
-        return self._input.wait_edge(limit_s)
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
         """Send a burst. Raises DeviceError."""
@@ -118,12 +106,9 @@ class SpiLines:
     def set_output(self, active: bool) -> None:
         """MOSI is low whenever no transfer runs: there is nothing to set."""
 
-    def flush(self) -> None:
-        """Nothing is buffered."""
-
     def close(self) -> None:
         """Lines released; MOSI is low."""
         try:
             self._device.close()
         finally:
-            self._input.close()
+            super().close()

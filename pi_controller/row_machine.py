@@ -1,0 +1,348 @@
+"""What the actions of the state machine (machine.py) do with stage, trigger loop and the running row.
+
+The first fault is kept until the next `Home` or row. Everything here runs in the executor's thread.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.lines import BurstSpec
+from polysight.pi_controller.machine import END_LIMIT_S, Machine
+from polysight.pi_controller.rows import RefusedError, row_duration_s, stage_row
+from polysight.pi_controller.stage import StageDriver
+from polysight.pi_controller.stage_link import StageLostError, StageRefusedError
+from polysight.pi_controller.trigger import BurstSent, Counts, LoopFault, RowJob, TriggerLoop, TriggerWatch
+from polysight.shared import messages as m
+from polysight.shared.errors import ProtocolError
+from polysight.shared.faults import PiFault, StageError, explain
+from polysight.shared.raster import Row
+from polysight.shared.stage_line import HOMING_LIMIT_S, Immediate, Reply
+
+STATUS_EVENT_S = 0.24
+RESTS = 3  # statuses at rest after which the end of a motion counts as lost
+MOVING = ("homing", "running", "held", "stopping")
+NOT_ANY_MORE_HOMED = (
+    StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
+)  # fmt: skip
+
+
+@dataclass
+class RunningRow:
+    """A row that the stage has taken. `status` is set as soon as its end is decided."""
+
+    row: Row
+    take: int
+    job: RowJob
+    sequence: int  # of the stage's ROW, and of its `done`
+    status: m.RowStatus | None = None
+    fault: int = 0
+    reason: str = ""
+    lasting: bool = False  # the state is fault afterwards
+    points: int = 0  # passed, by the stage's count
+    bursts: int = 0  # told to the host
+
+    def judge(self, counts: Counts) -> None:
+        """Decide how a row ended that nothing stopped: `done` if every count agrees, else `fault`."""
+        n, pulses = self.row.points, self.row.points * self.job.spec.pulses
+        if (self.points, *counts) == (n, n, n, pulses):
+            self.status = "done"
+            return
+        self.status, self.fault = "fault", int(PiFault.POINTS_MISMATCH)
+        self.reason = (
+            f"{n} points asked for, {self.points} passed by the stage, {counts.edges} edges seen, "
+            f"{counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
+        )
+
+
+class RowMachine(Machine):
+    """The machine with its actions. `post` puts a call behind everything that waits in the executor's queue."""
+
+    def __init__(
+        self,
+        stage: StageDriver,
+        loop: TriggerLoop,
+        ledger: Ledger,
+        post: Callable[[Callable[[], object]], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(post, clock)
+        self.stage, self._loop, self._ledger = stage, loop, ledger
+        self.row: RunningRow | None = None
+        self.homed = self.in_run = False
+        self.fault = 0  # the first one; its reason is in `reason`
+        self.lost_mm = (0.0, 0.0)  # found by the last homing
+        self._homing, self._homing_underway = -1, False  # sequence of HOME; whether the stage has taken it
+        self._lines_dead = self._terminating = False
+        self._rests, self._watch = 0, TriggerWatch()
+        self._status_told_s = 0.0
+
+    # --- what comes by itself ---------------------------------------------------------------------------------------
+
+    def take_burst(self, sent: BurstSent) -> None:
+        """A burst has ended."""
+        row, r = self.row, sent.record
+        if row is None or sent.job != row.job or not r.pulses:
+            return
+        self.emit(
+            m.Capture, row_index=row.row.index, take=row.take, point=sent.point, column=row.row.column(sent.point),
+            edge_ns=sent.edge_ns, first_pulse_ns=r.first_ns, last_pulse_ns=r.last_ns, pulses=r.pulses,
+            width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns,
+        )  # fmt: skip
+        row.bursts += 1
+        if row.bursts >= row.row.points:
+            self.happen("all sent")
+
+    def take_loop_fault(self, fault: LoopFault) -> None:
+        """The trigger loop has given up: this row, or for good."""
+        if fault.job is None:
+            self._lines_dead = True
+            self.happen("lasting fault", fault.number, fault.detail)
+        elif self.row is not None and fault.job == self.row.job:
+            self.happen("row fault", fault.number, fault.detail)
+
+    def take_stage(self, reply: Reply) -> None:
+        """What the stage tells by itself."""
+        homing, homed = self.state == "homing", reply.sequence == self._homing
+        if reply.kind == "status":
+            self._take_status(reply)
+        elif reply.kind == "ok":
+            self._homing_underway |= homing and homed
+        elif homing and not self._homing_underway:
+            pass  # from before homing: it began with clearing
+        elif reply.kind == "banner":
+            self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: its banner came")
+        elif reply.kind == "alarm" and reply.number == StageError.STOPPED:
+            self.happen("stopped")
+        elif reply.kind == "alarm":
+            e = explain(reply.number)
+            what = f"stage alarm {reply.number}: {e.what} ({e.why}); {e.remedy}"
+            self.happen("stage lost", PiFault.STAGE_ALARM, what)
+        elif reply.kind == "done" and (homed if homing else self.row and reply.sequence == self.row.sequence):
+            self.stage.note_position(reply)
+            self.happen("homed" if homing else "passed", reply)
+
+    def _take_status(self, reply: Reply) -> None:
+        self.stage.note_position(reply)
+        self._tell_status(reply)
+        row, edges = self.row, self._loop.counts.edges
+        if row is not None and self.state in MOVING:
+            row.points = max(0, _number(reply, "points"))
+            if self.state != "stopping" and self._watch.is_silent(row.points, edges):
+                silent = f"the stage has passed {row.points} points, {edges} edges were seen: wire off?"
+                self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, silent)
+        waits = self.state in MOVING and (row is not None or self._homing_underway)
+        at_rest = reply.fields.get("state") in ("idle", "alarm")
+        self._rests = self._rests + 1 if waits and at_rest else 0
+        if self._rests >= RESTS:
+            self._rests = 0
+            try:
+                self.stage.ask_how_it_ended()
+            except StageLostError as e:
+                self.happen("stage lost", PiFault.STAGE_LOST, str(e))
+
+    def _tell_status(self, reply: Reply) -> None:
+        now = self._clock()
+        if now - self._status_told_s < (STATUS_EVENT_S if self.state in MOVING else 1.0):
+            return
+        self._status_told_s = now
+        self.emit(
+            m.StageStatus, state=reply.fields.get("state", ""), x_mm=self.stage.x_mm, y_mm=self.stage.y_mm,
+            points=max(0, _number(reply, "points")), alarm=_number(reply, "alarm"),
+        )  # fmt: skip
+
+    # --- actions: homing and rows -----------------------------------------------------------------------------------
+
+    def _home(self) -> None:
+        if self._lines_dead:
+            remedy = "find out why, then start polysight-pi again"
+            raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
+        self.homed = self._homing_underway = self._ledger.broken = False
+        self.fault, self.reason = 0, ""
+        self._post(self._home_now)
+
+    def _home_now(self) -> None:
+        if self.state != "homing":
+            return
+        try:
+            self.stage.connect()
+            self._homing = self.stage.home()
+        except StageRefusedError as e:
+            self.happen("stage lost", PiFault.STAGE_ALARM, str(e))
+        except StageLostError as e:
+            self.happen("stage lost", PiFault.STAGE_LOST, str(e))
+
+    def _note_homed(self, reply: Reply) -> str:
+        self.stage.at_rest()
+        k = self.stage.config.steps_per_mm
+        self.lost_mm = (_number(reply, "lostx") / k, _number(reply, "losty") / k)
+        self.homed = True
+        return "ready" if self.in_run else "homed"
+
+    def _begin_run(self, heartbeat_ms: int) -> None:
+        self.in_run = True
+        self.promise(heartbeat_ms)
+
+    def _end_run(self) -> None:
+        self.in_run = False
+
+    def _start_row(self, row: Row, take: int, spec: BurstSpec, speed_mm_s: float) -> None:
+        job = self._loop.arm(RowJob(row.index, take, row.points, spec))
+        try:
+            sequence = self.stage.row(stage_row(row, self.stage.config, speed_mm_s))
+        except StageRefusedError as e:
+            self._loop.disarm()
+            if e.number in NOT_ANY_MORE_HOMED:
+                self.happen("not homed")
+            raise RefusedError(e.number, e.what, e.why, e.remedy) from None
+        except StageLostError as e:
+            self._loop.disarm()
+            self.happen("stage lost", PiFault.STAGE_LOST, str(e))
+            raise RefusedError(PiFault.STAGE_LOST, e.what, e.why, e.remedy) from None
+        self.row = RunningRow(row, take, job, sequence)
+        self.row_limit_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
+        self._rests, self._watch = 0, TriggerWatch()
+        self.fault, self.reason = 0, ""
+        self.emit(m.RowStarted, row=row, take=take)
+
+    def _hold(self, byte: Immediate = Immediate.HOLD) -> None:
+        try:
+            self.stage.send(byte)
+        except StageLostError as e:
+            raise RefusedError(PiFault.STAGE_LOST, e.what, e.why, e.remedy) from None
+
+    def _resume(self) -> None:
+        self._hold(Immediate.RESUME)
+
+    # --- actions: how a row ends ------------------------------------------------------------------------------------
+
+    def _decide(self, status: m.RowStatus, number: int, reason: str, lasting: bool = False) -> None:
+        """How the row ends. The first decision stays."""
+        if self.row is not None:
+            self.row.lasting |= lasting
+            if self.row.status is None:
+                self.row.status, self.row.fault, self.row.reason = status, int(number), reason
+                self._loop.disarm()
+
+    def _stop(self, *_: object) -> str | None:
+        """Stop what moves. Returns `ending` for a row that cannot be stopped."""
+        if self.state in ("homing", "running", "held"):
+            try:
+                self.stage.send(Immediate.STOP)
+            except StageLostError:
+                return "ending" if self.row else None
+        return None
+
+    def _disarm(self) -> None:
+        self._loop.disarm()
+
+    def _abort(self, reason: str) -> str | None:
+        self._decide("aborted", PiFault.ABORTED, reason)
+        return self._stop()
+
+    def terminate(self) -> bool:
+        """The program is told to end: stop what moves. Returns whether a row has to end first."""
+        self._terminating = True
+        self.happen("Abort", "polysight-pi was told to end")
+        if self.state == "stopping":
+            self._deadline_s = self._clock() + END_LIMIT_S
+        return self.row is not None
+
+    def _fail_row(self, number: int, reason: str) -> str | None:
+        self._tell_fault(number, reason)
+        self._decide("fault", number, reason)
+        return self._stop()
+
+    def _fail(self, number: int, reason: str) -> str | None:
+        self._tell_fault(number, reason)
+        self._decide("fault", number, reason, lasting=True)
+        return self._stop()
+
+    def _lose_stage(self, number: int, reason: str) -> None:
+        """Lost, in alarm, or reset: nothing can be stopped any more."""
+        self.homed = False
+        self.stage.at_rest()
+        if self.state != "fault":
+            self._tell_fault(number, reason)
+        self._decide("fault", number, reason, lasting=True)
+
+    def _lose_position(self) -> None:
+        self.homed = False
+
+    def _time_out(self) -> None:
+        if not self._terminating:
+            words = {
+                "homing": f"not homed after {HOMING_LIMIT_S} s",
+                "running": f"the row has not ended after {self.row_limit_s:.0f} s",
+                "stopping": "the stage did not stop",
+            }
+            self._lose_stage(PiFault.STAGE_LOST, words[self.state])
+
+    def _note_passed(self, reply: Reply) -> str | None:
+        row = self._current
+        self.stage.at_rest()
+        row.points = max(0, _number(reply, "points", row.row.points))
+        if _number(reply, "held"):
+            row.reason = "held on the way: some positions were passed below full speed"
+        return "ending" if row.bursts >= row.row.points else None
+
+    def _note_stopped(self, reply: Reply | None = None) -> None:
+        """The stage rests after STOP, or had come to the row's end by itself when STOP arrived."""
+        if reply is not None:
+            self._current.points = max(0, _number(reply, "points", self._current.row.points))
+        self._decide("aborted", PiFault.ABORTED, "the stage was stopped")
+        self._clear_alarm()
+
+    def _clear_alarm(self) -> None:
+        """Clear the alarm that STOP latches; the stage keeps its position."""
+        self.stage.at_rest()
+        try:
+            self.stage.clear()
+        except StageRefusedError as e:
+            self.homed = self.homed and e.number not in NOT_ANY_MORE_HOMED
+        except StageLostError as e:
+            self._post(partial(self.happen, "stage lost", PiFault.STAGE_LOST, str(e)))
+
+    def _finish_row(self) -> str:
+        row, counts = self._current, self._loop.disarm()
+        if row.status is None:
+            row.judge(counts)
+            if row.fault:
+                self._tell_fault(row.fault, row.reason)
+        self.emit(
+            m.RowFinished, row_index=row.row.index, take=row.take, status=row.status, points=row.points,
+            **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by(row.job.spec),
+        )  # fmt: skip
+        self.row = None
+        return "fault" if row.lasting else "ready" if self.homed else "idle"
+
+    @property
+    def _current(self) -> RunningRow:
+        if self.row is None:
+            raise RuntimeError(f"state {self.state} without a row")
+        return self.row
+
+    # --- events -----------------------------------------------------------------------------------------------------
+
+    def _tell_fault(self, number: int, reason: str) -> None:
+        table = explain(number)
+        if not self.fault:
+            self.fault, self.reason = int(number), reason
+        self.emit(m.Fault, number=int(number), what=f"{table.what}: {reason}", why=table.why, remedy=table.remedy)
+
+    def emit(self, kind: Any, **fields: Any) -> None:
+        """Add an event to the ledger; words are cut to what a reader takes."""
+        fields = {k: v[: m.MOST_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
+        self._ledger.add(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
+
+
+def _number(reply: Reply, key: str, absent: int = 0) -> int:
+    try:
+        return reply.integer(key)
+    except ProtocolError:
+        return absent

@@ -20,10 +20,12 @@ LIMIT_S = 60.0
 class HostSide:
     """Commands, and every event seen."""
 
-    def __init__(self, command_address: str, event_address: str, instrument: Instrument) -> None:
+    def __init__(
+        self, command_address: str, event_address: str, instrument: Instrument, key_dir: Path = Path("none")
+    ) -> None:
         self.context: Any = zmq.Context()
-        self.commands = requester(self.context, command_address, Path("none"))
-        self.subscriber = subscriber(self.context, event_address, Path("none"))
+        self.commands = requester(self.context, command_address, key_dir)
+        self.subscriber = subscriber(self.context, event_address, key_dir)
         self.instrument = instrument
         self.events: list[Any] = []
         self.wait(m.Heartbeat)  # the subscription has arrived

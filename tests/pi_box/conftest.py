@@ -1,0 +1,185 @@
+"""A Pi 3B on QEMU with this release installed as docs/how-to/install.md says, and its host outside."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import tomli_w
+
+from polysight.shared.config import Instrument
+from polysight.shared.tables import to_builtins
+from polysight.simulators.uno import ENABLING_COMMAND, missing
+from tests.pi_box.box import Box
+from tests.pi_box.uno import Uno
+from tests.support.paths import BIN, REPO
+from tests.support.pi.host_side import HostSide
+from tests.support.rigs import published_rig, timed_by_the_program
+
+HERE = Path(__file__).parent
+PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
+INSTALL_LIMIT_S = 1800
+READY_LIMIT_S = 300.0
+
+
+def tell(text: str) -> None:
+    """One line to standard output, which `make test-pi` shows."""
+    sys.stdout.write(text + "\n")
+
+
+def rig_of_the_box() -> Instrument:
+    """The published rig, SYNC_IN on a GPIO line with a one-shot: QEMU has no SPI controller, nor a Pi's speed."""
+    rig = timed_by_the_program(published_rig())
+    replace = msgspec.structs.replace
+    return replace(
+        rig,
+        stage=replace(rig.stage, port="/dev/polysight-stage", heartbeat_ms=5000),
+        pi=replace(rig.pi, one_shot=True, command_address="tcp://0.0.0.0:5601", event_address="tcp://0.0.0.0:5602"),
+    )
+
+
+class InstalledPi:
+    """The box with a release on it, the stage at its USB port, and the host's folder of keys."""
+
+    def __init__(self, box: Box, uno: Uno, work: Path) -> None:
+        self.box, self.uno, self.work = box, uno, work
+        self.rig = rig_of_the_box()
+        self.keys = work / "keys"
+
+    def install(self) -> str:
+        """`make pi-install`, as on a host; what it prints."""
+        (self.work / "installed").touch()  # for make: the environment of these tests is the one it would make
+        make = ["make", "pi-install", f"HOST=-F {self.box.ssh_config} box", f"OUT={self.work / 'out'}"]
+        make += [f"VENV={self.work}", f"BIN={BIN}"]
+        done = subprocess.run(make, cwd=REPO, capture_output=True, text=True, timeout=INSTALL_LIMIT_S, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def configure(self, rig: Instrument | None = None) -> None:
+        """Write the rig file."""
+        text = tomli_w.dumps(to_builtins(rig or self.rig)).encode()
+        self.box.run("sudo tee /etc/polysight/instrument.toml >/dev/null", text)
+
+    def make_keys(self) -> None:
+        """Make keys on the Pi and bring the host its two."""
+        self.box.run(f"sudo -u polysight {PROGRAM} keys --dir /etc/polysight/keys")
+        self.fetch_keys(self.keys, "host")
+
+    def fetch_keys(self, folder: Path, client: str) -> None:
+        """A client's keys, under the names that a host's have."""
+        folder.mkdir(mode=0o700)
+        for there, here in (("pi.key", "pi.key"), (f"{client}.key_secret", "host.key_secret")):
+            (folder / here).write_text(self.box.run(f"sudo cat /etc/polysight/keys/{there}"))
+
+    def systemctl(self, words: str) -> str:
+        """`sudo systemctl ...`."""
+        return self.box.run(f"sudo systemctl {words}")
+
+    def shown(self, name: str) -> str:
+        """A property of the service."""
+        return self.box.run(f"systemctl show --value --property={name} polysight-pi").strip()
+
+    def until_ready(self) -> None:
+        """Until the service has told systemd that it is ready."""
+        self.box.wait(lambda: self.shown("ActiveState") == "active", f"the service runs\n{self.log()}", READY_LIMIT_S)
+
+    def log(self) -> str:
+        """The service's log."""
+        return self.box.run("sudo journalctl --unit polysight-pi --output cat --lines 40 --no-pager")
+
+    def start(self) -> None:
+        """Start the service and wait until it is ready."""
+        self.systemctl("reset-failed polysight-pi")
+        done = self.box.try_run("sudo systemctl start polysight-pi")
+        assert done.returncode == 0, self.log()
+
+    def addresses(self) -> tuple[str, str]:
+        """Where the host reaches it. 0.0.0.0 leads here too, and is none of the addresses that need no keys."""
+        return f"tcp://0.0.0.0:{self.box.command_port}", f"tcp://0.0.0.0:{self.box.event_port}"
+
+    def on_host(self, *words: str) -> str:
+        """Run `polysight-pi` on the host, with a rig file that names the box and the host's keys; what it prints."""
+        command, event = self.addresses()
+        there = msgspec.structs.replace(
+            self.rig.pi, command_address=command, event_address=event, key_dir=str(self.keys)
+        )
+        config = self.work / "host.toml"
+        config.write_bytes(tomli_w.dumps(to_builtins(msgspec.structs.replace(self.rig, pi=there))).encode())
+        program = [BIN / "polysight-pi", *words, "--config", config]
+        done = subprocess.run(program, cwd=REPO, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def host(self) -> HostSide:
+        """A host with the keys, connected."""
+        return HostSide(*self.addresses(), self.rig, self.keys)
+
+    def release(self) -> str:
+        """The release in use."""
+        return self.box.run("readlink /opt/polysight/venv").strip()
+
+    def check(self) -> dict[str, dict[str, Any]]:
+        """What `polysight-pi check` finds, by name, run as the service's user."""
+        command = f"sudo -u polysight {PROGRAM} check --json --config /etc/polysight/instrument.toml"
+        done = self.box.try_run(command)
+        assert done.returncode in (0, 1), done.stderr
+        findings = {f["name"]: f for f in json.loads(done.stdout)}
+        assert done.returncode == any(f["verdict"] == "fail" for f in findings.values())
+        return findings
+
+
+@pytest.fixture(scope="session")
+def image(request: pytest.FixtureRequest) -> Path:
+    """Folder with the card's image and the kernel."""
+    if not request.config.getoption("--pi-box"):
+        pytest.skip("not asked for: `make test-pi` builds a Debian for a Pi (10 minutes, once) and runs these too")
+    if lacking := missing():
+        pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
+    if shutil.which("qemu-system-aarch64") is None:
+        pytest.skip("no QEMU: `sudo apt-get install qemu-system-arm` runs these tests too")
+    command = ["env", f"PYTHON={sys.executable}", str(HERE / "build_root.sh")]
+    built = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    assert built.returncode == 0, "the Pi's Debian was not built: see above"
+    return Path(built.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="session")
+def pi(image: Path) -> Iterator[InstalledPi]:
+    """The Pi, switched on, with this release installed and its service running."""
+    with tempfile.TemporaryDirectory(prefix="pi-box-") as folder:
+        work = Path(folder)
+        rig_file = work / "instrument.toml"
+        rig_file.write_bytes(tomli_w.dumps(to_builtins(rig_of_the_box())).encode())
+        uno = Uno(rig_file, work)
+        try:
+            box = Box(image, work, uno.port)
+            try:
+                pi = InstalledPi(box, uno, work)
+                begun = time.monotonic()
+                pi.install()
+                tell(f"booted in {box.boot_s:.0f} s, first installation {time.monotonic() - begun:.0f} s")
+                pi.configure()
+                pi.make_keys()
+                pi.start()
+                yield pi
+            finally:
+                box.close()
+        finally:
+            uno.close()
+
+
+@pytest.fixture
+def host(pi: InstalledPi) -> Iterator[HostSide]:
+    """The host, connected with its keys."""
+    host = pi.host()
+    yield host
+    host.close()

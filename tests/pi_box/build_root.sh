@@ -32,9 +32,23 @@ rm -rf "$work"
 mkdir -p "$work/box" "$work/wheels"
 trap 'rm -rf "$work"' EXIT
 
+libraries() { # $1: a release as install.sh would begin one, with its libraries: an emulated processor takes long over pip
+  "${PYTHON:-python3}" -m pip download "${for_the_pi[@]}" --dest "$work/wheels" --requirement "$pins"
+  "${PYTHON:-python3}" -m pip install "${for_the_pi[@]}" --target "$1/lib/python3.11/site-packages" --requirement "$pins" pip setuptools
+  rm -rf "$1/lib/python3.11/site-packages/bin"
+  mkdir "$1/bin"
+  ln -s /usr/bin/python3 "$1/bin/python3"
+  ln -s python3 "$1/bin/python"
+  ln -s lib "$1/lib64"
+  printf 'home = /usr/bin\ninclude-system-site-packages = false\nversion = 3.11.2\n' >"$1/pyvenv.cfg"
+}
+
 customize() { # $1: the root
   install -d -m 755 "$1/opt/wheels" "$1/etc/systemd/network"
   cp "$work"/wheels/*.whl "$1/opt/wheels/"
+  install -d -m 755 "$1/opt/polysight/releases"
+  cp -a "$work/release" "$1/opt/polysight/releases/0"
+  ln -s releases/0 "$1/opt/polysight/venv"
   printf '[global]\nno-index = true\nfind-links = /opt/wheels\n' >"$1/etc/pip.conf"
   echo pibox >"$1/etc/hostname"
   printf '127.0.0.1 localhost\n127.0.1.1 pibox\n' >"$1/etc/hosts"
@@ -48,7 +62,7 @@ customize() { # $1: the root
   chroot "$1" chown -R pi: /home/pi/.ssh
   chroot "$1" systemctl enable systemd-networkd ssh
   chroot "$1" systemctl mask apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer e2scrub_all.timer \
-    e2scrub_reap.service fstrim.timer getty@tty1.service serial-getty@ttyAMA0.service
+    e2scrub_reap.service fstrim.timer getty@tty1.service serial-getty@ttyAMA0.service systemd-logind.service
   touch "$1/etc/.updated" "$1/var/.updated" # up to date: nothing to be made anew at the first start
   cp "$1"/boot/vmlinuz-* "$work/box/vmlinuz"
   cp "$1"/boot/initrd.img-* "$work/box/initrd"
@@ -56,8 +70,9 @@ customize() { # $1: the root
 }
 
 {
-  "${PYTHON:-python3}" -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: --python-version 3.11 --implementation cp \
-    --platform manylinux2014_aarch64 --platform manylinux_2_28_aarch64 --dest "$work/wheels" --requirement "$pins"
+  for_the_pi=(--quiet --disable-pip-version-check --no-deps --only-binary=:all: --python-version 3.11 --implementation cp)
+  for_the_pi+=(--platform manylinux2014_aarch64 --platform manylinux_2_28_aarch64)
+  libraries "$work/release"
   ssh-keygen -q -t ed25519 -N '' -C pi-box -f "$work/box/key"
   if [ ! -e /proc/sys/fs/binfmt_misc/qemu-aarch64 ]; then
     [ -e /proc/sys/fs/binfmt_misc/register ] || mount -t binfmt_misc none /proc/sys/fs/binfmt_misc
@@ -72,7 +87,7 @@ customize() { # $1: the root
   export work
   # The card's driver and what it needs, instead of every driver there is: the RAM disk is unpacked by an emulated processor.
   mmdebstrap --arch=arm64 --variant=minbase \
-    --include=systemd-sysv,dbus,udev,kmod,iproute2,openssh-server,sudo,python3-venv,linux-image-arm64,initramfs-tools,zstd,gpiod \
+    --include=systemd-sysv,udev,kmod,procps,openssh-server,sudo,python3-venv,linux-image-arm64,initramfs-tools,zstd,gpiod \
     --aptopt='Acquire::Languages "none"' --aptopt='APT::Install-Recommends "false"' --dpkgopt=force-unsafe-io "${left_out[@]}" \
     --setup-hook='mkdir -p "$1/etc/initramfs-tools/conf.d" "$1/usr/share/initramfs-tools/modules.d"' \
     --setup-hook='echo MODULES=list >"$1/etc/initramfs-tools/conf.d/box"' \

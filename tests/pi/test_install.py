@@ -175,6 +175,26 @@ def test_a_release_that_cannot_be_installed_changes_nothing(bench, tmp_path):
     assert sorted(p.name for p in (opt / "releases").iterdir()) == before
 
 
+def test_nobody_goes_back_to_a_release_that_was_not_finished(bench, tmp_path):
+    """The power is cut while pip installs: its folder is there, and it was never in use."""
+    copied = tmp_path / "copied"
+    shutil.copytree(PI, copied)
+    (copied / "a.whl").touch()
+    shutil.copy(REPO / "instrument.toml", copied)
+    install = [copied / "install.sh"]
+    python = tmp_path / "root/opt/polysight/venv/bin/python"
+    assert subprocess.run(install, env=bench, check=False).returncode == 0
+    whole = python.read_text()
+    python.write_text(STUB + "kill -9 $PPID\n")
+    assert subprocess.run(install, env=bench, check=False).returncode == -9
+    opt = tmp_path / "root/opt/polysight"
+    assert (opt / "venv").readlink() == Path("releases/1")
+    python.write_text(whole)
+    assert subprocess.run(install, env=bench, check=False).returncode == 0
+    assert subprocess.run([*install, "--roll-back"], env=bench, check=False).returncode == 0
+    assert (opt / "venv").readlink() == Path("releases/1")
+
+
 def test_a_pi_that_lacks_a_library_and_the_internet_is_told_so(bench, tmp_path):
     (tmp_path / "bin/pip").write_text(STUB + "exit 1\n")
     done = subprocess.run([PI / "install.sh"], env=bench, capture_output=True, text=True, check=False)

@@ -19,7 +19,8 @@ SELECT, SET, CLEAR, LEVEL = 0x00, 0x1C, 0x28, 0x34  # offsets of registers, BCM2
 # Only what hangs reaches these: a busy computer has needed 5 minutes to boot.
 BOOT_LIMIT_S = 3600.0
 COMMAND_LIMIT_S = 1800.0
-KERNEL_LINE = "console=ttyAMA0,115200 root=/dev/mmcblk0 rw rootwait net.ifnames=0 loglevel=3 systemd.default_timeout_start_sec=3600"
+KERNEL_LINE = "console=ttyAMA0,115200 root=/dev/mmcblk0 rw rootwait net.ifnames=0 loglevel=3"
+KERNEL_LINE += " systemd.default_timeout_start_sec=3600"
 
 
 class Write(NamedTuple):

@@ -128,7 +128,7 @@ class InstalledPi:
 
     def host(self) -> HostSide:
         """A host with the keys, connected."""
-        return HostSide(*self.addresses(), self.rig, self.keys)
+        return HostSide(*self.addresses(), self.rig, self.keys, READY_LIMIT_S)
 
     def release(self) -> str:
         """The release in use."""

@@ -25,6 +25,7 @@ from tests.support.rigs import published_rig
 
 SYNC_OUT = 22
 INPUT, OUTPUT = 0, 1
+TRIES = 5
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
@@ -40,8 +41,17 @@ def bench(pi: InstalledPi) -> Iterator[InstalledPi]:
 @pytest.fixture
 def homed(host: HostSide) -> HostSide:
     """The host, after homing."""
-    host.home()
+    home(host)
     return host
+
+
+def home(host: HostSide) -> None:
+    """Home the stage. The Pi calls it lost when a busy computer keeps the two apart for a second: then once more."""
+    for _ in range(TRIES):
+        host.accepted(m.Home())
+        if host.until_state("homed", "ready", "fault").state != "fault":
+            return
+    raise AssertionError(host.ask(m.Status()))
 
 
 def pid_of(pi: InstalledPi) -> str:
@@ -88,7 +98,7 @@ def test_the_service_has_the_rights_that_its_unit_promises(pi: InstalledPi):
 
 def test_a_host_with_the_keys_is_answered_and_one_without_is_refused(pi: InstalledPi, host: HostSide, tmp_path: Path):
     hello = host.ask(m.Hello())
-    assert (hello.backend, hello.state) == ("gpiod", "unhomed")
+    assert (hello.backend, hello.state) == ("gpiod", "idle")
     assert hello.firmware
     pi.box.run(f"sudo -u polysight {PROGRAM} keys --dir /etc/polysight/keys --client second")
     pi.fetch_keys(tmp_path / "second", "second")
@@ -198,7 +208,7 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed:
          f" {pi.rig.stage.heartbeat_ms / 1e3:g} s here); the service was ready after {seconds(begun)}")  # fmt: skip
     assert pid_of(pi) != killed
     back = pi.host()
-    assert back.ask(m.Hello()).state == "unhomed"
+    assert back.ask(m.Hello()).state == "idle"
     assert back.replay("killed")[: len(homed.journalled)] == homed.journalled
     back.close()
 
@@ -218,7 +228,7 @@ def test_a_stage_whose_cable_was_pulled_is_homed_again_from_the_host(pi: Install
     pi.box.wait(lambda: not homed.ask(m.Status()).homed, "the stage is lost")
     pi.box.plug()
     pi.box.wait(lambda: pi.box.try_run("test -e /dev/polysight-stage").returncode == 0, "the port is back")
-    homed.home()
+    home(homed)
     assert pi.uno.stands_at_mm == (0.0, 0.0)
 
 
@@ -275,5 +285,5 @@ def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, home
     tell(f"power cut: logged in again after {pi.box.boot_s:.0f} s")
     back = pi.host()
     assert back.replay("cut")[: len(homed.journalled)] == homed.journalled
-    assert back.ask(m.Hello()).state == "unhomed"
+    assert back.ask(m.Hello()).state == "idle"
     back.close()

@@ -88,7 +88,8 @@ class Box:
         forwards = "".join(f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for inner, outer in forward.items())
         command = ["qemu-system-aarch64", "-M", "raspi3b", "-display", "none", "-msg", "timestamp=on"]
         command += ["-kernel", str(image / "vmlinuz"), "-initrd", str(image / "initrd"), "-dtb", str(image / "pi.dtb")]
-        command += ["-append", KERNEL_LINE, "-serial", f"file:{self.console}", "-D", str(self._trace)]
+        clock = f"systemd.clock_usec={time.time_ns() // 1000}"  # a Pi has no battery for its clock either, but the net
+        command += ["-append", f"{KERNEL_LINE} {clock}", "-serial", f"file:{self.console}", "-D", str(self._trace)]
         command += ["-drive", f"if=sd,format=raw,snapshot=on,file={image / 'root.img'}"]
         # Restricted: nothing but the forwarded ports leads in or out; what a release needs is on the card.
         command += ["-netdev", f"user,id=net,restrict=on{forwards}", "-device", "usb-net,netdev=net"]

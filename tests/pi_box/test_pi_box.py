@@ -19,7 +19,7 @@ import zmq
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.shared.sockets import Refusals, requester
-from tests.pi_box.conftest import PROGRAM, READY_LIMIT_S, InstalledPi, tell
+from tests.pi_box.installed import PROGRAM, READY_LIMIT_S, InstalledPi, tell
 from tests.support.pi.host_side import HostSide
 from tests.support.rigs import published_rig
 

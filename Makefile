@@ -7,7 +7,7 @@ OUT ?= out
 JOBS ?= 2
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test test-long test-uml quick check bench firmware flash pi-install library reproduce docs clean
+.PHONY: help demo test test-long test-uml test-pi quick check bench firmware flash pi-install library reproduce docs clean
 
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,10 @@ test-long: $(VENV)/installed  ## tests at full length: random rows, records, mes
 test-uml: $(VENV)/installed  ## the chain on a kernel's GPIO chip, in user-mode Linux built from Debian's source (10 minutes, once)
 	@./tests/install-tools.sh kernel
 	$(BIN)/python -m pytest tests/uml --uml -rP
+
+test-pi: $(VENV)/installed  ## a Raspberry Pi 3B in a box: Debian's kernel on QEMU, the real installation (15 minutes, once)
+	@./tests/install-tools.sh pi
+	$(BIN)/python -m pytest tests/pi_box --pi-box -rP
 
 CHANGED = $(shell git diff --name-only --diff-filter=d HEAD -- host papers pi_controller shared simulators 2>/dev/null | grep '\.py$$')
 LAWS := tests/house/test_rooms.py tests/shared tests/polarimetry tests/sync/test_tone.py tests/imaging/test_direct.py

@@ -4,7 +4,7 @@
 # The first run fetches the libraries from the internet, in the versions of requirements.txt; later ones need none, unless
 # a release needs another library. Each release has a folder of its own, /opt/polysight/releases/N, and
 # /opt/polysight/venv is a link to the one in use: `install.sh --roll-back` goes back to the one before it.
-# Not run on hardware yet.
+# Run in a simulated Pi (make test-pi), not on hardware yet.
 set -euo pipefail
 copied=$(cd "$(dirname "$0")" && pwd)
 root=${ROOT:-} # another place than /, to try it out
@@ -41,6 +41,8 @@ if [ -d "$opt/venv" ] && [ ! -L "$opt/venv" ]; then # installed before there wer
   mv "$opt/venv" "$opt/releases/0"
   use 0
 fi
+# A release that has this file was begun and never finished: the power was cut, or the run was ended.
+find "$opt/releases" -mindepth 2 -maxdepth 2 -name not-finished -printf '%h\n' | while read -r broken; do rm -rf "$broken"; done
 last=$(find "$opt/releases" -mindepth 1 -maxdepth 1 -name '[0-9]*' -printf '%f\n' | sort -n | tail -n 1)
 new="$opt/releases/$((${last:-0} + 1))"
 rm -rf "$opt/releases/unfinished"
@@ -49,6 +51,7 @@ if [ -n "$last" ]; then
 else
   python3 -m venv "$opt/releases/unfinished"
 fi
+touch "$opt/releases/unfinished/not-finished"
 mv "$opt/releases/unfinished" "$new"
 python="$new/bin/python"
 "$python" -m pip install --quiet --retries 1 --constraint "$copied/requirements.txt" "$copied"/*.whl || {
@@ -58,6 +61,8 @@ python="$new/bin/python"
 }
 # The same version may have other content.
 "$python" -m pip install --quiet --no-index --no-deps --force-reinstall "$copied"/*.whl
+rm "$new/not-finished"
+sync --file-system "$new" # on the card before it is used: the power may be cut at any time
 use "$(basename "$new")"
 find "$opt/releases" -mindepth 1 -maxdepth 1 -name '[0-9]*' -printf '%f\n' | sort -n | head -n -3 |
   while read -r old; do rm -rf "${opt:?}/releases/$old"; done # three are kept

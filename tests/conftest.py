@@ -30,6 +30,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--stage-port", metavar="PORT", help="also talk to a real stage at this port: IT WILL HOME AND MOVE"
     )
     group.addoption("--uml", action="store_true", help="build a user-mode Linux and run the chain on its GPIO chip")
+    group.addoption(
+        "--pi-box", action="store_true", help="build a Debian for a Pi and run it on QEMU's Raspberry Pi 3B"
+    )
     group.addoption("--long", action="store_true", help="the full number of randomised rows and random bytes")
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Debian packages the tests use (with `kernel`: and those of `make test-uml`): installed when root or passwordless sudo is there, else named with how to get them.
+# Debian packages the tests use (with `kernel`: and those of `make test-uml`; with `pi`: of `make test-pi`): installed when root or passwordless sudo is there, else named with how to get them.
 set -u
 missing=()
 lean=()  # installed without what Debian recommends beside them: a browser would bring half a desktop
@@ -17,6 +17,13 @@ command -v systemd-analyze >/dev/null || lean+=(systemd)
 if [ "${1-}" = kernel ]; then
   for tool in flex bison bc; do command -v $tool >/dev/null || missing+=($tool); done
   command -v xz >/dev/null || missing+=(xz-utils)
+fi
+if [ "${1-}" = pi ]; then
+  command -v qemu-system-aarch64 >/dev/null || lean+=(qemu-system-arm)
+  command -v mmdebstrap >/dev/null || lean+=(mmdebstrap)
+  command -v mke2fs >/dev/null || lean+=(e2fsprogs)
+  command -v ssh >/dev/null || lean+=(openssh-client)
+  [ -e /usr/lib/binfmt.d/qemu-aarch64.conf ] || lean+=(qemu-user-static)
 fi
 [ ${#missing[@]} -eq 0 ] && [ ${#lean[@]} -eq 0 ] && exit 0
 as_root=()

@@ -20,17 +20,25 @@ LIMIT_S = 60.0
 class HostSide:
     """Commands, and every event seen."""
 
-    def __init__(self, command_address: str, event_address: str, instrument: Instrument) -> None:
+    def __init__(
+        self,
+        command_address: str,
+        event_address: str,
+        instrument: Instrument,
+        key_dir: Path = Path("none"),
+        limit_s: float = LIMIT_S,
+    ) -> None:
+        self.limit_s = limit_s
         self.context: Any = zmq.Context()
-        self.commands = requester(self.context, command_address, Path("none"))
-        self.subscriber = subscriber(self.context, event_address, Path("none"))
+        self.commands = requester(self.context, command_address, key_dir)
+        self.subscriber = subscriber(self.context, event_address, key_dir)
         self.instrument = instrument
         self.events: list[Any] = []
         self.wait(m.Heartbeat)  # the subscription has arrived
 
     def ask(self, command: Any) -> Any:
         self.commands.send(m.pack(command))
-        assert self.commands.poll(int(LIMIT_S * 1e3)), f"no reply to {command}"
+        assert self.commands.poll(int(self.limit_s * 1e3)), f"no reply to {command}"
         return m.unpack_reply(self.commands.recv())
 
     def accepted(self, command: Any) -> m.Accepted:
@@ -55,7 +63,7 @@ class HostSide:
         self.until_state("ready")
 
     def until_state(self, *states: str) -> m.StatusReply:
-        deadline = time.monotonic() + LIMIT_S
+        deadline = time.monotonic() + self.limit_s
         while time.monotonic() < deadline:
             status = self.ask(m.Status())
             if status.state in states:
@@ -63,8 +71,9 @@ class HostSide:
             time.sleep(0.005)
         raise AssertionError(f"never in {states}: {self.ask(m.Status())}")
 
-    def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float = LIMIT_S) -> Any:
+    def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None) -> Any:
         """The next event of a kind; everything on the way is kept in `events`."""
+        limit_s = self.limit_s if limit_s is None else limit_s
         deadline = time.monotonic() + limit_s
         while (left := deadline - time.monotonic()) > 0:
             if self.subscriber.poll(int(left * 1e3) + 1):

@@ -1,0 +1,289 @@
+"""A Raspberry Pi 3B in a box: Debian's kernel and its GPIO driver, the real installation, the emulated UNO on USB.
+
+`make test-pi` runs these and prints figures; docs/how-to/hardware-tests.md tells what is real and what QEMU lacks.
+The tests share one Pi and run in this order; each leaves the service running.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import zmq
+
+from polysight.shared import messages as m
+from polysight.shared.faults import PiFault
+from polysight.shared.sockets import Refusals, requester
+from tests.pi_box.installed import PROGRAM, READY_LIMIT_S, InstalledPi, tell
+from tests.support.pi.host_side import HostSide
+from tests.support.rigs import published_rig
+
+SYNC_OUT = 22
+INPUT, OUTPUT = 0, 1
+TRIES = 5
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
+
+
+@pytest.fixture
+def bench(pi: InstalledPi) -> Iterator[InstalledPi]:
+    """The Pi with its service stopped, as for work at the bench."""
+    pi.systemctl("stop polysight-pi")
+    yield pi
+    pi.configure()
+    pi.start()
+
+
+@pytest.fixture
+def homed(host: HostSide) -> HostSide:
+    """The host, after homing."""
+    home(host)
+    return host
+
+
+def home(host: HostSide) -> None:
+    """Home the stage. The Pi calls it lost when a busy computer keeps the two apart for a second: then once more."""
+    for _ in range(TRIES):
+        host.accepted(m.Home())
+        if host.until_state("homed", "ready", "fault").state != "fault":
+            return
+    raise AssertionError(host.ask(m.Status()))
+
+
+def pid_of(pi: InstalledPi) -> str:
+    """The service's process."""
+    return pi.shown("MainPID")
+
+
+def seconds(begun: float) -> str:
+    """For a figure: since `begun`, on this computer's clock."""
+    return f"{time.monotonic() - begun:.1f} s"
+
+
+def test_what_is_installed_belongs_to_whom_the_page_says(pi: InstalledPi):
+    """The table of docs/how-to/install.md."""
+    places = "/etc/polysight/keys /etc/polysight/keys/pi.key_secret /var/lib/polysight /dev/gpiochip0"
+    stat = pi.box.run(f"sudo stat --dereference --format='%n %U:%G %a' {places} /dev/polysight-stage")
+    assert dict(line.split(maxsplit=1) for line in stat.splitlines()) == {
+        "/etc/polysight/keys": "polysight:polysight 700",
+        "/etc/polysight/keys/pi.key_secret": "polysight:polysight 600",
+        "/var/lib/polysight": "polysight:polysight 750",
+        "/dev/gpiochip0": "root:gpio 660",
+        "/dev/polysight-stage": "root:dialout 660",
+    }
+    assert (pi.shown("UnitFileState"), pi.shown("User")) == ("enabled", "polysight")
+
+
+def test_the_unit_exposes_little(pi: InstalledPi):
+    """systemd's own measure, taken where the service runs."""
+    text = pi.box.run("sudo systemd-analyze security --no-pager polysight-pi")
+    score = float(text.split("Overall exposure level for polysight-pi.service:")[1].split()[0])
+    tell(f"systemd-analyze security: {score}")
+    assert score <= 3.0
+
+
+def test_the_service_has_the_rights_that_its_unit_promises(pi: InstalledPi):
+    """Real-time threads and locked memory; a right that is not given has a line in the log."""
+    assert "no real-time scheduling" not in pi.log()
+    assert "memory is not locked" not in pi.log()
+    threads = pi.box.run(f"ps -L -o cls=,rtprio= -p {pid_of(pi)}").split("\n")
+    assert {"FF 40", "FF 50"} <= {" ".join(t.split()) for t in threads}, "the trigger thread before the others"
+    locked = pi.box.run(f"grep VmLck /proc/{pid_of(pi)}/status").split()[1]
+    assert int(locked) > 0
+
+
+def test_a_host_with_the_keys_is_answered_and_one_without_is_refused(pi: InstalledPi, host: HostSide, tmp_path: Path):
+    hello = host.ask(m.Hello())
+    assert (hello.backend, hello.state) == ("gpiod", "idle")
+    assert hello.firmware
+    pi.box.run(f"sudo -u polysight {PROGRAM} keys --dir /etc/polysight/keys --client second")
+    pi.fetch_keys(tmp_path / "second", "second")
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    second = requester(context, pi.addresses()[0], tmp_path / "second")
+    second.send(m.pack(m.Hello()))
+    assert second.poll(60_000)
+    assert isinstance(m.unpack_reply(second.recv()), m.HelloReply)
+    pi.box.run(f"sudo -u polysight {PROGRAM} keys --dir /etc/polysight/keys --revoke second")
+    second.send(m.pack(m.Hello()))
+    assert second.poll(60_000)
+    refused = m.unpack_reply(second.recv())
+    assert isinstance(refused, m.Refused)
+    assert refused.number == PiFault.NOT_OWNER
+    stranger = requester(context, pi.addresses()[0], tmp_path / "second")
+    refusals = Refusals(stranger)
+    pi.box.wait(refusals.seen, "a revoked key is refused at the door", 60)
+    refusals.close()
+    context.destroy(linger=0)
+
+
+def test_home_brings_the_motors_to_zero(pi: InstalledPi):
+    """`polysight-pi home` on the host, through the service; the steps are counted at the board's pins."""
+    begun = time.monotonic()
+    assert json.loads(pi.on_host("home", "--json")) == {"x_mm": 0.0, "y_mm": 0.0}
+    tell(f"home, through the service: {seconds(begun)}")
+    assert pi.uno.stands_at_mm == (0.0, 0.0)
+
+
+def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi, homed: HostSide):
+    """What the kernel's driver writes to the chip's registers, seen from outside the Pi."""
+    assert (pi.box.function(SYNC_OUT), pi.box.level(SYNC_OUT)) == (OUTPUT, 0)
+    replies: list[m.Pulsed] = []
+    i = pi.rig.burst
+    pulse = m.Pulse(pulses=i.pulses, period_us=i.period_us, width_us=i.width_us)
+    writes = pi.box.writes_during(lambda: replies.append(homed.ask(pulse)))
+    assert isinstance(replies[0], m.Pulsed), replies
+    assert [w.lines for w in writes] == [1 << SYNC_OUT] * len(writes), "no other line is touched"
+    pulses = list(itertools.pairwise(writes))[::2]
+    assert [(rise.high, fall.high) for rise, fall in pulses] == [(True, False)] * i.pulses
+    assert replies[0].pulses == i.pulses
+    assert pi.box.level(SYNC_OUT) == 0
+    spacings_ms = [(b.t_s - a.t_s) * 1e3 for (a, _), (b, _) in itertools.pairwise(pulses)]
+    widths_us = [(fall.t_s - rise.t_s) * 1e6 for rise, fall in pulses]
+    tell(f"bench burst: {len(pulses)} pulses, {min(widths_us):.0f} .. {max(widths_us):.0f} us wide and"
+         f" {min(spacings_ms):.2f} .. {max(spacings_ms):.2f} ms apart, on this computer's clock")  # fmt: skip
+
+
+def test_check_finds_everything_that_is_there(bench: InstalledPi):
+    findings = bench.check()
+    verdicts = {name: f["verdict"] for name, f in findings.items()}
+    tell("check: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
+    assert "fail" not in verdicts.values(), findings
+    # Rights of the unit, which a shell lacks; and Debian's driver does not say what dead programs' lines become.
+    assert {n for n, v in verdicts.items() if v == "warn"} <= {"schedule right", "locked memory", "line release"}
+    assert findings["GPIO chip"]["found"].endswith("is 'pinctrl-bcm2835'")
+    assert verdicts["keys"] == verdicts["stage"] == "ok"
+
+
+def test_check_of_the_shipped_rig_names_spi_and_nothing_else(bench: InstalledPi):
+    """No SPI controller here, as on a Pi where it was not switched on."""
+    shipped = published_rig()
+    stage = msgspec.structs.replace(shipped.stage, port=bench.rig.stage.port)
+    bench.configure(msgspec.structs.replace(shipped, stage=stage))
+    findings = bench.check()
+    assert {n for n, f in findings.items() if f["verdict"] == "fail"} == {"SYNC_IN line 10", "pulse width"}
+    assert "dtparam=spi=on" in findings["SYNC_IN line 10"]["remedy"]
+
+
+def test_a_jog_by_hand_moves_the_motors_by_its_distance(bench: InstalledPi):
+    by_hand = f"sudo -u polysight {PROGRAM}"
+    config = "--config /etc/polysight/instrument.toml --json"
+    assert json.loads(bench.box.run(f"{by_hand} home {config}")) == {"x_mm": 0.0, "y_mm": 0.0}
+    begun = time.monotonic()
+    assert json.loads(bench.box.run(f"{by_hand} jog --dx 10 --dy 5 {config}")) == {"x_mm": 10.0, "y_mm": 5.0}
+    tell(f"jog by 10 mm and 5 mm, the program's start included: {seconds(begun)}")
+    bench.box.wait(lambda: not bench.uno.moving, "the motors rest")
+    assert bench.uno.stands_at_mm == (10.0, 5.0)
+
+
+def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
+    """What `check` cannot learn from Debian's driver: no pulse stays high when the program dies inside it."""
+    held = f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 & echo $!"
+    number = bench.box.run(f"sudo sh -c '{held}' </dev/null 2>/dev/null").strip()
+    bench.box.wait(lambda: bench.box.level(SYNC_OUT) == 1, "the line is high")
+    assert bench.box.function(SYNC_OUT) == OUTPUT
+    bench.box.run(f"sudo kill -9 {number}")
+    bench.box.wait(lambda: bench.box.function(SYNC_OUT) == INPUT, "the line is an input again")
+
+
+def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed: HostSide):
+    """kill -9 in the middle of a row: the stage stops by itself, and no event that was told is lost."""
+    homed.accepted(homed.begin("killed"))
+    homed.accepted(m.RunRow(scan_id="killed", row_index=0, take=1))
+    homed.wait(m.RowStarted)
+    in_row_mm_s = pi.rig.stage.speed_mm_s
+    pi.box.wait(lambda: pi.uno.speed_mm_s == pytest.approx(in_row_mm_s, rel=0.01), "the row is under way")
+    killed, begun = pid_of(pi), time.monotonic()
+    pi.systemctl("kill --signal=KILL polysight-pi")
+    last_seen_mm = pi.uno.x_mm
+    pi.box.wait(lambda: not pi.uno.moving, "the stage rests")
+    beyond_mm = pi.uno.x_mm - last_seen_mm
+    ramp_mm = in_row_mm_s**2 / 2 / pi.rig.stage.accel_mm_s2
+    assert beyond_mm <= (pi.rig.stage.heartbeat_ms / 1e3 + 0.1) * in_row_mm_s + ramp_mm
+    pi.until_ready()
+    tell(f"kill -9 in a row: the stage went on for {beyond_mm:.0f} mm (heartbeat"
+         f" {pi.rig.stage.heartbeat_ms / 1e3:g} s here); the service was ready after {seconds(begun)}")  # fmt: skip
+    assert pid_of(pi) != killed
+    back = pi.host()
+    assert back.ask(m.Hello()).state == "idle"
+    assert back.replay("killed")[: len(homed.journalled)] == homed.journalled
+    back.close()
+
+
+def test_a_service_that_hangs_is_started_anew(pi: InstalledPi):
+    """The executor feeds systemd's watchdog."""
+    hung, begun = pid_of(pi), time.monotonic()
+    pi.systemctl("kill --signal=STOP polysight-pi")
+    pi.box.wait(lambda: pid_of(pi) not in (hung, "0"), "another process")
+    pi.until_ready()
+    tell(f"SIGSTOP: ready again after {seconds(begun)}")
+    assert "watchdog" in pi.box.run("sudo journalctl --unit polysight-pi --no-pager").lower()
+
+
+def test_a_stage_whose_cable_was_pulled_is_homed_again_from_the_host(pi: InstalledPi, homed: HostSide):
+    pi.box.unplug()
+    pi.box.wait(lambda: not homed.ask(m.Status()).homed, "the stage is lost")
+    pi.box.plug()
+    pi.box.wait(lambda: pi.box.try_run("test -e /dev/polysight-stage").returncode == 0, "the port is back")
+    home(homed)
+    assert pi.uno.stands_at_mm == (0.0, 0.0)
+
+
+def test_a_stage_that_is_plugged_in_after_the_service_has_started_is_found(bench: InstalledPi):
+    """The kernel has no serial driver until the first cable is plugged in."""
+    bench.box.unplug()
+    bench.box.wait(lambda: bench.box.try_run("test -e /dev/polysight-stage").returncode != 0, "the port is gone")
+    bench.box.run("sudo modprobe --remove ftdi_sio")
+    bench.systemctl("start --no-block polysight-pi")
+    bench.box.wait(lambda: "cannot be opened" in bench.log(), "it looks for the stage")
+    bench.box.plug()
+    bench.until_ready()
+
+
+def test_update_and_roll_back(pi: InstalledPi):
+    """Rig file, keys and journals stay; a service that runs goes on with the release that is in use."""
+    kept = "sudo sh -c 'sha256sum /etc/polysight/instrument.toml /etc/polysight/keys/* /var/lib/polysight/journal/*'"
+    before, first = pi.box.run(kept), pid_of(pi)
+    begun = time.monotonic()
+    pi.install()
+    tell(f"update: {seconds(begun)}")
+    pi.until_ready()
+    assert pi.release() == "releases/2"
+    second = pid_of(pi)
+    begun = time.monotonic()
+    pi.box.run("sudo ~/.cache/polysight-install/install.sh --roll-back")
+    tell(f"roll back: {seconds(begun)}")
+    pi.until_ready()
+    assert pi.release() == "releases/1"
+    assert len({first, second, pid_of(pi)}) == 3
+    assert "releases/1/" in pi.box.run(
+        f"sudo readlink /proc/{pid_of(pi)}/exe /opt/polysight/venv; pgrep -af polysight-pi"
+    )
+    assert pi.box.try_run("sudo ~/.cache/polysight-install/install.sh --roll-back").returncode == 5
+    after = pi.box.run(kept)
+    assert set(before.splitlines()) <= set(after.splitlines())
+
+
+def test_a_release_that_lacks_a_library_changes_nothing(pi: InstalledPi):
+    running, release = pid_of(pi), pi.release()
+    pi.box.run("cp -a ~/.cache/polysight-install ~/lacking && echo msgspec==99 >~/lacking/requirements.txt")
+    done = pi.box.try_run("sudo ~/lacking/install.sh", limit_s=READY_LIMIT_S)
+    assert (done.returncode, "connect this Pi to the internet" in done.stderr) == (5, True), done.stderr
+    assert (pid_of(pi), pi.release()) == (running, release)
+
+
+def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, homed: HostSide):
+    """And the Pi comes back by itself, with its keys, ready to be homed."""
+    homed.accepted(homed.begin("cut"))
+    homed.accepted(m.RunRow(scan_id="cut", row_index=0, take=1))
+    homed.wait(m.RowStarted)
+    pi.box.cut_power()
+    pi.until_ready()
+    tell(f"power cut: logged in again after {pi.box.boot_s:.0f} s")
+    back = pi.host()
+    assert back.replay("cut")[: len(homed.journalled)] == homed.journalled
+    assert back.ask(m.Hello()).state == "idle"
+    back.close()

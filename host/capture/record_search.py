@@ -231,6 +231,9 @@ class _Search:
             if verdict.located and self._before_switched_on(verdict.base, first, line):
                 why = "its first bytes would be older than the card's counters: the card began anew within it"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
+            if verdict.located and p.at(first, line) == SWITCHED_ON and self._ends_first(which):
+                why = "its end came before its beginning, which is a card's just switched on: it began anew within it"
+                verdict = replace(verdict, located=False, certain=False, reason=why)
             if verdict.located and not self._much(which):
                 why = "too little of it came to tell it from an earlier record's end"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
@@ -258,6 +261,12 @@ class _Search:
         """Whether a packet that is not full lies before the last: only a record's last one is."""
         sizes = self._p.sizes[which]
         return bool(((sizes < self._p.full) & (self._p.ahead[which] + sizes < stop)).any())
+
+    def _ends_first(self, which: Counts) -> bool:
+        """Whether packets came first that belong behind all that came later."""
+        ahead = self._p.ahead[which]
+        first = int(np.argmin(ahead))
+        return first > 0 and int(ahead[first:].max()) < int(ahead[:first].min())
 
     def _before_switched_on(self, base: int, first: int, line: int) -> bool:
         """Whether a record from `base` on would reach back behind sequence 1 and byte 0, where counters begin."""

@@ -131,3 +131,12 @@ def test_a_record_does_not_begin_before_the_card_was_switched_on():
     shifted = [p[:10] + bytes(reversed(p[10:])) for p in anew]  # whose bytes these are nobody can tell
     placed, _ = place(size, [*row.packets[:head], *shifted], past, FRAME, batch=64)
     assert not placed.located
+
+
+def test_two_resets_alike_are_not_one_record_in_another_order():
+    """Full packets alone: the last counters, a reset, then the first ones look like one record to a host just begun."""
+    card = Card(FULL_ENDS)
+    card.record((4,))
+    row = card.record((4,))
+    placed, out = place(FULL_ENDS, row.packets, None, FRAME, batch=64)
+    assert is_original_or_masked(row, placed, out)

@@ -13,7 +13,15 @@ from typing import NamedTuple
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
 from polysight.host.radar.calibration_data import CalibrationFiles, read_calibration, restore_calibration
-from polysight.host.radar.firmware import TO_FLASH, TO_RAM, Image, describe_patch, send_image
+from polysight.host.radar.firmware import (
+    TO_FLASH,
+    TO_RAM,
+    Image,
+    describe_patch,
+    require_family,
+    require_rom,
+    send_image,
+)
 from polysight.host.radar.messages import Message
 from polysight.host.radar.program import Program
 from polysight.host.radar.spi import Clock, Link, WordLink
@@ -80,7 +88,7 @@ class BringUp:
         self._firmware, self._die_id, self._facts, self._log = firmware, die_id, facts, log
         self._calibration = calibration
         self._passed_over: list[str] = []
-        self._cure, self._had = "", ""
+        self._cure, self._had, self._held = "", "", False
 
     def power_steps(self) -> list[Step]:
         """Until both cores run."""
@@ -121,7 +129,7 @@ class BringUp:
             when a part is not taken, or the board does not start from its flash afterwards.
         """
         self._reset()
-        before = self._same_family(image)
+        before = self._same_rom(image)
         send_image(self._link, self._name, image, TO_FLASH, progress)
         self._passed_over.clear()
         self._reset()
@@ -159,9 +167,10 @@ class BringUp:
 
     def _load(self) -> str:
         if self._firmware is not None:
-            self._had = has = self._same_family(self._firmware)
+            self._had = has = self._same_rom(self._firmware)
             if has == self._firmware.patches[0] and self._cure != "firmware":
-                return f"the flash holds patch {has} already; nothing is sent"
+                self._held = True
+                return f"the flash holds the main core's patch {has} already; nothing is sent"
             send_image(self._link, self._name, self._firmware, TO_RAM)
             self._boot_from_ram(self._firmware)
             came = f"{self._firmware.name} in RAM"
@@ -189,16 +198,10 @@ class BringUp:
                 f"{self._name}: refuses {image.name}: {booted}", "an image for another device", "TI's image for AWR2243"
             )
 
-    def _same_family(self, image: Image) -> str:
+    def _same_rom(self, image: Image) -> str:
         """The main core's patch now, once its ROM is known to be the one that the image is for."""
         answer = data_of(self._name, self._link.call(c.GET_MAIN_VERSION), c.GET_MAIN_VERSION, 16)
-        if answer[3] != image.rom[0]:
-            raise ConfigError(
-                f"{self._name}: its ROM is of generation {answer[3]}, {image.name} is for generation {image.rom[0]};"
-                " nothing was sent",
-                "another device than an AWR2243, or an image for another",
-                "take the image of this device's DFP",
-            )
+        require_rom(self._name, answer, image)
         return _patch(answer)
 
     def _main_patch(self) -> str:
@@ -217,24 +220,39 @@ class BringUp:
             )
         self._link.warnings.append(told)
 
+    def _verify_rf(self, patch: str, image: Image) -> None:
+        """The RF core's patch is known only once that core runs: another one than the file's is told."""
+        if patch != image.patches[1]:
+            held = f"from its flash; `polysight radar firmware {self._name} {image.name} --flash` writes both cores'"
+            self._link.warnings.append(
+                f"{self._name}: its RF core reports patch {patch}, {image.name} holds {image.patches[1]}"
+                + (f": it runs {held}" if self._held else "")
+            )
+
     def _rf_up(self) -> str:
         self._link.call(c.DeviceConfiguration())
         self._link.call(c.RF_POWER_UP)
         return str(self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_S, self.note))
 
     def _versions(self) -> str:
-        for key, question in (("rf_firmware", c.GET_RF_VERSION), ("main_firmware", c.GET_MAIN_VERSION)):
+        for core, key, question in (
+            ("RF", "rf_firmware", c.GET_RF_VERSION),
+            ("main", "main_firmware", c.GET_MAIN_VERSION),
+        ):
             v = data_of(self._name, self._link.call(question), question, 16)
             hardware, release, patch = v[:3], v[3:7], (*v[10:12], v[15] >> 4, v[15] & 15)
             self._facts[key] = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
             self._facts["hardware"] = ".".join(map(str, hardware))
+            require_family(self._name, core, v)
             if not any(patch):
                 raise DeviceError(
                     f"{self._name}: its {key.replace('_', ' ')} has no patch (version {self._facts[key]})",
                     "this board's flash holds no firmware, and none was downloaded",
                     _FIRMWARE,
                 )
-            if key == "main_firmware" and self._firmware is not None:
+            if self._firmware is not None and core == "RF":
+                self._verify_rf(_patch(v), self._firmware)
+            elif self._firmware is not None:
                 self._verify(_patch(v), self._had, self._firmware)
         return f"RF {self._facts['rf_firmware']}, main {self._facts['main_firmware']}"
 

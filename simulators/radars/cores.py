@@ -44,6 +44,8 @@ class Cores:
     fault_at: str = "power-up"
     first_generation: bool = False
     hardware_bits: int = 0
+    main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
+    rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     destroyed: bool = False
     executed: list[int] = field(default_factory=list)
     settings: dict[int, bytes] = field(default_factory=dict)
@@ -118,7 +120,8 @@ class Cores:
         elif number == 0x02CC and data[0] & 1 and self.supply_v > 1.1:
             self.destroyed = True
         elif number in (0x0220, 0x40E0):
-            return bytes((1, 2, 0, 2, 2, 1, 7, 20, 3, 17)) + self._patch(main=number == 0x40E0)
+            rom = self.main_rom if number == 0x40E0 else self.rf_rom
+            return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == 0x40E0)
         elif number == 0x0223:
             return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
         elif number == 0x02EA:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 
 import pytest
@@ -40,6 +41,8 @@ def with_crc(data: bytes) -> bytes:
         (with_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
         (with_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
         (FIRST_GENERATION, "for devices of generation 1"),
+        (with_crc(DATA[:0x8B8] + bytes((6, 2, 0, 13)) + DATA[0x8BC:-4]), "for devices of generation 6"),
+        (with_crc(DATA[:0x880] + b"CPRR" + DATA[0x884:-4]), "1 program parts"),
         (with_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
     ],
 )
@@ -161,16 +164,45 @@ def test_the_slow_erase_is_waited_for(clock):
     assert board.cores.flash == DATA
 
 
-def test_a_device_of_another_generation_is_sent_nothing(clock, monkeypatch):
-    board = Simulated(lambda: clock.time)
-    effect = board.cores._effect
-    monkeypatch.setattr(
-        board.cores, "_effect", lambda n, d: bytes((1, 2, 0, 1)) + effect(n, d)[4:] if n == 0x40E0 else effect(n, d)
-    )
+@pytest.mark.parametrize("rom", [(1, 2, 0, 5), (2, 0, 0, 3), (2, 2, 1, 6), (6, 2, 1, 7), (0, 0, 0, 0), (255,) * 4])
+@pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
+def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):
+    board = Simulated(lambda: clock.time, flash=flash)
+    board.cores.main_rom = rom
     for use in (lambda r: r.write_flash(IMAGE, ignored), lambda r: r.configure()):
-        with pytest.raises(ConfigError, match="generation 1"):
+        with pytest.raises(ConfigError, match=rf"ROM is {'.'.join(map(str, rom))}"):
             use(made(board, clock, IMAGE))
     assert 0x4080 not in board.executed
+    assert board.cores.flash == flash
+
+
+@pytest.mark.parametrize("core", ["main_rom", "rf_rom"])
+@pytest.mark.parametrize(
+    ("rom", "said"),
+    [((1, 2, 0, 5), "AWR1243"), ((6, 2, 0, 13), "57..64 GHz"), ((255,) * 4, "generation 255"), ((0,) * 4, "0.0.0.0")],
+)
+@pytest.mark.parametrize("image", [None, IMAGE])
+def test_what_is_no_awr2243_is_refused_before_any_setting(clock, core, rom, said, image):
+    """The same codes would be other frequencies there."""
+    board = Simulated(lambda: clock.time, flash=DATA)
+    setattr(board.cores, core, rom)
+    with pytest.raises(ConfigError, match=re.escape(said)) as caught:
+        made(board, clock, image).configure()
+    assert "only AWR2243" in caught.value.what
+    assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
+
+
+@pytest.mark.parametrize("flash", [b"", DATA], ids=["from RAM", "from flash"])
+def test_another_patch_of_the_rf_core_than_the_image_s_is_told(clock, monkeypatch, flash):
+    board = Simulated(lambda: clock.time, flash=flash)
+    effect = board.cores._effect
+    old = bytes((2, 1, 20, 1, 1, 0))
+    monkeypatch.setattr(board.cores, "_effect", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d))
+    radar = made(board, clock, IMAGE)
+    radar.configure()
+    (told,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
+    assert "holds 2.2.4.0" in told
+    assert ("--flash" in told) is bool(flash)
 
 
 @pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])

@@ -22,10 +22,11 @@ from polysight.host.radar.firmware import (
     require_rom,
     send_image,
 )
+from polysight.host.radar.lab_commands import ALL_CALIBRATIONS, RESTORED_CALIBRATIONS
 from polysight.host.radar.messages import Message
 from polysight.host.radar.program import Program
 from polysight.host.radar.spi import Clock, Link, WordLink
-from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.errors import DeviceError
 
 POWER_UP_S = 5.0
 _CALIBRATION_S = 5.0
@@ -103,7 +104,12 @@ class BringUp:
         return [
             Step("versions", "both cores with a patch", _FIRMWARE, self._versions),
             Step("settings", f"{len(self._program.basic)} acknowledgements", "compare with `plan`", self._basic),
-            Step("RF init", "calibrated, synthesizers passed", "clock, RF supplies; power-cycle it", self._rf_init),
+            Step(
+                "RF init",
+                "calibrated, all that the board needs passed",
+                "clock, RF supplies; power-cycle it",
+                self._rf_init,
+            ),
         ]
 
     def waveform_steps(self) -> list[Step]:
@@ -271,10 +277,12 @@ class BringUp:
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_S, self.note)
         self._facts["calibration"] = dict(event.values)
-        passed = event.values.get("passed")
-        if not isinstance(passed, int) or passed & e.SYNTHESIZER != e.SYNTHESIZER:
+        asked = ALL_CALIBRATIONS & ~RESTORED_CALIBRATIONS if restored else ALL_CALIBRATIONS
+        if failed := e.failed_calibrations(event, self._program.transmits, asked):
             raise DeviceError(
-                f"{self._name}: calibration failed: {event}", "no reference clock or supply", "power-cycle it"
+                f"{self._name}: RF init did not pass: {', '.join(failed)} ({event})",
+                "no reference clock, an RF supply out of range, or a damaged RF part",
+                "measure the RF supplies; switch its power off and on; replace the board if it stays",
             )
         if self._calibration is not None and kept is None:
             self._calibration.save(die, read_calibration(self._link, self._name))

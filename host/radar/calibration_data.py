@@ -49,8 +49,13 @@ class CalibrationFiles:
             told = json.loads(path.read_text(encoding="utf-8"))
             data = bytes.fromhex(told["data"])
             sound = told["die_id"] == die_id and len(data) == _BYTES and zlib.crc32(data) == told["crc32"]
+            passed = int.from_bytes(data[:4], "little")  # of the RF init that it was saved from (ICD 71)
         except (ValueError, KeyError, TypeError):
-            sound, data = False, b""
+            sound, data, passed = False, b"", 0
+        if sound and passed & RESTORED_CALIBRATIONS != RESTORED_CALIBRATIONS:
+            raise ConfigError(
+                f"{path}: is of a start whose RF init did not pass", "saved before that was looked at", _DO
+            )
         if not sound:
             raise ConfigError(f"{path}: is not the calibration data of {die_id}", "damaged, or another board's", _DO)
         return data

@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from polysight.host.radar.messages import SubBlock
 
@@ -17,21 +18,44 @@ CALIBRATION_REPORT = 0x1012
 MAIN_POWER_UP, RF_POWER_UP_DONE = 0x5000, 0x5001
 MAIN_CPU_FAULT, MAIN_ESM_FAULT, BOOT_STATUS, RF_ERROR = 0x5002, 0x5003, 0x5005, 0x5008
 
-CALIBRATIONS = {  # ICD 217, bit: name
-    1: "clock PLL",
-    2: "synthesizer VCO1",
-    3: "synthesizer VCO2",
-    4: "LO distribution",
-    5: "ADC offset",
-    6: "high-pass filter",
-    7: "low-pass filter",
-    8: "peak detector",
-    9: "TX power",
-    10: "RX gain",
-    11: "TX phase",
-    12: "RX I/Q",
+
+class InitBit(NamedTuple):
+    """A calibration of the RF init: `of_transmitter` when only a board that transmits needs it to have passed."""
+
+    name: str
+    of_transmitter: bool = False
+
+
+INIT_BITS = {  # ICD 217, where 0 is "fail"
+    1: InitBit("clock PLL"),
+    2: InitBit("synthesizer VCO1"),
+    3: InitBit("synthesizer VCO2"),
+    4: InitBit("LO distribution"),
+    5: InitBit("ADC offset"),
+    6: InitBit("high-pass filter"),
+    7: InitBit("low-pass filter"),
+    8: InitBit("peak detector", of_transmitter=True),
+    9: InitBit("TX power", of_transmitter=True),
+    10: InitBit("RX gain"),
+    11: InitBit("TX phase", of_transmitter=True),
+    12: InitBit("RX I/Q"),
 }
-SYNTHESIZER = 0b1110  # without these three nothing can be transmitted
+_INIT_NAMES = {bit: one.name for bit, one in INIT_BITS.items()}
+
+
+def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
+    """What a board cannot be used without and did not pass in its RF init.
+
+    `run` masks the calibrations that were asked for beside clock and synthesizers, which run at every start.
+    """
+    passed = event.values.get("passed")
+    if not isinstance(passed, int):
+        return ["a report that can be read"]
+    asked = run | 0b1110
+    needed = {bit: one.name for bit, one in INIT_BITS.items() if transmits or not one.of_transmitter}
+    return [name for bit, name in needed.items() if asked >> bit & 1 and not passed >> bit & 1]
+
+
 _CPU_FAULTS = (  # ICD 212, 317
     "undefined instruction",
     "instruction fetch abort",
@@ -218,9 +242,9 @@ def _esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
 
 def _init_done(data: bytes) -> _Read:
     status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
-    failed = sum(1 << b for b in CALIBRATIONS if not status >> b & 1)
+    failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
     values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
-    return f"{temperature} C" + (f"; not passed: {_bits(CALIBRATIONS, failed)}" if failed else ""), False, values
+    return f"{temperature} C" + (f"; not passed: {_bits(_INIT_NAMES, failed)}" if failed else ""), False, values
 
 
 def _analog(data: bytes) -> _Read:

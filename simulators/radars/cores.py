@@ -44,6 +44,7 @@ class Cores:
     fault_at: str = "power-up"
     first_generation: bool = False
     hardware_bits: int = 0
+    passes: int = 0x1FFE  # calibrations of the RF init
     main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     destroyed: bool = False
@@ -116,7 +117,7 @@ class Cores:
             self.event(UP_RF, struct.pack("<4I", 0x07FFFFFF, 2000, 0, 0), RF_UP_S)
         elif number == 0x00C0:
             self.calibrated = True
-            self._report_calibration(0x1FFE)
+            self._report_calibration(self.passes)
         elif number == 0x02CC and data[0] & 1 and self.supply_v > 1.1:
             self.destroyed = True
         elif number in (0x0220, 0x40E0):
@@ -172,9 +173,10 @@ class Cores:
         if number == SAVE:
             if not self.calibrated:
                 return 6, b""
-            whole = (struct.pack("<2I8xh", 0x1FFE, 0x1FFE, 41) + bytes((self.die * 31 + n) & 0xFF for n in range(654)))[
-                :672
-            ]
+            whole = (
+                struct.pack("<2I8xh", self.passes, self.passes, 41)
+                + bytes((self.die * 31 + n) & 0xFF for n in range(654))
+            )[:672]
             return 0, struct.pack("<2H", CHUNKS, part) + whole[CHUNK_BYTES * part : CHUNK_BYTES * (part + 1)]
         self._restored[part] = data[4:]
         if len(self._restored) == CHUNKS:

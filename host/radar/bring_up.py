@@ -25,7 +25,7 @@ from polysight.host.radar.firmware import (
 from polysight.host.radar.lab_commands import ALL_CALIBRATIONS, RESTORED_CALIBRATIONS
 from polysight.host.radar.messages import Message
 from polysight.host.radar.program import Program
-from polysight.host.radar.spi import Clock, Link, WordLink
+from polysight.host.radar.spi import Clock, Link, NotReportedError, StartedAnewError, WordLink
 from polysight.shared.errors import DeviceError
 
 POWER_UP_S = 5.0
@@ -120,11 +120,11 @@ class BringUp:
         ]
 
     def blame(self, error: DeviceError) -> DeviceError:
-        """The same error, naming what was passed over before it as its likely cause."""
+        """The same error; what was passed over before it stands behind its own cause."""
         if not self._passed_over:
             return error
         seen = "; ".join(dict.fromkeys(self._passed_over))
-        return DeviceError(error.what, f"it had reported before: {seen}; or {error.why}", error.remedy)
+        return DeviceError(error.what, f"{error.why}; it had reported before: {seen}", error.remedy)
 
     def write_flash(self, image: Image, progress: Callable[[int, int], None]) -> str:
         """Write an image to the flash, start the board from it, and verify; for a board in any state.
@@ -156,8 +156,8 @@ class BringUp:
         self._words.reset(held=False)
         try:
             up = self._link.wait_for((e.MAIN_POWER_UP,), POWER_UP_S, self.note)
-        except DeviceError as error:
-            raise DeviceError(
+        except NotReportedError as error:
+            raise NotReportedError(
                 error.what,
                 f"no power on the radar board, its jumpers are not in functional mode ({_JUMPERS}), or {error.why}",
                 f"the power supply of the radar board (its own 5 V plug), the jumpers, then the reset; {error.remedy}",
@@ -192,8 +192,8 @@ class BringUp:
 
     def _boot_from_ram(self, image: Image) -> None:
         try:
-            booted = self._link.wait_for((e.BOOT_STATUS,), _BOOTED_S, self.note)
-        except DeviceError as error:
+            booted = self._booted()
+        except NotReportedError as error:
             self._passed_over.append(f"no event 0x{e.BOOT_STATUS:04X} after the download")
             self._log(error.what)
             return
@@ -203,6 +203,18 @@ class BringUp:
             raise DeviceError(
                 f"{self._name}: refuses {image.name}: {booted}", "an image for another device", "TI's image for AWR2243"
             )
+
+    def _booted(self) -> e.Event:
+        """The event that a download to RAM ends with (ICD 6.1); a power-up event alone is no start from RAM."""
+        self._link.may_start = True
+        came = self._link.wait_for((e.BOOT_STATUS, e.MAIN_POWER_UP), _BOOTED_S, self.note)
+        if came.id == e.BOOT_STATUS:
+            self._link.may_start = False
+            return came
+        try:
+            return self._link.wait_for((e.BOOT_STATUS,), _BOOTED_S, self.note)
+        except NotReportedError:
+            raise StartedAnewError(self._name) from None
 
     def _same_rom(self, image: Image) -> str:
         """The main core's patch now, once its ROM is known to be the one that the image is for."""

@@ -19,6 +19,9 @@ MAIN_POWER_UP, RF_POWER_UP_DONE = 0x5000, 0x5001
 MAIN_CPU_FAULT, MAIN_ESM_FAULT, BOOT_STATUS, RF_ERROR = 0x5002, 0x5003, 0x5005, 0x5008
 
 
+STARTED_ANEW = frozenset({MAIN_POWER_UP})  # outside a reset: everything that was set is gone
+
+
 class InitBit(NamedTuple):
     """A calibration of the RF init: `of_transmitter` when only a board that transmits needs it to have passed."""
 

@@ -15,7 +15,7 @@ from polysight.host.radar.program import program
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.simulators.radars import Fault, make_image
 from polysight.simulators.radars import RadarBoard as Simulated
-from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, native_rig
 
 RIG = native_rig()
 DATA = make_image()
@@ -225,6 +225,18 @@ def test_power_lost_at_any_part_is_recovered_from(clock, part):
     assert rescued.state is State.CONFIGURED
     made(board, clock).write_flash(IMAGE, ignored)
     made(board, clock).configure()
+
+
+@pytest.mark.parametrize("part", range(1, 36))
+def test_a_start_in_the_middle_of_a_download_ends_it_at_once(clock, part):
+    """The parts that follow would be taken as the first of another file by the fresh ROM."""
+    board = Simulated(lambda: clock.time, flash=DATA, erase_s=0.1)
+    words = Restarts(board, clock, part + 1)
+    with pytest.raises(DeviceError, match=rf"part {part} of 35 .*started anew by itself") as caught:
+        made(board, clock, words=words).write_flash(IMAGE, ignored)
+    assert "no whole image" in caught.value.why
+    assert words.later == 0
+    assert clock.time < 5.0
 
 
 def test_a_part_that_is_refused_is_named(new, clock, monkeypatch):

@@ -354,10 +354,11 @@ def _answers(message: Message, asked: Message) -> bool:
     if message.kind is Kind.NACK:
         return True
     back = {Direction.HOST_TO_RF: Direction.RF_TO_HOST}.get(asked.direction, Direction.MAIN_TO_HOST)
+    of_device = message.direction in (Direction.RF_TO_HOST, Direction.MAIN_TO_HOST)
+    if message.error == (None, None) and message.sequence == 0 and of_device:
+        return True
     if message.kind is not Kind.RESPONSE or message.direction is not back:
         return False
-    if message.error == (None, None) and message.sequence == 0:
-        return True
     known = message.message_id == asked.message_id or message.error is not None
     return known and message.sequence == asked.sequence
 

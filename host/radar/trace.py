@@ -48,6 +48,7 @@ class TracedWords:
         self._words, self._clock, self._began = words, clock, clock.now()
         self._file = file.open("w", encoding="utf-8")
         self._level: bool | None = None
+        self._looks = 0  # at the interrupt since the last line, that showed nothing new
         self.file, self.ended = file, ""
         self._write({"trace": FORM, **facts})
 
@@ -68,9 +69,11 @@ class TracedWords:
         """The host interrupt; written down when it has changed. Raises DeviceError."""
         with _Errors(self):
             level = self._words.interrupt()
-        if level is not self._level:
+        if level is self._level:
+            self._looks += 1
+        else:
             self._level = level
-            self._put(line=INTERRUPT, level=int(level))
+            self._put(line=INTERRUPT, level=int(level), looks=self._looks)
         return level
 
     def reset(self, held: bool) -> None:
@@ -90,6 +93,7 @@ class TracedWords:
         self._put(error=what)
 
     def _put(self, **what: object) -> None:
+        self._looks = 0
         self._write({"t": round(self._clock.now() - self._began, 6), **what})
 
     def _write(self, line: dict[str, object]) -> None:
@@ -145,6 +149,7 @@ class ReplayedWords:
     def __init__(self, file: Path) -> None:
         self.facts, self._records = read_trace(file)
         self._at, self._time, self._level = 0, 0.0, False
+        self._looks = 0  # since the last line that was played
 
     def now(self) -> float:
         """Seconds of the trace's time."""
@@ -172,12 +177,19 @@ class ReplayedWords:
         return list(struct.unpack(f"<{count}H", bytes.fromhex(said)))
 
     def interrupt(self) -> bool:
-        """The line as it was at this time. Raises DeviceError."""
+        """The line as it was at this look, or, in a trace that does not count them, at this time.
+
+        Raises DeviceError.
+        """
+        self._looks += 1
         while not self.done and self._records[self._at].get("line") == INTERRUPT:
             record = self._records[self._at]
-            if record["t"] > self.now():
+            looks = record.get("looks")
+            if self._looks <= looks if looks is not None else record["t"] > self.now():
                 break
-            self._level, self._at = bool(record["level"]), self._at + 1
+            self._play_level()
+            if looks is not None:
+                break
         self._raise_error()
         return self._level
 
@@ -191,11 +203,19 @@ class ReplayedWords:
 
     def _skip_interrupts(self) -> None:
         while not self.done and self._records[self._at].get("line") == INTERRUPT:
-            self._level, self._at = bool(self._records[self._at]["level"]), self._at + 1
+            self._play_level()
+
+    def _play_level(self) -> None:
+        self._level = bool(self._records[self._at]["level"])
+        self._next()
+
+    def _next(self) -> None:
+        self._time = max(self._time, self._records[self._at]["t"])
+        self._at, self._looks = self._at + 1, 0
 
     def _raise_error(self) -> None:
         if not self.done and "error" in self._records[self._at]:
-            self._at += 1
+            self._next()
             raise DeviceError(self._records[self._at - 1]["error"], "as in the trace", "the trace's own remedy")
 
     def _expect(self, key: str, value: object) -> object:
@@ -206,7 +226,7 @@ class ReplayedWords:
         record = self._records[self._at]
         if key not in record or (value is not None and record[key] != value):
             raise self._differs(f"{key} {value}", json.dumps(record))
-        self._at, self._time = self._at + 1, max(self._time, record["t"])
+        self._next()
         self._raise_error()
         return record[key]
 

@@ -15,6 +15,8 @@ from polysight.host.radar.program import program
 from polysight.shared.tables import to_builtins
 from polysight.simulators.radars import RadarBoard, make_image
 from polysight.simulators.radars.__main__ import replay
+from polysight.simulators.radars.cores import BOOT_S
+from polysight.simulators.radars.wire import FAULT_DATA
 
 STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
 STEPS += ["one frame", "read back"]
@@ -154,6 +156,32 @@ def test_a_replayed_trace_comes_to_the_same_end(rig_file, board, capsys, tmp_pat
     again = capsys.readouterr().out.splitlines()
     assert [line for line in again if line.startswith("RH")] == told
     assert again[0].startswith("replayed from")
+
+
+@pytest.mark.parametrize("after_s", [0.0, 1e-4, 1.5e-3, 5e-3, 0.02, 0.5])
+@pytest.mark.parametrize("look_s", [0.0, 1.25e-4, 1e-3])
+def test_an_event_at_any_time_after_power_up_replays(
+    rig_file, words, board, clock, capsys, tmp_path, opened, look_s, after_s
+):
+    """A trace counts looks, each of which takes its time over USB: the line rises in a replay where it was seen to."""
+    del opened
+    look, boot = words.interrupt, board.cores.boot
+
+    def slow_look():
+        clock.sleep(look_s)
+        return look()
+
+    def booting():
+        boot()
+        board.cores.event(0x5002, FAULT_DATA, BOOT_S + after_s)
+
+    board.cores.fault_at = "never"
+    words.interrupt, board.cores.boot = slow_look, booting
+    trace = str(tmp_path / "day.jsonl")
+    assert run(rig_file(), "check", "RH", "--trace", trace) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
+    assert run(rig_file(), "replay", trace) == 0
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")] == told
 
 
 @pytest.mark.usefixtures("opened")

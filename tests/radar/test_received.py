@@ -113,8 +113,8 @@ def test_a_refusal_without_a_body_is_one_whatever_the_command_s_number(sequence)
     """The one that is known has the number 0; whether such a device repeats a command's number is not known."""
     asked, said = link(received.AWR1243_ERROR)
     asked.sequence = sequence
-    with pytest.raises(DeviceError, match=r"refuses DeviceConfiguration.*does not say why"):
-        asked.call(DeviceConfiguration())
+    with pytest.raises(DeviceError, match=r"refuses LowPower.*does not say why"):
+        asked.call(LowPower())
     assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
 

@@ -89,7 +89,7 @@ class BringUp:
         self._firmware, self._die_id, self._facts, self._log = firmware, die_id, facts, log
         self._calibration = calibration
         self._passed_over: list[str] = []
-        self._cure, self._had, self._held = "", "", False
+        self._cure, self._had, self._damage, self._held = "", "", "", False
 
     def power_steps(self) -> list[Step]:
         """Until both cores run."""
@@ -147,6 +147,7 @@ class BringUp:
             )
         after = self._main_patch()
         self._verify(after, before, image)
+        self._sound()
         return f"main core's patch {after} from flash (before: {before})"
 
     def _reset(self) -> str:
@@ -170,25 +171,34 @@ class BringUp:
         self._cure = str(event.values.get("cure", ""))
         if event.detail:
             self._passed_over.append(str(event))
+        if self._cure == "hardware":
+            self._damage = str(event)
+
+    def _sound(self) -> None:
+        """Refuse a board that found a fault of its own in any of its starts; only a download may come before it.
+
+        Raises DeviceError.
+        """
+        if self._damage:
+            raise DeviceError(
+                f"{self._name}: {self._damage}", "the device's own start-up test failed", "replace the board"
+            )
 
     def _load(self) -> str:
-        if self._firmware is not None:
-            self._had = has = self._same_rom(self._firmware)
-            if has == self._firmware.patches[0] and self._cure != "firmware":
-                self._held = True
-                return f"the flash holds the main core's patch {has} already; nothing is sent"
-            send_image(self._link, self._name, self._firmware, TO_RAM)
-            self._boot_from_ram(self._firmware)
-            came = f"{self._firmware.name} in RAM"
-        else:
-            came = (
-                "none asked for" if self._cure != "firmware" else "the flash is empty or broken, and no image is given"
-            )
-        if self._cure == "hardware":
-            raise DeviceError(
-                f"{self._name}: {self._passed_over[-1]}", "the device's own start-up test failed", "replace the board"
-            )
+        came = self._into_ram(self._firmware) if self._firmware is not None else "none asked for"
+        if self._firmware is None and self._cure == "firmware":
+            came = "the flash is empty or broken, and no image is given"
+        self._sound()
         return came
+
+    def _into_ram(self, image: Image) -> str:
+        self._had = has = self._same_rom(image)
+        if has == image.patches[0] and self._cure != "firmware":
+            self._held = True
+            return f"the flash holds the main core's patch {has} already; nothing is sent"
+        send_image(self._link, self._name, image, TO_RAM)
+        self._boot_from_ram(image)
+        return f"{image.name} in RAM"
 
     def _boot_from_ram(self, image: Image) -> None:
         try:
@@ -250,7 +260,11 @@ class BringUp:
     def _rf_up(self) -> str:
         self._link.call(c.DeviceConfiguration())
         self._link.call(c.RF_POWER_UP)
-        return str(self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_S, self.note))
+        up = self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_S, self.note)
+        self._facts["rf_tests_passed"] = up.values.get("tests_passed", 0)
+        if up.detail:
+            self._passed_over.append(str(up))
+        return str(up)
 
     def _versions(self) -> str:
         for core, key, question in (

@@ -81,6 +81,7 @@ _RF_CODES = (  # ICD 213
 )
 _RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1", 4: "ESM group 2", 7: "monitoring"}
 _ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}  # ICD 223
+_RF_TESTS = 0x07FFFFFF  # bits 0..26 of 0x5001, 1 = passed
 _RF_GROUP1_FATAL = 1 << 25  # programmable filter, double bit error (ICD 216); its parity error is reserved there
 _MAIN_GROUP1_FATAL = 1 << 22  # FRC lockstep (ICD 320)
 
@@ -275,7 +276,9 @@ def _boot(data: bytes) -> _Read:
 
 def _rf_power_up(data: bytes) -> _Read:
     passed, ticks = struct.unpack_from("<II", data)
-    return "", False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
+    failed = _RF_TESTS & ~passed
+    told = f"self-tests not passed 0x{failed:07X}" + (", none did" if failed == _RF_TESTS else "") if failed else ""
+    return told, False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
 
 
 def _rf_error(data: bytes) -> _Read:

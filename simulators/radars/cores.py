@@ -44,6 +44,7 @@ class Cores:
     fault_at: str = "power-up"
     first_generation: bool = False
     hardware_bits: int = 0
+    rf_tests: int = 0x07FFFFFF  # self-tests of the RF core that passed
     passes: int = 0x1FFE  # calibrations of the RF init
     main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
@@ -114,7 +115,7 @@ class Cores:
             self.crc32_events = data[0] == 1
         elif number == 0x4000 and (self._patched() or not self.first_generation):  # else it never comes, as received
             self.rf_up = True
-            self.event(UP_RF, struct.pack("<4I", 0x07FFFFFF, 2000, 0, 0), RF_UP_S)
+            self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
         elif number == 0x00C0:
             self.calibrated = True
             self._report_calibration(self.passes)

@@ -164,6 +164,33 @@ def test_the_slow_erase_is_waited_for(clock):
     assert board.cores.flash == DATA
 
 
+@pytest.mark.parametrize("bit", [8, 48, *range(50, 57)])
+@pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
+@pytest.mark.parametrize("image", [None, IMAGE])
+def test_a_board_that_found_itself_damaged_is_refused_after_any_download(clock, bit, flash, image):
+    """Boot status bits of docs/spec/mmwavelink.md; the status after a RAM download is clean, and no excuse."""
+    board = Simulated(lambda: clock.time, flash=flash)
+    board.cores.hardware_bits = 1 << bit
+    with pytest.raises(DeviceError, match="main core is up: ") as caught:
+        made(board, clock, image).configure()
+    assert caught.value.remedy == "replace the board"
+    assert 0x4000 not in board.executed
+    with pytest.raises(DeviceError) as caught:
+        made(board, clock).write_flash(IMAGE, ignored)
+    assert caught.value.remedy == "replace the board"
+    assert board.cores.flash == DATA
+
+
+@pytest.mark.parametrize(("tests", "said"), [(0, "none did"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
+def test_self_tests_of_the_rf_core_that_failed_are_told(board, clock, tests, said):
+    board.cores.rf_tests = tests
+    radar = made(board, clock)
+    told = []
+    radar.configure(lambda step, came: told.append(came) if step.name == "RF power-up" else None)
+    assert (said in told[0]) if said else told == ["RF core is up"]
+    assert radar.facts["rf_tests_passed"] == tests
+
+
 @pytest.mark.parametrize("rom", [(1, 2, 0, 5), (2, 0, 0, 3), (2, 2, 1, 6), (6, 2, 1, 7), (0, 0, 0, 0), (255,) * 4])
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
 def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):

@@ -29,10 +29,13 @@ _WORDS = {True: "ok", False: "FAILED"}
 
 
 def plan_radars(config: Path) -> int:
-    """Every constraint, and every message that each board would be sent; touches no board. Raises ConfigError."""
-    rig = _native(config)
-    sys.stdout.write("\n".join(plan_lines(rig)) + "\n")
-    return 0
+    """Every constraint, and each board's settings as bytes; touches no board; 1 when one is broken.
+
+    Raises ConfigError.
+    """
+    lines, holds = plan_lines(_native(config))
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0 if holds else 1
 
 
 def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json: bool) -> int:

@@ -148,6 +148,9 @@ class BringUp:
         after = self._main_patch()
         self._verify(after, before, image)
         self._sound()
+        if self._die_id:  # it can be asked only once the RF core runs, so only behind the writing
+            self._rf_up()
+            self._ask_die()
         return f"main core's patch {after} from flash (before: {before})"
 
     def _reset(self) -> str:
@@ -286,6 +289,8 @@ class BringUp:
                 self._verify_rf(_patch(v), self._firmware)
             elif self._firmware is not None:
                 self._verify(_patch(v), self._had, self._firmware)
+        if self._die_id:
+            self._ask_die()  # before anything of another board is powered
         return f"RF {self._facts['rf_firmware']}, main {self._facts['main_firmware']}"
 
     def _basic(self) -> str:

@@ -53,17 +53,26 @@ def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmw
     return RadarBoard(name, words, clock, made, firmware, native.die_id, calibration)
 
 
-def plan_lines(rig: Instrument) -> list[str]:
-    """Each constraint with its value, and every message that each board will be sent, as hexadecimal."""
+def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
+    """Each constraint with its value, and, where all hold, the settings of each board as hexadecimal; whether they do.
+
+    Beside the settings a board is sent power-up and RF init, questions and the start of its frames.
+    """
     frames = rig.grid.columns * rig.burst.pulses
-    lines = [f"{'holds ' if c.holds else 'BROKEN'}  {c}" for c in constraints(rig, frames)]
+    found = constraints(rig, frames)
+    lines = [
+        f"{'holds ' if c.holds else 'BROKEN'}  {c}" + ("" if c.holds else f"\n        do: {c.remedy}") for c in found
+    ]
+    if not all(c.holds for c in found):
+        return [*lines, "\nnothing would be sent"], False
     for board in rig.boards:
-        lines.append(f"\n{board.name}, sequence numbers from 0:")
+        lines.append(f"\n{board.name}, its settings, numbered as if they alone were sent:")
         made = program(rig, board)
         for number, sent in enumerate((*made.basic, *made.waveform, *made.frames(frames))):
             raw = encode(command((sent.block(),), sequence=number % 16))
             lines.append(f"  {type(sent).__name__:19} {raw.hex()}")
-    return lines
+    lines.append("\nnot shown: power-up, RF init, frame start, and questions (versions, die id, temperatures)")
+    return lines, True
 
 
 def firmware_of(rig: Instrument) -> Image | None:

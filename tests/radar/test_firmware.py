@@ -181,6 +181,21 @@ def test_a_board_that_found_itself_damaged_is_refused_after_any_download(clock, 
     assert board.cores.flash == DATA
 
 
+def test_another_board_than_the_rig_file_names_is_told_after_its_flash_was_written(clock):
+    board = Simulated(lambda: clock.time)
+    radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")), die_id="5eed0002-0-0-0")
+    with pytest.raises(DeviceError, match=r"die id 5eed0001.*the rig file names 5eed0002"):
+        radar.write_flash(IMAGE, ignored)
+
+
+def test_nothing_of_another_board_than_the_rig_file_names_is_powered(clock):
+    board = Simulated(lambda: clock.time, flash=DATA)
+    radar = RadarBoard("LS", BoardWords(board, clock), clock, program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0")
+    with pytest.raises(DeviceError, match="die id 5eed0001"):
+        radar.configure()
+    assert 0x0080 not in board.executed
+
+
 @pytest.mark.parametrize(("tests", "said"), [(0, "none did"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
 def test_self_tests_of_the_rf_core_that_failed_are_told(board, clock, tests, said):
     board.cores.rf_tests = tests

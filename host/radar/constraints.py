@@ -105,6 +105,9 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
     slower = "raise burst.period_us"
     yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "take fewer points or pulses a row")
     yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", slower)
+    yield Constraint(
+        "chirps", "chirps of a frame", rig.burst.chirps, 1, 255, "", "set burst.chirps to 1..255"
+    )  # ICD 91
     if rig.burst.chirps > 1:
         apart = f"set radar.idle_us to {rig.burst.chirp_us - chirps + rig.radar.idle_us:g}, or burst.chirp_us"
         yield Constraint(
@@ -137,7 +140,7 @@ def _chirp(rig: Instrument) -> Iterator[Constraint]:
     slope = slope_code(c.slope_hz_per_s)
     yield Constraint("slope", "code of the slope", slope, 1, MAX_SLOPE_CODE, "", "lower chirp.slope_hz_per_s")
     yield Constraint("ADC start", "ADC start", c.adc_start_us, 0, 40.95, "us", "lower chirp.adc_start_us")
-    yield Constraint("ramp", "ramp end", c.ramp_end_us, None, 5000, "us", "lower chirp.ramp_end_us")
+    yield Constraint("ramp", "ramp end", c.ramp_end_us, 0, 5000, "us", "lower chirp.ramp_end_us")
     yield Constraint("idle", "idle time", rig.radar.idle_us, 0, 5242.87, "us", "lower radar.idle_us")
     served_here = all(n.place.startswith("tcp://127.") for n in rig.radar.native.values())
     if not served_here or (c.hpf1_khz and c.hpf2_khz):  # simulated radars may have none; a device always filters

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polysight.host.radar.commands import FileChunk
+from polysight.host.radar.files import read_bounded
 from polysight.host.radar.messages import BODY_LIMIT
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import ConfigError, DeviceError
@@ -69,7 +70,7 @@ def describe_patch(major: int, minor: int, build: int, debug: int) -> str:
 
 def read_image(path: Path) -> Image:
     """Read and check an image file. Raises ConfigError, which names what is wrong with it; OSError."""
-    return check_image(path.read_bytes(), path.name)
+    return check_image(read_bounded(path, LARGEST_BYTES), path.name)
 
 
 def check_image(data: bytes, name: str) -> Image:
@@ -176,6 +177,7 @@ def send_image(link: Link, name: str, image: Image, to: int, progress: Callable[
         naming the part that failed. A flash is then half written: the board still starts, and takes the download again.
     """
     parts = image.chunks(to)
+    progress(0, len(parts))
     for n, (part, remaining) in enumerate(parts):
         try:
             link.call(part, timeout_s=CHUNK_S, remaining=remaining)

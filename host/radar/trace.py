@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from polysight.host.radar.files import read_bounded
 from polysight.host.radar.spi import Clock, WordLink
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
@@ -23,6 +24,8 @@ from polysight.shared.errors import ConfigError, DeviceError
 
 FORM = 1
 INTERRUPT, RESET = "HOST_INTR", "NRST"
+LARGEST_BYTES = 2**26  # a scan of some thousand rows
+_LONGEST_S = 1e7
 
 
 class TracedWords:
@@ -240,20 +243,47 @@ class ReplayedWords:
 
 def read_trace(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """A trace's first line, and the others; a last line that was cut off is left out. Raises ConfigError, OSError."""
-    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    lines = read_bounded(file, LARGEST_BYTES).decode("utf-8", errors="replace").split("\n")
     found = []
     for number, line in enumerate(lines, 1):
         try:
-            found.append(json.loads(line) if line else None)
-        except ValueError:
+            found.append((number, json.loads(line) if line else None))
+        except (ValueError, RecursionError):
             if number < len(lines):
                 raise _no_trace(file, f"line {number} is no JSON") from None
-    records = [r for r in found if isinstance(r, dict)]
-    if not records or records[0].get("trace") != FORM:
+    records = [(number, r) for number, r in found if r is not None]
+    if not records or not isinstance(records[0][1], dict) or records[0][1].get("trace") != FORM:
         raise _no_trace(file, f"its first line is not that of a trace of form {FORM}")
-    if not all(isinstance(r.get("t"), int | float) for r in records[1:]):
-        raise _no_trace(file, "a line has no time")
-    return records[0], records[1:]
+    before = 0.0
+    for number, record in records[1:]:
+        if not _sound(record):
+            raise _no_trace(file, f"line {number} is none of a trace's lines")
+        if record["t"] < before:
+            raise _no_trace(file, f"line {number} is of an earlier time than the one before")
+        before = record["t"]
+    return records[0][1], [r for _, r in records[1:]]
+
+
+def _sound(record: object) -> bool:
+    """Whether a line is one of those in docs/spec/mmwavelink.md ("Traces")."""
+    if (
+        not isinstance(record, dict)
+        or isinstance(record.get("t"), bool)
+        or not isinstance(record.get("t"), int | float)
+    ):
+        return False
+    if not 0 <= record["t"] <= _LONGEST_S:
+        return False
+    looks = record.get("looks", 0)
+    if "line" in record:
+        level = record["line"] in (INTERRUPT, RESET) and record.get("level") in (0, 1)
+        return level and isinstance(looks, int) and looks >= 0
+    texts = [record[key] for key in ("out", "in", "error") if key in record]
+    if len(texts) != 1 or not isinstance(texts[0], str):
+        return False
+    text = texts[0]
+    words = len(text) % 4 == 0 and all(c in "0123456789abcdef" for c in text)
+    return words or "error" in record
 
 
 def _no_trace(file: Path, what: str) -> ConfigError:

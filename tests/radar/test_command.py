@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from itertools import pairwise
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -226,6 +229,80 @@ def test_what_is_no_trace_is_named(rig_file, capsys, tmp_path, text):
     (tmp_path / "a").write_text(text)
     assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
     assert "--trace FILE" in capsys.readouterr().err
+
+
+HEAD = '{"trace": 1, "board": "RH"}\n'
+BAD_LINES = ["[" * 100_000, '{"t": -5, "out": ""}', '{"t": Infinity, "out": ""}', '{"t": 1e9, "out": ""}', '{"t": 1}']
+BAD_LINES += [
+    '{"t": 1, "line": "HOST_INTR"}',
+    '{"t": 1, "in": "xyz0"}',
+    '{"t": 1, "out": 5}',
+    '{"t": ' + "9" * 400 + ', "out": ""}',
+]
+BAD_LINES += ["5", '{"t": 2, "out": ""}\n{"t": 1, "out": ""}', '{"t": true, "out": ""}']
+
+
+@pytest.mark.parametrize("line", BAD_LINES, ids=range(len(BAD_LINES)))
+def test_a_line_that_is_none_of_a_trace_s_is_named(rig_file, capsys, tmp_path, line):
+    (tmp_path / "a").write_text(HEAD + line + "\n")
+    assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
+    assert re.search(r"a: line [23] is", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "sparse", "folder"])
+def test_what_is_no_file_of_a_sane_size_is_refused_unread(rig, rig_file, capsys, tmp_path, opened, kind):
+    path = tmp_path / "odd"
+    if kind == "device":
+        path = Path("/dev/zero")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        with path.open("wb") as file:
+            file.truncate(3 * 2**30)
+    said = "bytes" if kind == "sparse" else "no regular file"
+    with_it = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, firmware=str(path)))
+    here = rig_file()
+    for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):
+        assert run(file, *args) == 2
+        assert said in capsys.readouterr().err
+    assert run(rig_file(with_it), "check", "RH") == 2
+    assert said in capsys.readouterr().err
+    assert opened == []
+
+
+def test_a_trace_is_never_written_over(rig_file, opened, capsys, tmp_path):
+    trace = tmp_path / "day.jsonl"
+    trace.write_text("of another day")
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 2
+    assert "there already" in capsys.readouterr().err
+    assert trace.read_text() == "of another day"
+    assert opened == []
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_flash_write_that_is_stopped_says_what_the_flash_holds_now(rig_file, words, board, capsys, tmp_path):
+    image = tmp_path / "image.bin"
+    image.write_bytes(make_image())
+    write, seen = words.write, []
+
+    def stop_at_part_7(sent):
+        seen.extend(w for w in sent[:1] if w == 0x1234)
+        if len(seen) == 8:
+            raise KeyboardInterrupt
+        write(sent)
+
+    words.write = stop_at_part_7
+    assert run(rig_file(), "firmware", "RH", str(image), "--flash") == 130
+    assert "after 6 of 35 parts: its flash holds no whole image" in capsys.readouterr().err
+    assert board.cores.flash != make_image()
+
+
+def test_an_empty_file_is_no_trace_for_the_simulated_board(tmp_path):
+    (tmp_path / "a").write_text("")
+    with pytest.raises(ValueError, match="no trace"):
+        replay(tmp_path / "a", RadarBoard)
 
 
 @pytest.mark.usefixtures("opened")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
-from polysight.host.radar.calibration_data import CalibrationFiles, read_calibration, restore_calibration
+from polysight.host.radar.calibration_data import NO_DIE, CalibrationFiles, read_calibration, restore_calibration
 from polysight.host.radar.firmware import (
     TO_FLASH,
     TO_RAM,
@@ -302,7 +302,10 @@ class BringUp:
         die, kept, restored = "", None, ""
         if self._calibration is not None:
             die = self._ask_die()
-            kept = self._calibration.load(die)
+            if die == NO_DIE:
+                self._link.warnings.append(f"{self._name}: its die id is 0: no calibration is kept for it")
+            else:
+                kept = self._calibration.load(die)
         if kept is not None:
             restored = "; " + restore_calibration(self._link, self._name, kept, _CALIBRATION_S, self.note)
         self._link.call(c.RF_INIT)
@@ -315,7 +318,7 @@ class BringUp:
                 "no reference clock, an RF supply out of range, or a damaged RF part",
                 "measure the RF supplies; switch its power off and on; replace the board if it stays",
             )
-        if self._calibration is not None and kept is None:
+        if self._calibration is not None and kept is None and die != NO_DIE:
             self._calibration.save(die, read_calibration(self._link, self._name))
         self._facts["calibration_restored"] = bool(restored)
         return str(event) + restored

@@ -28,6 +28,7 @@ from polysight.host.radar.spi import Link
 from polysight.shared.errors import ConfigError, DeviceError
 
 _BYTES = CALIBRATION_PARTS * CALIBRATION_PART_BYTES
+NO_DIE = "-".join(["00000000"] * 4)  # tells no boards apart
 _LARGEST_BYTES = 2**16
 _DO = "remove the file: the board then calibrates itself, and a new one is written"
 

@@ -6,7 +6,7 @@ Each has its formula, limit and value. Sources: ICD at its printed page; rig fac
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import isfinite
+from math import inf
 from typing import NamedTuple
 
 from polysight.host.radar.commands import SLOPE_HZ_PER_S_PER_CODE, START_HZ_PER_CODE, slope_code, start_code
@@ -95,9 +95,9 @@ def _finite(rig: Instrument) -> Iterator[Constraint]:
     for table, part in tables.items():
         for key in part.__struct_fields__:
             value = getattr(part, key)
-            if isinstance(value, float) and not isfinite(value):
-                name = f"{table}.{key}"
-                yield Constraint(name, "a number", value, -_LARGEST, _LARGEST, "", f"give a number in {name}")
+            if isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
+                name, shown = f"{table}.{key}", value if isinstance(value, float) else inf
+                yield Constraint(name, "a number", shown, -_LARGEST, _LARGEST, "", f"give a number in {name}")
 
 
 def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
@@ -122,7 +122,7 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
 
 def _chirp(rig: Instrument) -> Iterator[Constraint]:
     c = rig.chirp
-    end = c.adc_start_us + c.samples / c.sample_rate_hz * 1e6
+    end = c.adc_start_us + (c.samples / c.sample_rate_hz * 1e6 if c.sample_rate_hz else inf)
     yield Constraint(
         "ADC window", "ADC start + samples / rate", end, None, c.ramp_end_us, "us", "raise chirp.ramp_end_us"
     )

@@ -196,7 +196,7 @@ def describe_refusal(number: int | None, block: int | None) -> str:
 
 
 def decode_event(block: SubBlock) -> Event:
-    """An event from its sub-block; unknown or short ones are told as such, and are not fatal."""
+    """An event from its sub-block; unknown and short ones are told as such. A fault too short to be read is fatal."""
     known = _EVENTS.get(block.id)
     if known is None:
         return Event(block.id, f"event 0x{block.id:04X}", block.data.hex())
@@ -204,7 +204,8 @@ def decode_event(block: SubBlock) -> Event:
     try:
         detail, fatal, values = read(block.data)
     except (struct.error, IndexError):
-        return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}")
+        fatal = block.id in _FATAL_UNREAD
+        return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}", fatal)
     return Event(block.id, name, detail, fatal, values)
 
 
@@ -286,6 +287,7 @@ def _rf_error(data: bytes) -> _Read:
     return _word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
 
 
+_FATAL_UNREAD = (RF_CPU_FAULT, RF_ESM_FAULT, ANALOG_FAULT, MAIN_CPU_FAULT, MAIN_ESM_FAULT, RF_ERROR)
 _EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
     RF_CPU_FAULT: ("RF core fault", _cpu(_RF_CODES)),
     RF_ESM_FAULT: ("RF core error signal", _esm(_RF_GROUP1_FATAL)),

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.calibration_data import CalibrationFiles
+from polysight.host.radar.calibration_data import NO_DIE, CalibrationFiles
 from polysight.host.radar.constraints import constraints, direct_if_hz, require
 from polysight.host.radar.firmware import Image, read_image
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
@@ -164,6 +164,7 @@ class NativeRadars(RadarControl):
                 self._boards[board.name] = radar_board(rig, board.name, words, self._clock, firmware)
             for board in self._boards.values():
                 board.configure()
+            self._tell_apart()
             opened.pop_all()
 
     def arm(self, frames: int) -> None:
@@ -179,6 +180,19 @@ class NativeRadars(RadarControl):
                 if self._reopen(board):
                     with suppress(DeviceError):
                         board.arm(frames)
+
+    def _tell_apart(self) -> None:
+        """Raises DeviceError when two boards have one die id: they are one board, named twice."""
+        found: dict[object, str] = {}
+        for name, board in self._boards.items():
+            die = board.facts.get("die_id", name)
+            if die != NO_DIE and die in found:
+                raise DeviceError(
+                    f"{found[die]} and {name} have the same die id {die}",
+                    "both names of radar.native lead to one board",
+                    "correct usb_serial or usb_path of one of them",
+                )
+            found[die] = name
 
     def _open(self, name: str) -> WordLink:
         words, folder = self._open_words(self._rig.radar.native[name].place), self._rig.radar.trace_dir
@@ -218,7 +232,7 @@ class NativeRadars(RadarControl):
             if self._clock.now() > deadline:
                 break
             self._clock.sleep(_LOOK_S)
-        return waiting
+        return [n for n, b in self._boards.items() if n in waiting or b.state is State.FAULT]
 
     def states(self) -> dict[str, BoardState]:
         """What each board has said, by name; a link that is gone is a fault. Boards not armed are left out."""

@@ -125,6 +125,8 @@ class Cores:
             rom = self.main_rom if number == 0x40E0 else self.rf_rom
             return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == 0x40E0)
         elif number == 0x0223:
+            if not self.die:
+                return bytes(32)
             return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
         elif number == 0x02EA:
             return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)

@@ -118,6 +118,8 @@ def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, cloc
         (ANALOG_FAULT, struct.pack("<BBHII", 1, 0, 0, 0b1010, 0), "1.3 V / 1.0 V RF supply, PA LDO shorted"),
         (MAIN_CPU_FAULT, struct.pack("<BBH", 4, 0, 0) + bytes(28), "chirp error"),
         (RF_ERROR, struct.pack("<II", 2, 0), "RF firmware abort"),
+        (RF_CPU_FAULT, b"", "only 0 bytes"),
+        (RF_ESM_FAULT, bytes(4), "only 4 bytes"),
     ],
 )
 @pytest.mark.parametrize("running", [False, True])

@@ -29,7 +29,7 @@ def add_commands(add: Add) -> None:
         sub.add_argument("--config", type=Path, default=argparse.SUPPRESS, metavar="FILE", help="rig file")
         return sub
 
-    sub = action("plan", "show each constraint and every message that each board will be sent", "polysight radar plan")
+    sub = action("plan", "show each constraint, and the settings that each board will be sent", "polysight radar plan")
     sub.set_defaults(run=_plan)
 
     sub = action(

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from polysight.host.radar import (
     Clock,
+    Image,
+    RadarBoard,
     ReplayedWords,
     Row,
     SystemClock,
@@ -29,15 +31,19 @@ _WORDS = {True: "ok", False: "FAILED"}
 
 
 def plan_radars(config: Path) -> int:
-    """Every constraint, and every message that each board would be sent; touches no board. Raises ConfigError."""
-    rig = _native(config)
-    sys.stdout.write("\n".join(plan_lines(rig)) + "\n")
-    return 0
+    """Every constraint, and each board's settings as bytes; touches no board; 1 when one is broken.
+
+    Raises ConfigError.
+    """
+    lines, holds = plan_lines(_native(config))
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0 if holds else 1
 
 
 def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json: bool) -> int:
     """One board from USB to one frame, step by step; 0 when every step holds. Raises ConfigError, OSError."""
     rig = _checked(config, name)
+    _fresh(trace)
     clock = SystemClock()
     return _check(rig, name, clock, lambda: _open(rig, name, clock, trace, slow), as_json)
 
@@ -59,11 +65,12 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     rig = _checked(config, name)
     checked, clock = read_image(image), SystemClock()
     sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked.patches)}\n")
+    _fresh(trace)
     words = _open(rig, name, clock, trace, slow)
     board = radar_board(rig, name, words, clock, None if flash else checked)
     try:
         if flash:
-            sys.stdout.write(f"{name}: {board.write_flash(checked, _progress)}\n")
+            sys.stdout.write(f"{name}: {_write_flash(board, image, checked)}\n")
         else:
             board.configure()
             sys.stdout.write(
@@ -104,6 +111,34 @@ def _text(name: str, row: Row) -> str:
     if not row.holds:
         lines += [f"      expected: {row.expected}", f"      do: {row.do}"]
     return "\n".join(lines) + "\n"
+
+
+def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
+    """Write it, and say how much of it is there when somebody stops it. Raises DeviceError, ConfigError."""
+    done = [0, 0]
+
+    def progress(sent: int, of: int) -> None:
+        done[:] = sent, of
+        _progress(sent, of)
+
+    try:
+        return board.write_flash(image, progress)
+    except KeyboardInterrupt:
+        sent, of = done
+        again = f"`polysight radar firmware {board.name} {file} --flash`"
+        if of and sent < of:
+            told = f"stopped after {sent} of {of} parts: its flash holds no whole image now; again: {again}"
+            sys.stderr.write(f"\n{board.name}: {told}\n")
+        elif of:
+            sys.stderr.write(f"\n{board.name}: stopped: its flash was written, not verified; again: {again}\n")
+        raise
+
+
+def _fresh(trace: Path | None) -> None:
+    if trace is not None and trace.is_file():
+        raise ConfigError(
+            f"{trace}: is there already", "a trace of before, which is never written over", "another name"
+        )
 
 
 def _progress(sent: int, of: int) -> None:

@@ -7,9 +7,10 @@ chip can do. For a board's first days: `check_board`, and `TracedWords` with `Re
 """
 
 from polysight.host.radar.backends import radar_control
+from polysight.host.radar.board import RadarBoard
 from polysight.host.radar.check import Row, check_board
 from polysight.host.radar.constraints import INTER_FRAME_US, constraints, direct_if_hz, require
-from polysight.host.radar.firmware import read_image
+from polysight.host.radar.firmware import Image, read_image
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
 from polysight.host.radar.native import firmware_of, open_board, plan_lines, radar_board
 from polysight.host.radar.program import TRIGGER_MARGIN_US, chirp_us
@@ -21,6 +22,8 @@ __all__ = [
     "TRIGGER_MARGIN_US",
     "BoardState",
     "Clock",
+    "Image",
+    "RadarBoard",
     "RadarControl",
     "RadarState",
     "ReplayedWords",

@@ -181,6 +181,12 @@ class RadarBoard:
                 self._frames = frames
             self._link.call(c.FrameControl(c.START))
             self._wait(e.TRIGGER_READY, _READY_S)
+            if self._state is State.DONE:
+                raise DeviceError(
+                    f"{self.name}: says that its frames ended as soon as it was armed, before any pulse was sent",
+                    "pulses on SYNC_IN from elsewhere (DCA1000 through R62, noise), or a late report of earlier ones",
+                    "look at SYNC_IN while nothing is sent (docs/how-to/wiring.md); the row is taken again",
+                )
             if self._state is not State.ARMED:
                 raise DeviceError(f"{self.name}: {self.reason}", "a fatal event while it was armed", "resume the scan")
 
@@ -317,8 +323,6 @@ class RadarBoard:
         self._keep(str(event))
         if event.fatal:
             self.fail(str(event))
-        elif event.id == e.MAIN_POWER_UP:  # asked for only in a bring-up
-            self.fail("it has started anew by itself: its supply failed for a moment, or somebody pressed reset")
         elif event.id == e.FRAME_END and self._state in (State.ARMED, State.RUNNING):
             self._to(State.DONE)
         elif event.id == e.TRIGGER_READY and self._state in (State.CONFIGURED, State.DONE):

@@ -12,12 +12,21 @@ from typing import NamedTuple
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
-from polysight.host.radar.calibration_data import CalibrationFiles, read_calibration, restore_calibration
-from polysight.host.radar.firmware import TO_FLASH, TO_RAM, Image, describe_patch, send_image
+from polysight.host.radar.calibration_data import NO_DIE, CalibrationFiles, read_calibration, restore_calibration
+from polysight.host.radar.firmware import (
+    TO_FLASH,
+    TO_RAM,
+    Image,
+    describe_patch,
+    require_family,
+    require_rom,
+    send_image,
+)
+from polysight.host.radar.lab_commands import ALL_CALIBRATIONS, RESTORED_CALIBRATIONS
 from polysight.host.radar.messages import Message
 from polysight.host.radar.program import Program
-from polysight.host.radar.spi import Clock, Link, WordLink
-from polysight.shared.errors import ConfigError, DeviceError
+from polysight.host.radar.spi import Clock, Link, NotReportedError, StartedAnewError, WordLink
+from polysight.shared.errors import DeviceError
 
 POWER_UP_S = 5.0
 _CALIBRATION_S = 5.0
@@ -80,7 +89,7 @@ class BringUp:
         self._firmware, self._die_id, self._facts, self._log = firmware, die_id, facts, log
         self._calibration = calibration
         self._passed_over: list[str] = []
-        self._cure, self._had = "", ""
+        self._cure, self._had, self._damage, self._held = "", "", "", False
 
     def power_steps(self) -> list[Step]:
         """Until both cores run."""
@@ -95,7 +104,12 @@ class BringUp:
         return [
             Step("versions", "both cores with a patch", _FIRMWARE, self._versions),
             Step("settings", f"{len(self._program.basic)} acknowledgements", "compare with `plan`", self._basic),
-            Step("RF init", "calibrated, synthesizers passed", "clock, RF supplies; power-cycle it", self._rf_init),
+            Step(
+                "RF init",
+                "calibrated, all that the board needs passed",
+                "clock, RF supplies; power-cycle it",
+                self._rf_init,
+            ),
         ]
 
     def waveform_steps(self) -> list[Step]:
@@ -106,11 +120,11 @@ class BringUp:
         ]
 
     def blame(self, error: DeviceError) -> DeviceError:
-        """The same error, naming what was passed over before it as its likely cause."""
+        """The same error; what was passed over before it stands behind its own cause."""
         if not self._passed_over:
             return error
         seen = "; ".join(dict.fromkeys(self._passed_over))
-        return DeviceError(error.what, f"it had reported before: {seen}; or {error.why}", error.remedy)
+        return DeviceError(error.what, f"{error.why}; it had reported before: {seen}", error.remedy)
 
     def write_flash(self, image: Image, progress: Callable[[int, int], None]) -> str:
         """Write an image to the flash, start the board from it, and verify; for a board in any state.
@@ -121,7 +135,7 @@ class BringUp:
             when a part is not taken, or the board does not start from its flash afterwards.
         """
         self._reset()
-        before = self._same_family(image)
+        before = self._same_rom(image)
         send_image(self._link, self._name, image, TO_FLASH, progress)
         self._passed_over.clear()
         self._reset()
@@ -133,6 +147,10 @@ class BringUp:
             )
         after = self._main_patch()
         self._verify(after, before, image)
+        self._sound()
+        if self._die_id:  # it can be asked only once the RF core runs, so only behind the writing
+            self._rf_up()
+            self._ask_die()
         return f"main core's patch {after} from flash (before: {before})"
 
     def _reset(self) -> str:
@@ -142,8 +160,8 @@ class BringUp:
         self._words.reset(held=False)
         try:
             up = self._link.wait_for((e.MAIN_POWER_UP,), POWER_UP_S, self.note)
-        except DeviceError as error:
-            raise DeviceError(
+        except NotReportedError as error:
+            raise NotReportedError(
                 error.what,
                 f"no power on the radar board, its jumpers are not in functional mode ({_JUMPERS}), or {error.why}",
                 f"the power supply of the radar board (its own 5 V plug), the jumpers, then the reset; {error.remedy}",
@@ -156,29 +174,39 @@ class BringUp:
         self._cure = str(event.values.get("cure", ""))
         if event.detail:
             self._passed_over.append(str(event))
+        if self._cure == "hardware":
+            self._damage = str(event)
+
+    def _sound(self) -> None:
+        """Refuse a board that found a fault of its own in any of its starts; only a download may come before it.
+
+        Raises DeviceError.
+        """
+        if self._damage:
+            raise DeviceError(
+                f"{self._name}: {self._damage}", "the device's own start-up test failed", "replace the board"
+            )
 
     def _load(self) -> str:
-        if self._firmware is not None:
-            self._had = has = self._same_family(self._firmware)
-            if has == self._firmware.patches[0] and self._cure != "firmware":
-                return f"the flash holds patch {has} already; nothing is sent"
-            send_image(self._link, self._name, self._firmware, TO_RAM)
-            self._boot_from_ram(self._firmware)
-            came = f"{self._firmware.name} in RAM"
-        else:
-            came = (
-                "none asked for" if self._cure != "firmware" else "the flash is empty or broken, and no image is given"
-            )
-        if self._cure == "hardware":
-            raise DeviceError(
-                f"{self._name}: {self._passed_over[-1]}", "the device's own start-up test failed", "replace the board"
-            )
+        came = self._into_ram(self._firmware) if self._firmware is not None else "none asked for"
+        if self._firmware is None and self._cure == "firmware":
+            came = "the flash is empty or broken, and no image is given"
+        self._sound()
         return came
+
+    def _into_ram(self, image: Image) -> str:
+        self._had = has = self._same_rom(image)
+        if has == image.patches[0] and self._cure != "firmware":
+            self._held = True
+            return f"the flash holds the main core's patch {has} already; nothing is sent"
+        send_image(self._link, self._name, image, TO_RAM)
+        self._boot_from_ram(image)
+        return f"{image.name} in RAM"
 
     def _boot_from_ram(self, image: Image) -> None:
         try:
-            booted = self._link.wait_for((e.BOOT_STATUS,), _BOOTED_S, self.note)
-        except DeviceError as error:
+            booted = self._booted()
+        except NotReportedError as error:
             self._passed_over.append(f"no event 0x{e.BOOT_STATUS:04X} after the download")
             self._log(error.what)
             return
@@ -189,16 +217,22 @@ class BringUp:
                 f"{self._name}: refuses {image.name}: {booted}", "an image for another device", "TI's image for AWR2243"
             )
 
-    def _same_family(self, image: Image) -> str:
+    def _booted(self) -> e.Event:
+        """The event that a download to RAM ends with (ICD 6.1); a power-up event alone is no start from RAM."""
+        self._link.may_start = True
+        came = self._link.wait_for((e.BOOT_STATUS, e.MAIN_POWER_UP), _BOOTED_S, self.note)
+        if came.id == e.BOOT_STATUS:
+            self._link.may_start = False
+            return came
+        try:
+            return self._link.wait_for((e.BOOT_STATUS,), _BOOTED_S, self.note)
+        except NotReportedError:
+            raise StartedAnewError(self._name) from None
+
+    def _same_rom(self, image: Image) -> str:
         """The main core's patch now, once its ROM is known to be the one that the image is for."""
         answer = data_of(self._name, self._link.call(c.GET_MAIN_VERSION), c.GET_MAIN_VERSION, 16)
-        if answer[3] != image.rom[0]:
-            raise ConfigError(
-                f"{self._name}: its ROM is of generation {answer[3]}, {image.name} is for generation {image.rom[0]};"
-                " nothing was sent",
-                "another device than an AWR2243, or an image for another",
-                "take the image of this device's DFP",
-            )
+        require_rom(self._name, answer, image)
         return _patch(answer)
 
     def _main_patch(self) -> str:
@@ -217,25 +251,46 @@ class BringUp:
             )
         self._link.warnings.append(told)
 
+    def _verify_rf(self, patch: str, image: Image) -> None:
+        """The RF core's patch is known only once that core runs: another one than the file's is told."""
+        if patch != image.patches[1]:
+            held = f"from its flash; `polysight radar firmware {self._name} {image.name} --flash` writes both cores'"
+            self._link.warnings.append(
+                f"{self._name}: its RF core reports patch {patch}, {image.name} holds {image.patches[1]}"
+                + (f": it runs {held}" if self._held else "")
+            )
+
     def _rf_up(self) -> str:
         self._link.call(c.DeviceConfiguration())
         self._link.call(c.RF_POWER_UP)
-        return str(self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_S, self.note))
+        up = self._link.wait_for((e.RF_POWER_UP_DONE,), POWER_UP_S, self.note)
+        self._facts["rf_tests_passed"] = up.values.get("tests_passed", 0)
+        if up.detail:
+            self._passed_over.append(str(up))
+        return str(up)
 
     def _versions(self) -> str:
-        for key, question in (("rf_firmware", c.GET_RF_VERSION), ("main_firmware", c.GET_MAIN_VERSION)):
+        for core, key, question in (
+            ("RF", "rf_firmware", c.GET_RF_VERSION),
+            ("main", "main_firmware", c.GET_MAIN_VERSION),
+        ):
             v = data_of(self._name, self._link.call(question), question, 16)
             hardware, release, patch = v[:3], v[3:7], (*v[10:12], v[15] >> 4, v[15] & 15)
             self._facts[key] = ".".join(map(str, release)) + " patch " + ".".join(map(str, patch))
             self._facts["hardware"] = ".".join(map(str, hardware))
+            require_family(self._name, core, v)
             if not any(patch):
                 raise DeviceError(
                     f"{self._name}: its {key.replace('_', ' ')} has no patch (version {self._facts[key]})",
                     "this board's flash holds no firmware, and none was downloaded",
                     _FIRMWARE,
                 )
-            if key == "main_firmware" and self._firmware is not None:
+            if self._firmware is not None and core == "RF":
+                self._verify_rf(_patch(v), self._firmware)
+            elif self._firmware is not None:
                 self._verify(_patch(v), self._had, self._firmware)
+        if self._die_id:
+            self._ask_die()  # before anything of another board is powered
         return f"RF {self._facts['rf_firmware']}, main {self._facts['main_firmware']}"
 
     def _basic(self) -> str:
@@ -247,18 +302,23 @@ class BringUp:
         die, kept, restored = "", None, ""
         if self._calibration is not None:
             die = self._ask_die()
-            kept = self._calibration.load(die)
+            if die == NO_DIE:
+                self._link.warnings.append(f"{self._name}: its die id is 0: no calibration is kept for it")
+            else:
+                kept = self._calibration.load(die)
         if kept is not None:
             restored = "; " + restore_calibration(self._link, self._name, kept, _CALIBRATION_S, self.note)
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_S, self.note)
         self._facts["calibration"] = dict(event.values)
-        passed = event.values.get("passed")
-        if not isinstance(passed, int) or passed & e.SYNTHESIZER != e.SYNTHESIZER:
+        asked = ALL_CALIBRATIONS & ~RESTORED_CALIBRATIONS if restored else ALL_CALIBRATIONS
+        if failed := e.failed_calibrations(event, self._program.transmits, asked):
             raise DeviceError(
-                f"{self._name}: calibration failed: {event}", "no reference clock or supply", "power-cycle it"
+                f"{self._name}: RF init did not pass: {', '.join(failed)} ({event})",
+                "no reference clock, an RF supply out of range, or a damaged RF part",
+                "measure the RF supplies; switch its power off and on; replace the board if it stays",
             )
-        if self._calibration is not None and kept is None:
+        if self._calibration is not None and kept is None and die != NO_DIE:
             self._calibration.save(die, read_calibration(self._link, self._name))
         self._facts["calibration_restored"] = bool(restored)
         return str(event) + restored

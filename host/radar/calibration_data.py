@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from polysight.host.radar import events as e
+from polysight.host.radar.files import read_bounded
 from polysight.host.radar.lab_commands import (
     ALL_CALIBRATIONS,
     CALIBRATION_PART_BYTES,
@@ -27,6 +28,8 @@ from polysight.host.radar.spi import Link
 from polysight.shared.errors import ConfigError, DeviceError
 
 _BYTES = CALIBRATION_PARTS * CALIBRATION_PART_BYTES
+NO_DIE = "-".join(["00000000"] * 4)  # tells no boards apart
+_LARGEST_BYTES = 2**16
 _DO = "remove the file: the board then calibrates itself, and a new one is written"
 
 
@@ -46,11 +49,16 @@ class CalibrationFiles:
         if not path.exists():
             return None
         try:
-            told = json.loads(path.read_text(encoding="utf-8"))
+            told = json.loads(read_bounded(path, _LARGEST_BYTES))
             data = bytes.fromhex(told["data"])
             sound = told["die_id"] == die_id and len(data) == _BYTES and zlib.crc32(data) == told["crc32"]
-        except (ValueError, KeyError, TypeError):
-            sound, data = False, b""
+            passed = int.from_bytes(data[:4], "little")  # of the RF init that it was saved from (ICD 71)
+        except (ValueError, KeyError, TypeError, RecursionError):
+            sound, data, passed = False, b"", 0
+        if sound and passed & RESTORED_CALIBRATIONS != RESTORED_CALIBRATIONS:
+            raise ConfigError(
+                f"{path}: is of a start whose RF init did not pass", "saved before that was looked at", _DO
+            )
         if not sound:
             raise ConfigError(f"{path}: is not the calibration data of {die_id}", "damaged, or another board's", _DO)
         return data

@@ -347,6 +347,9 @@ class FileChunk(Command):
     ID = 0x4080
     part: bytes
 
+    def __str__(self) -> str:
+        return f"{len(self.part)} bytes of a file"
+
     def data(self) -> bytes:
         """The part itself."""
         return self.part

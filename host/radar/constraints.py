@@ -6,17 +6,18 @@ Each has its formula, limit and value. Sources: ICD at its printed page; rig fac
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import inf
 from typing import NamedTuple
 
 from polysight.host.radar.commands import SLOPE_HZ_PER_S_PER_CODE, START_HZ_PER_CODE, slope_code, start_code
 from polysight.host.radar.program import chirp_us, frame_period_us
-from polysight.shared.config import Board, Instrument
+from polysight.shared.config import HPF_FIRST_KHZ, Board, Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import direct_path_m
 from polysight.shared.raster import MIN_PERIOD_US, WIDTH_US
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-BAND_HZ = (76e9, 81e9)
+BAND_HZ = (0x5471C71B * START_HZ_PER_CODE, 0x5A000000 * START_HZ_PER_CODE)  # 76..81 GHz, to the code (ICD 81)
 INTER_FRAME_US = 300.0
 AFTER_FRAME_US = 150.0
 FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
@@ -24,6 +25,7 @@ SAMPLE_MEMORY_BYTES = 16384
 TRIGGER_UNCERTAINTY_S = 5e-9  # of one board against the pulse (ICD 92)
 PASSBAND = 0.9  # of the sample rate
 MAX_SLOPE_CODE = 5510
+_LARGEST = 1.7e308
 MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}  # regular ADC mode, 20 MHz IF (ICD 85)
 
 
@@ -47,9 +49,9 @@ class Constraint(NamedTuple):
         return (self.low is None or self.value >= self.low) and (self.high is None or self.value <= self.high)
 
     def __str__(self) -> str:
-        low = "" if self.low is None else f"{self.low:.9g} <= "
-        high = "" if self.high is None else f" <= {self.high:.9g}"
-        return f"{self.name}: {low}{self.formula} = {self.value:.9g}{high} {self.unit}".rstrip()
+        low = "" if self.low is None else f"{self.low:.12g} <= "
+        high = "" if self.high is None else f" <= {self.high:.12g}"
+        return f"{self.name}: {low}{self.formula} = {self.value:.12g}{high} {self.unit}".rstrip()
 
 
 def direct_if_hz(rig: Instrument, board: Board) -> float:
@@ -66,7 +68,12 @@ def direct_if_hz(rig: Instrument, board: Board) -> float:
 
 
 def constraints(rig: Instrument, frames: int) -> list[Constraint]:
-    """Every constraint on a rig, for rows of `frames` frames."""
+    """Every constraint on a rig, for rows of `frames` frames; only what is no number, where something is none.
+
+    Whatever the rig file holds, this raises nothing; what breaks none of them can be encoded (`program`).
+    """
+    if unusable := list(_finite(rig)):
+        return unusable
     return [*_timing(rig, frames), *_chirp(rig), *(c for b in rig.boards for c in _of_board(rig, b))]
 
 
@@ -81,11 +88,26 @@ def require(rig: Instrument, frames: int) -> None:
         )
 
 
+def _finite(rig: Instrument) -> Iterator[Constraint]:
+    """What breaks every formula: infinities, and what is not a number."""
+    tables = {"chirp": rig.chirp, "burst": rig.burst, "radar": rig.radar}
+    tables |= {f"boards.{b.name}": b for b in rig.boards}
+    for table, part in tables.items():
+        for key in part.__struct_fields__:
+            value = getattr(part, key)
+            if isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
+                name, shown = f"{table}.{key}", value if isinstance(value, float) else inf
+                yield Constraint(name, "a number", shown, -_LARGEST, _LARGEST, "", f"give a number in {name}")
+
+
 def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
     period, chirps = frame_period_us(rig), chirp_us(rig)
     slower = "raise burst.period_us"
     yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "take fewer points or pulses a row")
     yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", slower)
+    yield Constraint(
+        "chirps", "chirps of a frame", rig.burst.chirps, 1, 255, "", "set burst.chirps to 1..255"
+    )  # ICD 91
     if rig.burst.chirps > 1:
         apart = f"set radar.idle_us to {rig.burst.chirp_us - chirps + rig.radar.idle_us:g}, or burst.chirp_us"
         yield Constraint(
@@ -100,7 +122,7 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
 
 def _chirp(rig: Instrument) -> Iterator[Constraint]:
     c = rig.chirp
-    end = c.adc_start_us + c.samples / c.sample_rate_hz * 1e6
+    end = c.adc_start_us + (c.samples / c.sample_rate_hz * 1e6 if c.sample_rate_hz else inf)
     yield Constraint(
         "ADC window", "ADC start + samples / rate", end, None, c.ramp_end_us, "us", "raise chirp.ramp_end_us"
     )
@@ -118,8 +140,13 @@ def _chirp(rig: Instrument) -> Iterator[Constraint]:
     slope = slope_code(c.slope_hz_per_s)
     yield Constraint("slope", "code of the slope", slope, 1, MAX_SLOPE_CODE, "", "lower chirp.slope_hz_per_s")
     yield Constraint("ADC start", "ADC start", c.adc_start_us, 0, 40.95, "us", "lower chirp.adc_start_us")
-    yield Constraint("ramp", "ramp end", c.ramp_end_us, None, 5000, "us", "lower chirp.ramp_end_us")
+    yield Constraint("ramp", "ramp end", c.ramp_end_us, 0, 5000, "us", "lower chirp.ramp_end_us")
     yield Constraint("idle", "idle time", rig.radar.idle_us, 0, 5242.87, "us", "lower radar.idle_us")
+    served_here = all(n.place.startswith("tcp://127.") for n in rig.radar.native.values())
+    if not served_here or (c.hpf1_khz and c.hpf2_khz):  # simulated radars may have none; a device always filters
+        lowest = min(c.hpf1_khz, c.hpf2_khz)
+        corner = "set the corners that the devices have: chirp.hpf1_khz 175 and hpf2_khz 350 at least"
+        yield Constraint("high-pass filters", "lower corner", lowest, HPF_FIRST_KHZ[0], None, "kHz", corner)
     gain = rig.radar.rx_gain_db
     # ICD table 5.24; the text of error 52 says 24..52, which not every temperature and RF target reaches.
     yield Constraint("RX gain", "RX gain", gain, 32, 52, "dB", "set radar.rx_gain_db to 32..52, even")

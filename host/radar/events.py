@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from polysight.host.radar.messages import SubBlock
 
@@ -17,21 +18,47 @@ CALIBRATION_REPORT = 0x1012
 MAIN_POWER_UP, RF_POWER_UP_DONE = 0x5000, 0x5001
 MAIN_CPU_FAULT, MAIN_ESM_FAULT, BOOT_STATUS, RF_ERROR = 0x5002, 0x5003, 0x5005, 0x5008
 
-CALIBRATIONS = {  # ICD 217, bit: name
-    1: "clock PLL",
-    2: "synthesizer VCO1",
-    3: "synthesizer VCO2",
-    4: "LO distribution",
-    5: "ADC offset",
-    6: "high-pass filter",
-    7: "low-pass filter",
-    8: "peak detector",
-    9: "TX power",
-    10: "RX gain",
-    11: "TX phase",
-    12: "RX I/Q",
+
+STARTED_ANEW = frozenset({MAIN_POWER_UP})  # outside a reset: everything that was set is gone
+
+
+class InitBit(NamedTuple):
+    """A calibration of the RF init: `of_transmitter` when only a board that transmits needs it to have passed."""
+
+    name: str
+    of_transmitter: bool = False
+
+
+INIT_BITS = {  # ICD 217, where 0 is "fail"
+    1: InitBit("clock PLL"),
+    2: InitBit("synthesizer VCO1"),
+    3: InitBit("synthesizer VCO2"),
+    4: InitBit("LO distribution"),
+    5: InitBit("ADC offset"),
+    6: InitBit("high-pass filter"),
+    7: InitBit("low-pass filter"),
+    8: InitBit("peak detector", of_transmitter=True),
+    9: InitBit("TX power", of_transmitter=True),
+    10: InitBit("RX gain"),
+    11: InitBit("TX phase", of_transmitter=True),
+    12: InitBit("RX I/Q"),
 }
-SYNTHESIZER = 0b1110  # without these three nothing can be transmitted
+_INIT_NAMES = {bit: one.name for bit, one in INIT_BITS.items()}
+
+
+def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
+    """What a board cannot be used without and did not pass in its RF init.
+
+    `run` masks the calibrations that were asked for beside clock and synthesizers, which run at every start.
+    """
+    passed = event.values.get("passed")
+    if not isinstance(passed, int):
+        return ["a report that can be read"]
+    asked = run | 0b1110
+    needed = {bit: one.name for bit, one in INIT_BITS.items() if transmits or not one.of_transmitter}
+    return [name for bit, name in needed.items() if asked >> bit & 1 and not passed >> bit & 1]
+
+
 _CPU_FAULTS = (  # ICD 212, 317
     "undefined instruction",
     "instruction fetch abort",
@@ -54,6 +81,7 @@ _RF_CODES = (  # ICD 213
 )
 _RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1", 4: "ESM group 2", 7: "monitoring"}
 _ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}  # ICD 223
+_RF_TESTS = 0x07FFFFFF  # bits 0..26 of 0x5001, 1 = passed
 _RF_GROUP1_FATAL = 1 << 25  # programmable filter, double bit error (ICD 216); its parity error is reserved there
 _MAIN_GROUP1_FATAL = 1 << 22  # FRC lockstep (ICD 320)
 
@@ -168,7 +196,7 @@ def describe_refusal(number: int | None, block: int | None) -> str:
 
 
 def decode_event(block: SubBlock) -> Event:
-    """An event from its sub-block; unknown or short ones are told as such, and are not fatal."""
+    """An event from its sub-block; unknown and short ones are told as such. A fault too short to be read is fatal."""
     known = _EVENTS.get(block.id)
     if known is None:
         return Event(block.id, f"event 0x{block.id:04X}", block.data.hex())
@@ -176,7 +204,8 @@ def decode_event(block: SubBlock) -> Event:
     try:
         detail, fatal, values = read(block.data)
     except (struct.error, IndexError):
-        return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}")
+        fatal = block.id in _FATAL_UNREAD
+        return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}", fatal)
     return Event(block.id, name, detail, fatal, values)
 
 
@@ -218,9 +247,9 @@ def _esm(fatal_in_group1: int) -> Callable[[bytes], _Read]:
 
 def _init_done(data: bytes) -> _Read:
     status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
-    failed = sum(1 << b for b in CALIBRATIONS if not status >> b & 1)
+    failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
     values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
-    return f"{temperature} C" + (f"; not passed: {_bits(CALIBRATIONS, failed)}" if failed else ""), False, values
+    return f"{temperature} C" + (f"; not passed: {_bits(_INIT_NAMES, failed)}" if failed else ""), False, values
 
 
 def _analog(data: bytes) -> _Read:
@@ -248,7 +277,9 @@ def _boot(data: bytes) -> _Read:
 
 def _rf_power_up(data: bytes) -> _Read:
     passed, ticks = struct.unpack_from("<II", data)
-    return "", False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
+    failed = _RF_TESTS & ~passed
+    told = f"self-tests not passed 0x{failed:07X}" + (", none did" if failed == _RF_TESTS else "") if failed else ""
+    return told, False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
 
 
 def _rf_error(data: bytes) -> _Read:
@@ -256,6 +287,7 @@ def _rf_error(data: bytes) -> _Read:
     return _word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
 
 
+_FATAL_UNREAD = (RF_CPU_FAULT, RF_ESM_FAULT, ANALOG_FAULT, MAIN_CPU_FAULT, MAIN_ESM_FAULT, RF_ERROR)
 _EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
     RF_CPU_FAULT: ("RF core fault", _cpu(_RF_CODES)),
     RF_ESM_FAULT: ("RF core error signal", _esm(_RF_GROUP1_FATAL)),

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polysight.host.radar.commands import FileChunk
+from polysight.host.radar.files import read_bounded
 from polysight.host.radar.messages import BODY_LIMIT
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import ConfigError, DeviceError
@@ -23,6 +24,12 @@ TO_FLASH = 4  # the first of four places in the board's serial flash
 CHUNK_S = 10.0  # TI's limit for each part; the first one is acknowledged when the flash is erased
 LARGEST_BYTES = 2**20  # of one of the flash's four places, more than any image of TI's
 GENERATION = 2  # major version of the ROM in AWR2243, which the image must patch
+FAMILIES = {  # major version of a ROM: devices
+    1: "AWR1243 or another of the first generation",
+    GENERATION: "AWR2243",
+    6: "xWR6243, 57..64 GHz",
+}
+_CORES = ("main", "RF")  # in an image, a part for each
 
 _MAGIC, _END, _PART = b"MSTR", b"MEND", b"RPRC"
 _LENGTH_AT, _HEADER_BYTES = 20, 128
@@ -41,7 +48,7 @@ class Image:
     data
         All of it, CRC included.
     rom
-        Version of the ROM that it patches: major, minor, build, debug.
+        Version of the main core's ROM that it patches: major, minor, build, debug.
     patches
         Version of each part's patch, main core first, as a version answer tells it (`describe_patch`).
     """
@@ -63,7 +70,7 @@ def describe_patch(major: int, minor: int, build: int, debug: int) -> str:
 
 def read_image(path: Path) -> Image:
     """Read and check an image file. Raises ConfigError, which names what is wrong with it; OSError."""
-    return check_image(path.read_bytes(), path.name)
+    return check_image(read_bounded(path, LARGEST_BYTES), path.name)
 
 
 def check_image(data: bytes, name: str) -> Image:
@@ -92,17 +99,53 @@ def check_image(data: bytes, name: str) -> Image:
     begins = [at for at in range(_HEADER_BYTES, len(data) - _PATCH_AT - 8, 4) if data[at : at + 4] == _PART]
     if _END not in data[:_HEADER_BYTES] or not begins or begins[0] != _HEADER_BYTES:
         raise _refused(name, "no program part behind its header", "an image of another kind")
-    rom = tuple(data[_HEADER_BYTES + _ROM_AT : _HEADER_BYTES + _ROM_AT + 4])
-    if rom[0] != GENERATION:
+    if len(begins) != len(_CORES):
+        raise _refused(name, f"{len(begins)} program parts, an AWR2243 has two cores", "an image of another kind")
+    roms = [tuple(data[at + _ROM_AT : at + _ROM_AT + 4]) for at in begins]
+    if others := [rom[0] for rom in roms if rom[0] != GENERATION]:
         raise _refused(
             name,
-            f"for devices of generation {rom[0]}, an AWR2243 is of {GENERATION}",
-            "an image for AWR1243 or another",
+            f"for devices of generation {others[0]} ({_family(others[0])}), an AWR2243 is of {GENERATION}",
+            "an image for another device",
         )
     patches = tuple(describe_patch(*data[at + _PATCH_AT : at + _PATCH_AT + 4]) for at in begins)
     if others := [p for p in patches if not p.startswith(f"{GENERATION}.")]:
         raise _refused(name, f"its patches are {', '.join(others)}, those of an AWR2243 2.x", "an image for xWR6243")
-    return Image(name, data, rom, patches)
+    return Image(name, data, roms[0], patches)
+
+
+def _family(generation: int) -> str:
+    return FAMILIES.get(generation, "no device that is known here")
+
+
+def require_family(name: str, core: str, version: bytes) -> None:
+    """Refuse a device that is no AWR2243, by its version answer; its frequencies and settings would mean other things.
+
+    Raises ConfigError in plain words.
+    """
+    release = version[3:7]
+    if release[0] == GENERATION:
+        return
+    told = ".".join(map(str, release))
+    wired = set(release) in ({0x00}, {0xFF})
+    raise ConfigError(
+        f"{name}: its {core} core's ROM is {told}, of generation {release[0]} ({_family(release[0])});"
+        " only AWR2243 is configured here",
+        "the board's data line is stuck" if wired else "another device than the rig file's",
+        "check the 60-pin connector" if wired else "put an AWR2243 there; docs/spec/mmwavelink.md, Other boards",
+    )
+
+
+def require_rom(name: str, version: bytes, image: Image) -> None:
+    """Refuse an image that was made for another ROM than the device's, by its version answer. Raises ConfigError."""
+    require_family(name, _CORES[0], version)
+    if tuple(version[3:7]) != image.rom:
+        there, wanted = (".".join(map(str, rom)) for rom in (version[3:7], image.rom))
+        raise ConfigError(
+            f"{name}: its main core's ROM is {there}, {image.name} patches ROM {wanted}; nothing was sent",
+            "another version of the device, or an image for another",
+            "take the image of this device's DFP",
+        )
 
 
 def file_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:
@@ -134,6 +177,7 @@ def send_image(link: Link, name: str, image: Image, to: int, progress: Callable[
         naming the part that failed. A flash is then half written: the board still starts, and takes the download again.
     """
     parts = image.chunks(to)
+    progress(0, len(parts))
     for n, (part, remaining) in enumerate(parts):
         try:
             link.call(part, timeout_s=CHUNK_S, remaining=remaining)

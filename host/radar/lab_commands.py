@@ -85,6 +85,9 @@ class RestoreCalibration(Command):
     part: int
     content: bytes
 
+    def __str__(self) -> str:
+        return f"part {self.part} of its calibration data"
+
     def data(self) -> bytes:
         """How many parts, which one, and its 224 bytes; TI's library sends the count where the ICD reserves a field."""
         return struct.pack("<2H", CALIBRATION_PARTS, self.part) + self.content

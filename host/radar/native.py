@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.calibration_data import CalibrationFiles
+from polysight.host.radar.calibration_data import NO_DIE, CalibrationFiles
 from polysight.host.radar.constraints import constraints, direct_if_hz, require
 from polysight.host.radar.firmware import Image, read_image
 from polysight.host.radar.interface import BoardState, RadarControl, RadarState
@@ -53,17 +53,26 @@ def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmw
     return RadarBoard(name, words, clock, made, firmware, native.die_id, calibration)
 
 
-def plan_lines(rig: Instrument) -> list[str]:
-    """Each constraint with its value, and every message that each board will be sent, as hexadecimal."""
+def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
+    """Each constraint with its value, and, where all hold, the settings of each board as hexadecimal; whether they do.
+
+    Beside the settings a board is sent power-up and RF init, questions and the start of its frames.
+    """
     frames = rig.grid.columns * rig.burst.pulses
-    lines = [f"{'holds ' if c.holds else 'BROKEN'}  {c}" for c in constraints(rig, frames)]
+    found = constraints(rig, frames)
+    lines = [
+        f"{'holds ' if c.holds else 'BROKEN'}  {c}" + ("" if c.holds else f"\n        do: {c.remedy}") for c in found
+    ]
+    if not all(c.holds for c in found):
+        return [*lines, "\nnothing would be sent"], False
     for board in rig.boards:
-        lines.append(f"\n{board.name}, sequence numbers from 0:")
+        lines.append(f"\n{board.name}, its settings, numbered as if they alone were sent:")
         made = program(rig, board)
         for number, sent in enumerate((*made.basic, *made.waveform, *made.frames(frames))):
             raw = encode(command((sent.block(),), sequence=number % 16))
             lines.append(f"  {type(sent).__name__:19} {raw.hex()}")
-    return lines
+    lines.append("\nnot shown: power-up, RF init, frame start, and questions (versions, die id, temperatures)")
+    return lines, True
 
 
 def firmware_of(rig: Instrument) -> Image | None:
@@ -155,6 +164,7 @@ class NativeRadars(RadarControl):
                 self._boards[board.name] = radar_board(rig, board.name, words, self._clock, firmware)
             for board in self._boards.values():
                 board.configure()
+            self._tell_apart()
             opened.pop_all()
 
     def arm(self, frames: int) -> None:
@@ -170,6 +180,19 @@ class NativeRadars(RadarControl):
                 if self._reopen(board):
                     with suppress(DeviceError):
                         board.arm(frames)
+
+    def _tell_apart(self) -> None:
+        """Raises DeviceError when two boards have one die id: they are one board, named twice."""
+        found: dict[object, str] = {}
+        for name, board in self._boards.items():
+            die = board.facts.get("die_id", name)
+            if die != NO_DIE and die in found:
+                raise DeviceError(
+                    f"{found[die]} and {name} have the same die id {die}",
+                    "both names of radar.native lead to one board",
+                    "correct usb_serial or usb_path of one of them",
+                )
+            found[die] = name
 
     def _open(self, name: str) -> WordLink:
         words, folder = self._open_words(self._rig.radar.native[name].place), self._rig.radar.trace_dir
@@ -209,7 +232,7 @@ class NativeRadars(RadarControl):
             if self._clock.now() > deadline:
                 break
             self._clock.sleep(_LOOK_S)
-        return waiting
+        return [n for n, b in self._boards.items() if n in waiting or b.state is State.FAULT]
 
     def states(self) -> dict[str, BoardState]:
         """What each board has said, by name; a link that is gone is a fault. Boards not armed are left out."""

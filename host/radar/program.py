@@ -31,6 +31,7 @@ class Program:
     samples: int
     frame_period_us: float
     chirps: int = 1
+    transmits: bool = False
 
     def frames(self, count: int, trigger: int = c.HARDWARE_TRIGGER) -> tuple[c.Command, ...]:
         """Frames of the burst: the RF core's part, then the main core's."""
@@ -93,6 +94,7 @@ def program(rig: Instrument, board: Board) -> Program:
         samples=chirp.samples,
         frame_period_us=frame_period_us(rig),
         chirps=rig.burst.chirps,
+        transmits=bool(tx),
     )
     for command in (*made.basic, *made.waveform):
         command.block()  # refuses here what fits no field

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 from polysight.host.radar.commands import RF_POWER_UP, Command
-from polysight.host.radar.events import Event, decode_event, describe_refusal
+from polysight.host.radar.events import STARTED_ANEW, Event, decode_event, describe_refusal
 from polysight.host.radar.messages import (
     DEVICE_SYNC,
     HEADER_BYTES,
@@ -37,6 +37,7 @@ SETTLE_S = 30e-6  # from the interrupt to the first word (ICD 20)
 DATA_S = 1e-3  # from the interrupt's fall to the first word read, as TI's port waits
 _LOOK_S = 0.5e-3
 _INTERRUPT_LOW_S = 0.1
+_LINGER_S = 0.1  # a device's power-up event comes within; only looked for when a command was refused
 MESSAGES_A_POLL = 64  # read in one look at most, or
 POLL_S = 0.25  # for so long, when events follow each other without end
 _MOST_WARNINGS = 100
@@ -56,6 +57,21 @@ _SILENT = "the board has no power, hangs, or its interrupt line is not connected
 _NOT_CLOCKED = "the board does not hear its SPI clock or chip select, or its interrupt line is stuck"
 _NOT_HEARD = "the board's data line (MISO) is not connected, or SPI is disturbed"
 _DISTURBED = "the SPI lines are disturbed: noise, a loose 60-pin connector, or a clock that is too fast"
+
+
+class NotReportedError(DeviceError):
+    """An event that was waited for did not come; the link itself works."""
+
+
+class StartedAnewError(DeviceError):
+    """A board has reset itself, and nothing that it was told holds any more."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(
+            f"{name}: it has started anew by itself: its supply failed for a moment, or somebody pressed reset",
+            "a supply that sags when the RF core starts, a loose 5 V plug, or the reset line",
+            "measure the radar board's 5 V while it starts; what was being done begins again with a reset",
+        )
 
 
 class WordLink(Protocol):
@@ -122,6 +138,8 @@ class Link:
     ----------
     sequence
         Number of the next command, 0..15.
+    may_start
+        Whether the device's next power-up event is awaited; any other ends what is being done with StartedAnewError.
     warnings
         What went wrong and was mended, at most 100 lines.
     """
@@ -130,12 +148,14 @@ class Link:
         self._name, self._words, self._clock, self._on_sent = name, words, clock, on_sent
         self.sequence = 0
         self._events: deque[Event] = deque()
+        self.may_start = True
         self.warnings: list[str] = []
 
     def restart(self) -> None:
         """The device was reset: it counts from zero again, and what it had said is void."""
         self.sequence = 0
         self._events.clear()
+        self.may_start = True
 
     def call(self, sent: Command, *, timeout_s: float = RESPONSE_S, remaining: int = 0) -> Message:
         """Send a command and return the device's answer, its chunks joined.
@@ -165,6 +185,7 @@ class Link:
                     f"{type(sent).__name__} (0x{sent.ID:04X}) sent {len(problems) + 1} times: {problems[-1].what}"
                 )
             if answer.error is not None:
+                self._linger()
                 raise DeviceError(
                     f"{self._name}: the radar refuses {sent}: {describe_refusal(*answer.error)}",
                     "the rig file asks for what this device cannot do, or it was in another state than thought",
@@ -177,6 +198,13 @@ class Link:
             "; ".join(dict.fromkeys(p.why for p in problems)),
             _DO,
         )
+
+    def _linger(self) -> None:
+        """A device that has just started anew refuses, too, and says why a moment later. Raises StartedAnewError."""
+        until = self._clock.now() + _LINGER_S
+        while self._clock.now() < until:
+            self._look()
+            self._clock.sleep(_LOOK_S)
 
     def poll(self) -> list[Event]:
         """Events since the last look; reads what waits, within limits. Raises DeviceError without a link."""
@@ -206,7 +234,7 @@ class Link:
                     return event
             if self._clock.now() > deadline:
                 wanted = ", ".join(f"0x{i:04X}" for i in ids)
-                raise DeviceError(
+                raise NotReportedError(
                     f"{self._name}: the radar did not report {wanted} within {limit_s:g} s"
                     + (f"; a message was lost meanwhile: {lost.what}" if lost else ""),
                     lost.why if lost else f"it was reset, or: {_SILENT}",
@@ -252,7 +280,7 @@ class Link:
                 parts.append(message)
                 if message.remaining_chunks == 0:
                     return _joined(parts), problem
-        return None, problem
+        return None, Problem("parts of the answer are missing", _DISTURBED) if parts else problem
 
     def _receive(self) -> tuple[Message | None, Problem]:
         """One message, now that the interrupt is high; None and why when it cannot be read."""
@@ -292,10 +320,17 @@ class Link:
         return True
 
     def _keep(self, message: Message) -> None:
-        if message.kind is Kind.EVENT:
-            self._events.extend(decode_event(b) for b in message.blocks)
-        else:
+        """Keep events for whoever looks next. Raises StartedAnewError."""
+        if message.kind is not Kind.EVENT:
             self._warn(f"an answer that nobody waits for (sequence {message.sequence})")
+            return
+        for event in map(decode_event, message.blocks):
+            self._events.append(event)
+            if event.id in STARTED_ANEW:
+                if not self.may_start:
+                    self._warn(str(event))
+                    raise StartedAnewError(self._name)
+                self.may_start = False
 
     def _write(self, raw: bytes) -> None:
         self._on_sent(raw)
@@ -311,11 +346,20 @@ class Link:
 
 
 def _answers(message: Message, asked: Message) -> bool:
-    """Whether a response or NACK belongs to a command: its id, or the id 0 of a refusal (ICD 4.4), and its number."""
+    """Whether a response or NACK belongs to a command: its id, or the id 0 of a refusal (ICD 4.4), and its number.
+
+    The one refusal without a body that is known has the number 0; whether such a device repeats a command's number is
+    not. One with that number is taken as meant: it ends the command, and never lets anything pass.
+    """
     if message.kind is Kind.NACK:
         return True
     back = {Direction.HOST_TO_RF: Direction.RF_TO_HOST}.get(asked.direction, Direction.MAIN_TO_HOST)
-    known = message.message_id == asked.message_id or (message.error is not None and message.direction is back)
+    of_device = message.direction in (Direction.RF_TO_HOST, Direction.MAIN_TO_HOST)
+    if message.error == (None, None) and message.sequence == 0 and of_device:
+        return True
+    if message.kind is not Kind.RESPONSE or message.direction is not back:
+        return False
+    known = message.message_id == asked.message_id or message.error is not None
     return known and message.sequence == asked.sequence
 
 

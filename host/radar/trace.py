@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from polysight.host.radar.files import read_bounded
 from polysight.host.radar.spi import Clock, WordLink
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
@@ -23,6 +24,8 @@ from polysight.shared.errors import ConfigError, DeviceError
 
 FORM = 1
 INTERRUPT, RESET = "HOST_INTR", "NRST"
+LARGEST_BYTES = 2**26  # a scan of some thousand rows
+_LONGEST_S = 1e7
 
 
 class TracedWords:
@@ -48,6 +51,7 @@ class TracedWords:
         self._words, self._clock, self._began = words, clock, clock.now()
         self._file = file.open("w", encoding="utf-8")
         self._level: bool | None = None
+        self._looks = 0  # at the interrupt since the last line, that showed nothing new
         self.file, self.ended = file, ""
         self._write({"trace": FORM, **facts})
 
@@ -68,9 +72,11 @@ class TracedWords:
         """The host interrupt; written down when it has changed. Raises DeviceError."""
         with _Errors(self):
             level = self._words.interrupt()
-        if level is not self._level:
+        if level is self._level:
+            self._looks += 1
+        else:
             self._level = level
-            self._put(line=INTERRUPT, level=int(level))
+            self._put(line=INTERRUPT, level=int(level), looks=self._looks)
         return level
 
     def reset(self, held: bool) -> None:
@@ -90,6 +96,7 @@ class TracedWords:
         self._put(error=what)
 
     def _put(self, **what: object) -> None:
+        self._looks = 0
         self._write({"t": round(self._clock.now() - self._began, 6), **what})
 
     def _write(self, line: dict[str, object]) -> None:
@@ -145,6 +152,7 @@ class ReplayedWords:
     def __init__(self, file: Path) -> None:
         self.facts, self._records = read_trace(file)
         self._at, self._time, self._level = 0, 0.0, False
+        self._looks = 0  # since the last line that was played
 
     def now(self) -> float:
         """Seconds of the trace's time."""
@@ -172,12 +180,19 @@ class ReplayedWords:
         return list(struct.unpack(f"<{count}H", bytes.fromhex(said)))
 
     def interrupt(self) -> bool:
-        """The line as it was at this time. Raises DeviceError."""
+        """The line as it was at this look, or, in a trace that does not count them, at this time.
+
+        Raises DeviceError.
+        """
+        self._looks += 1
         while not self.done and self._records[self._at].get("line") == INTERRUPT:
             record = self._records[self._at]
-            if record["t"] > self.now():
+            looks = record.get("looks")
+            if self._looks <= looks if looks is not None else record["t"] > self.now():
                 break
-            self._level, self._at = bool(record["level"]), self._at + 1
+            self._play_level()
+            if looks is not None:
+                break
         self._raise_error()
         return self._level
 
@@ -191,11 +206,19 @@ class ReplayedWords:
 
     def _skip_interrupts(self) -> None:
         while not self.done and self._records[self._at].get("line") == INTERRUPT:
-            self._level, self._at = bool(self._records[self._at]["level"]), self._at + 1
+            self._play_level()
+
+    def _play_level(self) -> None:
+        self._level = bool(self._records[self._at]["level"])
+        self._next()
+
+    def _next(self) -> None:
+        self._time = max(self._time, self._records[self._at]["t"])
+        self._at, self._looks = self._at + 1, 0
 
     def _raise_error(self) -> None:
         if not self.done and "error" in self._records[self._at]:
-            self._at += 1
+            self._next()
             raise DeviceError(self._records[self._at - 1]["error"], "as in the trace", "the trace's own remedy")
 
     def _expect(self, key: str, value: object) -> object:
@@ -206,7 +229,7 @@ class ReplayedWords:
         record = self._records[self._at]
         if key not in record or (value is not None and record[key] != value):
             raise self._differs(f"{key} {value}", json.dumps(record))
-        self._at, self._time = self._at + 1, max(self._time, record["t"])
+        self._next()
         self._raise_error()
         return record[key]
 
@@ -220,20 +243,47 @@ class ReplayedWords:
 
 def read_trace(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """A trace's first line, and the others; a last line that was cut off is left out. Raises ConfigError, OSError."""
-    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    lines = read_bounded(file, LARGEST_BYTES).decode("utf-8", errors="replace").split("\n")
     found = []
     for number, line in enumerate(lines, 1):
         try:
-            found.append(json.loads(line) if line else None)
-        except ValueError:
+            found.append((number, json.loads(line) if line else None))
+        except (ValueError, RecursionError):
             if number < len(lines):
                 raise _no_trace(file, f"line {number} is no JSON") from None
-    records = [r for r in found if isinstance(r, dict)]
-    if not records or records[0].get("trace") != FORM:
+    records = [(number, r) for number, r in found if r is not None]
+    if not records or not isinstance(records[0][1], dict) or records[0][1].get("trace") != FORM:
         raise _no_trace(file, f"its first line is not that of a trace of form {FORM}")
-    if not all(isinstance(r.get("t"), int | float) for r in records[1:]):
-        raise _no_trace(file, "a line has no time")
-    return records[0], records[1:]
+    before = 0.0
+    for number, record in records[1:]:
+        if not _sound(record):
+            raise _no_trace(file, f"line {number} is none of a trace's lines")
+        if record["t"] < before:
+            raise _no_trace(file, f"line {number} is of an earlier time than the one before")
+        before = record["t"]
+    return records[0][1], [r for _, r in records[1:]]
+
+
+def _sound(record: object) -> bool:
+    """Whether a line is one of those in docs/spec/mmwavelink.md ("Traces")."""
+    if (
+        not isinstance(record, dict)
+        or isinstance(record.get("t"), bool)
+        or not isinstance(record.get("t"), int | float)
+    ):
+        return False
+    if not 0 <= record["t"] <= _LONGEST_S:
+        return False
+    looks = record.get("looks", 0)
+    if "line" in record:
+        level = record["line"] in (INTERRUPT, RESET) and record.get("level") in (0, 1)
+        return level and isinstance(looks, int) and looks >= 0
+    texts = [record[key] for key in ("out", "in", "error") if key in record]
+    if len(texts) != 1 or not isinstance(texts[0], str):
+        return False
+    text = texts[0]
+    words = len(text) % 4 == 0 and all(c in "0123456789abcdef" for c in text)
+    return words or "error" in record
 
 
 def _no_trace(file: Path, what: str) -> ConfigError:

@@ -8,6 +8,7 @@ Not run on hardware yet.
 
 from __future__ import annotations
 
+import errno
 import socket
 import struct
 import time
@@ -155,9 +156,9 @@ def _exactly(port: Port, size: int) -> bytes:
 
 
 class FtdiPort:
-    """One channel, in MPSSE or bit-bang mode. Errors of the USB library become DeviceError."""
+    """One channel of a chip, in MPSSE or bit-bang mode. Errors of the USB library become DeviceError."""
 
-    def __init__(self, place: str, interface: int, direction: int, bit_bang: bool) -> None:
+    def __init__(self, place: str, chip: Any, interface: int, direction: int, bit_bang: bool) -> None:
         self._library = _library()
         ftdi = self._library.ftdi
         self._place = place
@@ -166,19 +167,15 @@ class FtdiPort:
             if VENDOR not in ftdi.PRODUCT_IDS:
                 ftdi.add_custom_vendor(VENDOR, "ti")
                 ftdi.add_custom_product(VENDOR, PRODUCT, "devpack")
-            self._ftdi.open(VENDOR, PRODUCT, interface=interface, **self._library.address_of(place))
+            self._ftdi.open_from_device(self._library.share(chip), interface)
             self._ftdi.set_bitmode(0, ftdi.BitMode.RESET)
             self._ftdi.set_latency_timer(_LATENCY_MS)
             self._ftdi.purge_buffers()
             self._ftdi.set_bitmode(direction, ftdi.BitMode.BITBANG if bit_bang else ftdi.BitMode.MPSSE)
         except self._library.errors as e:
             self.close()
-            raise DeviceError(
-                f"radar USB {place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}",
-                "unplugged, another serial number or path, no permission (a udev rule for 0451:fd03), or libusb is"
-                " missing",
-                _CHECK,
-            ) from None
+            what = f"radar USB {place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
+            raise DeviceError(what, _cause(e, "unplugged meanwhile, or libusb is missing"), _CHECK) from None
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises DeviceError."""
@@ -206,7 +203,25 @@ class FtdiPort:
             self._library.tools.release_device(device)  # which else counts it as open, and gives it to the next
 
     def _gone(self, e: BaseException) -> DeviceError:
-        return DeviceError(f"radar USB {self._place}: {e}", "the cable was pulled, or the board lost power", _CHECK)
+        why = _cause(e, "the cable was pulled, or the board lost power")
+        return DeviceError(f"radar USB {self._place}: {e}", why, _CHECK)
+
+
+_CAUSES = {
+    errno.EBUSY: "another program holds this chip: mmWave Studio, or a second polysight; end it",
+    errno.EACCES: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
+    errno.EPERM: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
+    errno.ETIMEDOUT: "the chip does not answer: a loose cable, or a hub without power",
+}
+
+
+def _cause(e: BaseException | None, otherwise: str) -> str:
+    """The likely cause by the error's number; pyftdi keeps that of libusb in the error behind its own."""
+    while e is not None:
+        if getattr(e, "errno", None) in _CAUSES:
+            return _CAUSES[getattr(e, "errno", 0)]
+        e = e.__cause__ or e.__context__
+    return otherwise
 
 
 def open_usb(place: str, slow: bool = False) -> UsbWords:
@@ -221,7 +236,9 @@ def open_usb(place: str, slow: bool = False) -> UsbWords:
     DeviceError
         when the chip cannot be opened.
     """
-    _library().tools.flush_cache()
+    library = _library()
+    library.tools.flush_cache()
+    chip = library.chip_at(place)
     ports: list[FtdiPort] = []
     try:
         for interface, (direction, bit_bang) in enumerate(
@@ -233,7 +250,7 @@ def open_usb(place: str, slow: bool = False) -> UsbWords:
             ),
             start=1,
         ):
-            ports.append(FtdiPort(place, interface, direction, bit_bang))
+            ports.append(FtdiPort(place, chip, interface, direction, bit_bang))
         spi, interrupt, reset, sense = ports
         return UsbWords(spi, interrupt, reset, sense, slow=slow)
     except (ConfigError, DeviceError):
@@ -250,19 +267,50 @@ class _Library(NamedTuple):
     errors: tuple[type[Exception], ...]
     find: Callable[..., Any]
 
-    def address_of(self, place: str) -> dict[str, object]:
-        """How pyftdi names the chip at a place. Raises OSError when there is none at a path."""
-        if not place.startswith(PATH):
-            return {"serial": place}
-        backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)  # pyftdi's, in its order
-        backend = next((b for b in backends if b is not None), None)
-        found = self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend)
-        paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in found}
-        if place.removeprefix(PATH) not in paths:
-            there = f"; there are {', '.join(sorted(paths))}" if paths else "; there is none on the bus"
-            raise OSError(f"no chip 0451:fd03 at this path{there}")
-        device = paths[place.removeprefix(PATH)]
-        return {"bus": device.bus, "address": device.address}
+    def chip_at(self, place: str) -> Any:
+        """The one chip that is meant. Raises DeviceError when there is none, or more than one."""
+        wanted = place.removeprefix(PATH)
+        try:
+            backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)  # pyftdi's, in its order
+            backend = next((b for b in backends if b is not None), None)
+            chips = list(self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend))
+            paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in chips}
+            by_path = place.startswith(PATH)
+            meant = [p for p, d in paths.items() if (p if by_path else self._serial(d)) == wanted]
+        except self.errors as e:
+            raise DeviceError(f"radar USB {place}: {e}", _cause(e, "libusb is missing, or unplugged"), _CHECK) from None
+        there = f"there are {', '.join(sorted(paths))}" if paths else "there is none on the bus"
+        if not meant:
+            what = "at this path" if by_path else "with this serial number"
+            raise DeviceError(
+                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {there}",
+                "unplugged, another serial number or path, or no permission (a udev rule for 0451:fd03)",
+                _CHECK,
+            )
+        if len(meant) > 1:
+            raise DeviceError(
+                f"radar USB {place}: {len(meant)} chips have this serial number, at {', '.join(sorted(meant))}",
+                "which of them is meant cannot be told; none was opened",
+                f'name it by its place instead of usb_serial: usb_path = "{min(meant)}", or another of these',
+            )
+        return paths[meant[0]]
+
+    def _serial(self, chip: Any) -> str | None:
+        """A chip's serial number; None of one that has none, or may not be asked."""
+        try:
+            return self.tools.get_string(chip, chip.iSerialNumber) if chip.iSerialNumber else None
+        except self.errors:
+            return None
+
+    def share(self, chip: Any) -> Any:
+        """A chip for one more of its channels, counted where pyftdi counts them.
+
+        pyftdi's own look-up takes any chip when it is given bus and address alone.
+        """
+        with self.tools.Lock:
+            opened = self.tools.Devices.setdefault((chip.bus, chip.address, VENDOR, PRODUCT), [chip, 0])
+            opened[1] += 1
+        return opened[0]
 
 
 def _library() -> _Library:

@@ -30,7 +30,13 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
     """Lines that say where the board answers otherwise; none when it is the same. Raises OSError, ValueError."""
     time = _Time()
     board, differences = make(time.now), []
-    for number, line in enumerate(trace.read_text(encoding="utf-8").splitlines(), 1):
+    if not trace.is_file():
+        raise ValueError("no regular file")
+    lines = trace.read_text(encoding="utf-8").splitlines()
+    first = json.loads(lines[0]) if lines else None
+    if len(lines) < 2 or not isinstance(first, dict) or first.get("trace") != 1:
+        raise ValueError("no trace of form 1, or an empty one")
+    for number, line in enumerate(lines, 1):
         record = json.loads(line)
         time.s = max(time.s, record.get("t", 0.0))
         if record.get("line") == "NRST":
@@ -72,7 +78,7 @@ def main() -> int:
     flash = b"" if args.empty_flash else make_image()
     try:
         differences = replay(args.trace, lambda now: RadarBoard(now, flash=flash))
-    except (OSError, ValueError) as e:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as e:
         sys.stderr.write(f"{args.trace}: {e}\n")
         return 2
     sys.stdout.write("\n".join(differences or ["the simulated board answers the same"]) + "\n")

@@ -44,6 +44,10 @@ class Cores:
     fault_at: str = "power-up"
     first_generation: bool = False
     hardware_bits: int = 0
+    rf_tests: int = 0x07FFFFFF  # self-tests of the RF core that passed
+    passes: int = 0x1FFE  # calibrations of the RF init
+    main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
+    rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     destroyed: bool = False
     executed: list[int] = field(default_factory=list)
     settings: dict[int, bytes] = field(default_factory=dict)
@@ -111,15 +115,18 @@ class Cores:
             self.crc32_events = data[0] == 1
         elif number == 0x4000 and (self._patched() or not self.first_generation):  # else it never comes, as received
             self.rf_up = True
-            self.event(UP_RF, struct.pack("<4I", 0x07FFFFFF, 2000, 0, 0), RF_UP_S)
+            self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
         elif number == 0x00C0:
             self.calibrated = True
-            self._report_calibration(0x1FFE)
+            self._report_calibration(self.passes)
         elif number == 0x02CC and data[0] & 1 and self.supply_v > 1.1:
             self.destroyed = True
         elif number in (0x0220, 0x40E0):
-            return bytes((1, 2, 0, 2, 2, 1, 7, 20, 3, 17)) + self._patch(main=number == 0x40E0)
+            rom = self.main_rom if number == 0x40E0 else self.rf_rom
+            return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == 0x40E0)
         elif number == 0x0223:
+            if not self.die:
+                return bytes(32)
             return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
         elif number == 0x02EA:
             return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
@@ -169,9 +176,10 @@ class Cores:
         if number == SAVE:
             if not self.calibrated:
                 return 6, b""
-            whole = (struct.pack("<2I8xh", 0x1FFE, 0x1FFE, 41) + bytes((self.die * 31 + n) & 0xFF for n in range(654)))[
-                :672
-            ]
+            whole = (
+                struct.pack("<2I8xh", self.passes, self.passes, 41)
+                + bytes((self.die * 31 + n) & 0xFF for n in range(654))
+            )[:672]
             return 0, struct.pack("<2H", CHUNKS, part) + whole[CHUNK_BYTES * part : CHUNK_BYTES * (part + 1)]
         self._restored[part] = data[4:]
         if len(self._restored) == CHUNKS:

@@ -9,10 +9,12 @@ import pytest
 from polysight.host.radar.board import TRANSITIONS, RadarBoard, State
 from polysight.host.radar.commands import RF_POWER_UP, Frame, FrameApply, FrameControl
 from polysight.host.radar.events import ANALOG_FAULT, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
+from polysight.host.radar.firmware import check_image
 from polysight.host.radar.program import program
 from polysight.shared.errors import DeviceError
-from polysight.simulators.radars import Fault, cores
+from polysight.simulators.radars import Fault, cores, make_image
 from polysight.simulators.radars import board as simulated
+from tests.support.radar.boards import Restarts
 
 FRAMES = 32
 PERIOD_S = 1.5e-3
@@ -116,6 +118,8 @@ def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, cloc
         (ANALOG_FAULT, struct.pack("<BBHII", 1, 0, 0, 0b1010, 0), "1.3 V / 1.0 V RF supply, PA LDO shorted"),
         (MAIN_CPU_FAULT, struct.pack("<BBH", 4, 0, 0) + bytes(28), "chirp error"),
         (RF_ERROR, struct.pack("<II", 2, 0), "RF firmware abort"),
+        (RF_CPU_FAULT, b"", "only 0 bytes"),
+        (RF_ESM_FAULT, bytes(4), "only 4 bytes"),
     ],
 )
 @pytest.mark.parametrize("running", [False, True])
@@ -235,6 +239,75 @@ def test_a_board_that_starts_anew_by_itself_is_a_fault_and_comes_back(radar, boa
     assert "started anew by itself" in radar.reason
     radar.arm(FRAMES)
     assert radar.state is State.ARMED
+
+
+IMAGE = check_image(make_image(), "image.bin")
+
+
+@pytest.mark.parametrize(("flash", "commands"), [(make_image(), 25), (b"", 60)], ids=["flash", "RAM"])
+def test_a_start_by_itself_at_any_command_is_named(rig, clock, flash, commands):
+    """In place of each answer of a bring-up and an arming: the cause is the restart, not the rig file or the image."""
+    for after in range(1, commands + 1):
+        board = simulated.RadarBoard(lambda: clock.time, flash=flash)
+        words = Restarts(board, clock, after)
+        radar = RadarBoard("RH", words, clock, program(rig, rig.by_name("RH")), IMAGE)
+        began = clock.time
+        with pytest.raises(DeviceError, match="started anew by itself"):
+            radar.arm(FRAMES)
+        assert clock.time - began < 8.0, after
+        assert radar.state is State.FAULT
+        radar.arm(FRAMES)
+        assert radar.state is State.ARMED
+    words = Restarts(simulated.RadarBoard(lambda: clock.time, flash=flash), clock, 1000)
+    RadarBoard("RH", words, clock, program(rig, rig.by_name("RH")), IMAGE).arm(FRAMES)
+    assert 1000 - words.left == commands
+
+
+def test_a_refusal_by_a_board_that_has_just_started_anew_is_no_fault_of_the_rig_file(radar, board, monkeypatch):
+    """Its ROM answers before it has said that it is up."""
+    obey = board.cores.obey
+
+    def restarting(number, data, remaining):
+        if number == 0x0082:
+            board.cores.event(0x5000, struct.pack("<IQQ", 371_216, 0, 0), 0.03)
+            return 6, b"", 0.0
+        return obey(number, data, remaining)
+
+    monkeypatch.setattr(board.cores, "obey", restarting)
+    with pytest.raises(DeviceError, match="started anew by itself"):
+        radar.configure()
+
+
+def test_frames_that_end_as_soon_as_they_are_armed_are_an_error_with_a_name(radar, board, monkeypatch):
+    event = board.cores.event
+
+    def both(number, data, delay_s):
+        event(number, data, delay_s)
+        if number == 0x100B:
+            event(0x100F, b"", delay_s)
+
+    monkeypatch.setattr(board.cores, "event", both)
+    with pytest.raises(DeviceError, match="LS: says that its frames ended as soon as it was armed"):
+        radar.arm(FRAMES)
+
+
+def test_a_cable_pulled_before_the_power_up_event_is_no_matter_of_jumpers(radar, board, words, monkeypatch):
+    def pull(held):
+        del held
+        board.plugged = False
+
+    monkeypatch.setattr(words, "reset", pull)
+    with pytest.raises(DeviceError, match="unplugged") as caught:
+        radar.configure()
+    assert "jumpers" not in caught.value.why
+
+
+def test_the_cause_of_a_failure_comes_before_what_was_passed_over(radar, board):
+    board.inject(Fault.REFUSE)
+    with pytest.raises(DeviceError) as caught:
+        radar.configure()
+    assert caught.value.why.startswith("the rig file asks for")
+    assert "it had reported before: main core fault" in caught.value.why
 
 
 def test_a_failure_after_the_main_core_s_fault_names_it(radar, board):

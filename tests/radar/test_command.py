@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from itertools import pairwise
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -15,6 +18,8 @@ from polysight.host.radar.program import program
 from polysight.shared.tables import to_builtins
 from polysight.simulators.radars import RadarBoard, make_image
 from polysight.simulators.radars.__main__ import replay
+from polysight.simulators.radars.cores import BOOT_S
+from polysight.simulators.radars.wire import FAULT_DATA
 
 STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
 STEPS += ["one frame", "read back"]
@@ -60,15 +65,6 @@ def test_the_plan_is_every_message_of_every_board(rig, rig_file, capsys):
     assert sent == expected
 
 
-def test_a_broken_constraint_shows_in_the_plan_and_keeps_boards_untouched(rig, rig_file, opened, capsys):
-    path = rig_file(msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=33)))
-    assert run(path, "plan") == 0
-    assert "BROKEN  RX gain step" in capsys.readouterr().out
-    assert run(path, "check", "RH") == 2
-    assert "RX gain step" in capsys.readouterr().err
-    assert opened == []
-
-
 def test_a_sound_board_passes_every_step(rig_file, opened, capsys):
     assert run(rig_file(), "check", "RH", "--json", "--slow") == 0
     told = json.loads(capsys.readouterr().out)
@@ -99,6 +95,27 @@ def test_a_step_that_fails_says_what_was_expected_and_what_to_do(rig_file, board
     assert "expected: " in out
     assert "do: " in out
     assert all(w in out for w in said)
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value"),
+    [
+        ("burst", "pulses", 200),
+        ("radar", "rx_gain_db", -1),
+        ("radar", "idle_us", float("inf")),
+        ("chirp", "hpf1_khz", 0.0),
+    ],
+)
+def test_a_plan_shows_what_is_broken_and_fails_and_nothing_is_opened(rig, rig_file, opened, capsys, table, key, value):
+    part = msgspec.structs.replace(getattr(rig, table), **{key: value})
+    path = rig_file(msgspec.structs.replace(rig, **{table: part}))
+    assert run(path, "plan") == 1
+    out = capsys.readouterr().out
+    assert "BROKEN" in out
+    assert "34122143" not in out
+    assert run(path, "check", "RH") == 2
+    assert "the radars would refuse" in capsys.readouterr().err
+    assert opened == []
 
 
 @pytest.mark.usefixtures("opened")
@@ -156,6 +173,32 @@ def test_a_replayed_trace_comes_to_the_same_end(rig_file, board, capsys, tmp_pat
     assert again[0].startswith("replayed from")
 
 
+@pytest.mark.parametrize("after_s", [0.0, 1e-4, 1.5e-3, 5e-3, 0.02, 0.5])
+@pytest.mark.parametrize("look_s", [0.0, 1.25e-4, 1e-3])
+def test_an_event_at_any_time_after_power_up_replays(
+    rig_file, words, board, clock, capsys, tmp_path, opened, look_s, after_s
+):
+    """A trace counts looks, each of which takes its time over USB: the line rises in a replay where it was seen to."""
+    del opened
+    look, boot = words.interrupt, board.cores.boot
+
+    def slow_look():
+        clock.sleep(look_s)
+        return look()
+
+    def booting():
+        boot()
+        board.cores.event(0x5002, FAULT_DATA, BOOT_S + after_s)
+
+    board.cores.fault_at = "never"
+    words.interrupt, board.cores.boot = slow_look, booting
+    trace = str(tmp_path / "day.jsonl")
+    assert run(rig_file(), "check", "RH", "--trace", trace) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
+    assert run(rig_file(), "replay", trace) == 0
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")] == told
+
+
 @pytest.mark.usefixtures("opened")
 def test_a_trace_holds_both_directions_and_every_change_of_a_line(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
@@ -186,6 +229,80 @@ def test_what_is_no_trace_is_named(rig_file, capsys, tmp_path, text):
     (tmp_path / "a").write_text(text)
     assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
     assert "--trace FILE" in capsys.readouterr().err
+
+
+HEAD = '{"trace": 1, "board": "RH"}\n'
+BAD_LINES = ["[" * 100_000, '{"t": -5, "out": ""}', '{"t": Infinity, "out": ""}', '{"t": 1e9, "out": ""}', '{"t": 1}']
+BAD_LINES += [
+    '{"t": 1, "line": "HOST_INTR"}',
+    '{"t": 1, "in": "xyz0"}',
+    '{"t": 1, "out": 5}',
+    '{"t": ' + "9" * 400 + ', "out": ""}',
+]
+BAD_LINES += ["5", '{"t": 2, "out": ""}\n{"t": 1, "out": ""}', '{"t": true, "out": ""}']
+
+
+@pytest.mark.parametrize("line", BAD_LINES, ids=range(len(BAD_LINES)))
+def test_a_line_that_is_none_of_a_trace_s_is_named(rig_file, capsys, tmp_path, line):
+    (tmp_path / "a").write_text(HEAD + line + "\n")
+    assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
+    assert re.search(r"a: line [23] is", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe", "sparse", "folder"])
+def test_what_is_no_file_of_a_sane_size_is_refused_unread(rig, rig_file, capsys, tmp_path, opened, kind):
+    path = tmp_path / "odd"
+    if kind == "device":
+        path = Path("/dev/zero")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        with path.open("wb") as file:
+            file.truncate(3 * 2**30)
+    said = "bytes" if kind == "sparse" else "no regular file"
+    with_it = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, firmware=str(path)))
+    here = rig_file()
+    for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):
+        assert run(file, *args) == 2
+        assert said in capsys.readouterr().err
+    assert run(rig_file(with_it), "check", "RH") == 2
+    assert said in capsys.readouterr().err
+    assert opened == []
+
+
+def test_a_trace_is_never_written_over(rig_file, opened, capsys, tmp_path):
+    trace = tmp_path / "day.jsonl"
+    trace.write_text("of another day")
+    assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 2
+    assert "there already" in capsys.readouterr().err
+    assert trace.read_text() == "of another day"
+    assert opened == []
+
+
+@pytest.mark.usefixtures("opened")
+def test_a_flash_write_that_is_stopped_says_what_the_flash_holds_now(rig_file, words, board, capsys, tmp_path):
+    image = tmp_path / "image.bin"
+    image.write_bytes(make_image())
+    write, seen = words.write, []
+
+    def stop_at_part_7(sent):
+        seen.extend(w for w in sent[:1] if w == 0x1234)
+        if len(seen) == 8:
+            raise KeyboardInterrupt
+        write(sent)
+
+    words.write = stop_at_part_7
+    assert run(rig_file(), "firmware", "RH", str(image), "--flash") == 130
+    assert "after 6 of 35 parts: its flash holds no whole image" in capsys.readouterr().err
+    assert board.cores.flash != make_image()
+
+
+def test_an_empty_file_is_no_trace_for_the_simulated_board(tmp_path):
+    (tmp_path / "a").write_text("")
+    with pytest.raises(ValueError, match="no trace"):
+        replay(tmp_path / "a", RadarBoard)
 
 
 @pytest.mark.usefixtures("opened")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 
 import pytest
@@ -14,7 +15,7 @@ from polysight.host.radar.program import program
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.simulators.radars import Fault, make_image
 from polysight.simulators.radars import RadarBoard as Simulated
-from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, native_rig
 
 RIG = native_rig()
 DATA = make_image()
@@ -40,6 +41,8 @@ def with_crc(data: bytes) -> bytes:
         (with_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
         (with_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
         (FIRST_GENERATION, "for devices of generation 1"),
+        (with_crc(DATA[:0x8B8] + bytes((6, 2, 0, 13)) + DATA[0x8BC:-4]), "for devices of generation 6"),
+        (with_crc(DATA[:0x880] + b"CPRR" + DATA[0x884:-4]), "1 program parts"),
         (with_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
     ],
 )
@@ -161,16 +164,87 @@ def test_the_slow_erase_is_waited_for(clock):
     assert board.cores.flash == DATA
 
 
-def test_a_device_of_another_generation_is_sent_nothing(clock, monkeypatch):
+@pytest.mark.parametrize("bit", [8, 48, *range(50, 57)])
+@pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
+@pytest.mark.parametrize("image", [None, IMAGE])
+def test_a_board_that_found_itself_damaged_is_refused_after_any_download(clock, bit, flash, image):
+    """Boot status bits of docs/spec/mmwavelink.md; the status after a RAM download is clean, and no excuse."""
+    board = Simulated(lambda: clock.time, flash=flash)
+    board.cores.hardware_bits = 1 << bit
+    with pytest.raises(DeviceError, match="main core is up: ") as caught:
+        made(board, clock, image).configure()
+    assert caught.value.remedy == "replace the board"
+    assert 0x4000 not in board.executed
+    with pytest.raises(DeviceError) as caught:
+        made(board, clock).write_flash(IMAGE, ignored)
+    assert caught.value.remedy == "replace the board"
+    assert board.cores.flash == DATA
+
+
+def test_another_board_than_the_rig_file_names_is_told_after_its_flash_was_written(clock):
     board = Simulated(lambda: clock.time)
-    effect = board.cores._effect
-    monkeypatch.setattr(
-        board.cores, "_effect", lambda n, d: bytes((1, 2, 0, 1)) + effect(n, d)[4:] if n == 0x40E0 else effect(n, d)
-    )
+    radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")), die_id="5eed0002-0-0-0")
+    with pytest.raises(DeviceError, match=r"die id 5eed0001.*the rig file names 5eed0002"):
+        radar.write_flash(IMAGE, ignored)
+
+
+def test_nothing_of_another_board_than_the_rig_file_names_is_powered(clock):
+    board = Simulated(lambda: clock.time, flash=DATA)
+    radar = RadarBoard("LS", BoardWords(board, clock), clock, program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0")
+    with pytest.raises(DeviceError, match="die id 5eed0001"):
+        radar.configure()
+    assert 0x0080 not in board.executed
+
+
+@pytest.mark.parametrize(("tests", "said"), [(0, "none did"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
+def test_self_tests_of_the_rf_core_that_failed_are_told(board, clock, tests, said):
+    board.cores.rf_tests = tests
+    radar = made(board, clock)
+    told = []
+    radar.configure(lambda step, came: told.append(came) if step.name == "RF power-up" else None)
+    assert (said in told[0]) if said else told == ["RF core is up"]
+    assert radar.facts["rf_tests_passed"] == tests
+
+
+@pytest.mark.parametrize("rom", [(1, 2, 0, 5), (2, 0, 0, 3), (2, 2, 1, 6), (6, 2, 1, 7), (0, 0, 0, 0), (255,) * 4])
+@pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
+def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):
+    board = Simulated(lambda: clock.time, flash=flash)
+    board.cores.main_rom = rom
     for use in (lambda r: r.write_flash(IMAGE, ignored), lambda r: r.configure()):
-        with pytest.raises(ConfigError, match="generation 1"):
+        with pytest.raises(ConfigError, match=rf"ROM is {'.'.join(map(str, rom))}"):
             use(made(board, clock, IMAGE))
     assert 0x4080 not in board.executed
+    assert board.cores.flash == flash
+
+
+@pytest.mark.parametrize("core", ["main_rom", "rf_rom"])
+@pytest.mark.parametrize(
+    ("rom", "said"),
+    [((1, 2, 0, 5), "AWR1243"), ((6, 2, 0, 13), "57..64 GHz"), ((255,) * 4, "generation 255"), ((0,) * 4, "0.0.0.0")],
+)
+@pytest.mark.parametrize("image", [None, IMAGE])
+def test_what_is_no_awr2243_is_refused_before_any_setting(clock, core, rom, said, image):
+    """The same codes would be other frequencies there."""
+    board = Simulated(lambda: clock.time, flash=DATA)
+    setattr(board.cores, core, rom)
+    with pytest.raises(ConfigError, match=re.escape(said)) as caught:
+        made(board, clock, image).configure()
+    assert "only AWR2243" in caught.value.what
+    assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
+
+
+@pytest.mark.parametrize("flash", [b"", DATA], ids=["from RAM", "from flash"])
+def test_another_patch_of_the_rf_core_than_the_image_s_is_told(clock, monkeypatch, flash):
+    board = Simulated(lambda: clock.time, flash=flash)
+    effect = board.cores._effect
+    old = bytes((2, 1, 20, 1, 1, 0))
+    monkeypatch.setattr(board.cores, "_effect", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d))
+    radar = made(board, clock, IMAGE)
+    radar.configure()
+    (told,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
+    assert "holds 2.2.4.0" in told
+    assert ("--flash" in told) is bool(flash)
 
 
 @pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])
@@ -193,6 +267,18 @@ def test_power_lost_at_any_part_is_recovered_from(clock, part):
     assert rescued.state is State.CONFIGURED
     made(board, clock).write_flash(IMAGE, ignored)
     made(board, clock).configure()
+
+
+@pytest.mark.parametrize("part", range(1, 36))
+def test_a_start_in_the_middle_of_a_download_ends_it_at_once(clock, part):
+    """The parts that follow would be taken as the first of another file by the fresh ROM."""
+    board = Simulated(lambda: clock.time, flash=DATA, erase_s=0.1)
+    words = Restarts(board, clock, part + 1)
+    with pytest.raises(DeviceError, match=rf"part {part} of 35 .*started anew by itself") as caught:
+        made(board, clock, words=words).write_flash(IMAGE, ignored)
+    assert "no whole image" in caught.value.why
+    assert words.later == 0
+    assert clock.time < 5.0
 
 
 def test_a_part_that_is_refused_is_named(new, clock, monkeypatch):

@@ -153,6 +153,37 @@ def test_a_calibration_is_kept_and_given_back_at_the_next_start(made, board, tmp
     assert again.state is State.CONFIGURED
 
 
+NEEDED = {1: "clock PLL", 2: "VCO1", 3: "VCO2", 4: "LO", 5: "ADC", 6: "high-pass", 7: "low-pass", 10: "gain", 12: "I/Q"}
+OF_TX = {8: "peak", 9: "TX power", 11: "TX phase"}
+
+
+@pytest.mark.parametrize("name", ["LS", "RH"])
+@pytest.mark.parametrize(("bit", "said"), (NEEDED | OF_TX).items())
+def test_an_rf_init_that_did_not_pass_is_refused_and_never_kept(rig, words, clock, board, tmp_path, name, bit, said):
+    """Bits of ICD 217; those of the transmitters are needed by the board that transmits."""
+    board.cores.passes = 0x1FFE & ~(1 << bit)
+    files = CalibrationFiles(tmp_path / "kept", b"settings")
+    radar = RadarBoard(name, words, clock, program(rig, rig.by_name(name)), calibration=files)
+    if name == "RH" and bit in OF_TX:
+        radar.configure()
+        return
+    with pytest.raises(DeviceError, match=rf"RF init did not pass: .*{said}"):
+        radar.configure()
+    assert not (tmp_path / "kept").exists()
+    assert 0x0100 not in board.executed
+
+
+def test_what_a_start_that_did_not_pass_left_behind_is_never_given_back(made, tmp_path):
+    files = CalibrationFiles(tmp_path, b"settings")
+    made(files).configure()
+    (file,) = tmp_path.iterdir()
+    die, data = json.loads(file.read_text())["die_id"], bytearray.fromhex(json.loads(file.read_text())["data"])
+    data[:4] = (0x1FFE & ~(1 << 10)).to_bytes(4, "little")
+    files.save(die, bytes(data))
+    with pytest.raises(ConfigError, match="RF init did not pass"):
+        made(files).configure()
+
+
 def test_other_settings_or_another_die_have_a_calibration_of_their_own(made, board, tmp_path):
     made(CalibrationFiles(tmp_path, b"settings")).configure()
     made(CalibrationFiles(tmp_path, b"others")).configure()

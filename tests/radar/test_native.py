@@ -27,7 +27,8 @@ class Boards:
     def __init__(self, rig: Instrument, clock) -> None:
         self.clock = clock
         self.by_serial = {
-            b.usb_serial: RadarBoard(lambda: clock.time, flash=make_image()) for b in rig.radar.native.values()
+            b.usb_serial: RadarBoard(lambda: clock.time, flash=make_image(), die=n)
+            for n, b in enumerate(rig.radar.native.values(), 1)
         }
         self.words = {s: BoardWords(b, clock) for s, b in self.by_serial.items()}
 
@@ -78,6 +79,27 @@ def test_a_board_that_missed_a_pulse_still_waits(radars, boards):
     radars.arm(FRAMES)
     boards.pulses(FRAMES)
     assert radars.wait_done(3.0) == []
+
+
+def test_a_board_in_fault_is_not_done(radars, boards):
+    radars.arm(FRAMES)
+    boards.by_serial["FTRH"].say(0x1002, bytes(4))
+    boards.pulses(FRAMES)
+    assert radars.wait_done(3.0) == ["RH"]
+
+
+def test_two_names_of_one_board_are_refused(rig, boards, clock):
+    boards.by_serial["FTRV"].cores.die = 2
+    with pytest.raises(DeviceError, match="RH and RV have the same die id"):
+        NativeRadars(rig, boards.words.__getitem__, clock)
+
+
+def test_boards_without_a_die_id_keep_no_calibration(rig, boards, clock, tmp_path):
+    for board in boards.by_serial.values():
+        board.cores.die = 0
+    kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, calibration_dir=str(tmp_path)))
+    with NativeRadars(kept, boards.words.__getitem__, clock):
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_a_fault_is_told_and_the_next_row_resets_that_board_alone(radars, boards):

@@ -49,7 +49,8 @@ class Usb:
     def __init__(self, rig, clock) -> None:
         self.clock = clock
         self.boards = {
-            n.usb_serial: RadarBoard(lambda: clock.time, flash=make_image()) for n in rig.radar.native.values()
+            n.usb_serial: RadarBoard(lambda: clock.time, flash=make_image(), die=k)
+            for k, n in enumerate(rig.radar.native.values(), 1)
         }
         self.links: dict[str, list[Words]] = {serial: [] for serial in self.boards}
         self.back_at = 0.0

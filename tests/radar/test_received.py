@@ -108,6 +108,29 @@ def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
     assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
 
+@pytest.mark.parametrize("sequence", range(16))
+def test_a_refusal_without_a_body_is_one_whatever_the_command_s_number(sequence):
+    """The one that is known has the number 0; whether such a device repeats a command's number is not known."""
+    asked, said = link(received.AWR1243_ERROR)
+    asked.sequence = sequence
+    with pytest.raises(DeviceError, match=r"refuses LowPower.*does not say why"):
+        asked.call(LowPower())
+    assert len([w for w in said.written if w[:4] == bytes.fromhex("34122143")]) == 1
+
+
+@pytest.mark.parametrize(("direction", "kind"), [(2, 1), (5, 1), (1, 1), (6, 0)])
+def test_what_is_no_response_of_the_core_that_was_asked_is_no_answer(direction, kind):
+    asked, _ = link(*[frame(direction, kind, 0x202, b"", 0, 0, True)] * 3)
+    with pytest.raises(DeviceError, match="no valid answer"):
+        asked.call(DeviceConfiguration())
+
+
+def test_a_last_chunk_that_never_comes_is_a_part_that_is_missing():
+    asked, _ = link(chunk(1, 0x40E0, bytes(16)))
+    with pytest.raises(DeviceError, match="parts of the answer are missing"):
+        asked.call(GET_MAIN_VERSION)
+
+
 def test_an_acknowledgement_with_a_16_bit_crc_is_taken():
     asked, _ = link(received.AWR1243_RF_UP)
     assert asked.call(RF_POWER_UP).blocks == ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 
 import pytest
@@ -77,16 +78,39 @@ def test_slow_mode_is_one_word_a_transfer(plugged):
 
 
 def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugged):
-    bus.plug(chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3)))  # two with one serial number
+    """pyftdi takes any of the chips when it is given a bus address alone, by the chance of a set's order."""
+    others = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
+    for other in others:
+        bus.plug(other)
     open_usb("usb:1-4.2").write([0x1234])
     assert plugged.chip.words_written == [0x1234]
-    with pytest.raises(DeviceError, match=r"usb:1-7.*there are 1-4\.2, 1-4\.3"):
+    assert all(o.chip.words_written == [] and o.modes == {} for o in others)
+    with pytest.raises(DeviceError, match=r"usb:1-7.*there are 1-4\.1, 1-4\.2"):
         open_usb("usb:1-7")
+
+
+def test_a_serial_number_that_two_chips_have_opens_neither_and_lists_their_paths(bus, plugged):
+    other = chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
+    bus.plug(other)
+    with pytest.raises(DeviceError, match=r"2 chips have this serial number, at 1-4\.2, 1-4\.3") as caught:
+        open_usb("FT1234")
+    assert "usb_path" in caught.value.remedy
+    assert plugged.modes == other.modes == {}
+
+
+@pytest.mark.parametrize(("number", "cause"), [(errno.EBUSY, "another program"), (errno.EACCES, "udev rule")])
+@pytest.mark.usefixtures("plugged")
+def test_what_keeps_a_chip_from_being_claimed_is_named(bus, number, cause):
+    bus.refuses = number
+    with pytest.raises(DeviceError) as caught:
+        open_usb("FT1234")
+    assert cause in caught.value.why
+    assert "pulled" not in caught.value.why
 
 
 @pytest.mark.usefixtures("plugged")
 def test_a_chip_that_is_not_there_is_named():
-    with pytest.raises(DeviceError, match="FT9, channel A: cannot be opened"):
+    with pytest.raises(DeviceError, match="FT9: cannot be opened"):
         open_usb("FT9")
 
 
@@ -133,7 +157,8 @@ def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged):
 
 
 def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
-    boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image()) for n in rig.radar.native.values()}
+    native = enumerate(rig.radar.native.values(), 1)
+    boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image(), die=k) for k, n in native}
     chips = {place: chip(b, place, (n,)) for n, (place, b) in enumerate(boards.items(), 1)}
     for made in chips.values():
         bus.plug(made)

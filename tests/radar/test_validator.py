@@ -6,11 +6,15 @@ import math
 
 import msgspec
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from polysight.host.radar.constraints import constraints, direct_if_hz, require
+from polysight.host.radar.program import program
 from polysight.shared.config import Instrument, NativeRadar
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import direct_path_m
+from tests.support.radar.boards import native_rig
 
 FRAMES = 5600
 
@@ -45,6 +49,9 @@ def test_the_published_chirp_with_centred_receivers_holds(rig):
         ("frame period", "burst", {"period_us": 450.0}),
         ("inter-frame time", "burst", {"period_us": 728.0}),
         ("pulse width", "burst", {"width_us": 4.1}),
+        ("chirps", "burst", {"chirps": 0}),
+        ("chirps", "burst", {"chirps": 256}),
+        ("ramp", "chirp", {"ramp_end_us": -1.0}),
         ("pulse width", "burst", {"width_us": 0.02}),
         ("ADC window", "chirp", {"ramp_end_us": 126.0}),
         ("sample memory", "chirp", {"samples": 1025}),
@@ -56,6 +63,9 @@ def test_the_published_chirp_with_centred_receivers_holds(rig):
         ("ADC start", "chirp", {"adc_start_us": 41.0}),
         ("ramp", "chirp", {"ramp_end_us": 5001.0}),
         ("idle", "radar", {"idle_us": 5300.0}),
+        ("high-pass filters", "chirp", {"hpf1_khz": 0.0}),
+        ("high-pass filters", "chirp", {"hpf2_khz": 0.0}),
+        ("RX gain", "radar", {"rx_gain_db": -1}),
         ("RX gain", "radar", {"rx_gain_db": 54}),
         ("RX gain", "radar", {"rx_gain_db": 30}),
         ("RX gain step", "radar", {"rx_gain_db": 31}),
@@ -72,8 +82,56 @@ def test_a_value_outside_is_named_with_formula_limit_and_value(rig, name, table,
     told = next(c for c in constraints(wrong, FRAMES) if c.name == name and not c.holds)
     assert str(told) in str(caught.value)
     assert told.formula in str(told)
-    assert f"{told.value:.9g}" in str(told)
+    assert f"{told.value:.12g}" in str(told)
     assert told.remedy in str(caught.value)
+
+
+def test_76_ghz_is_inside_the_band_to_the_code(rig):
+    """The ICD's lowest code stands for a little less than 76 GHz."""
+    transmitter = msgspec.structs.replace(rig.transmitter, start_offset_hz=0.0)
+    for start, holds in ((76e9, True), (0x5471C71B * 3.6e9 / 2**26, True), (0x5471C71A * 3.6e9 / 2**26, False)):
+        wrong = changed(rig, "chirp", start_hz=start)
+        assert (f"start frequency of {transmitter.name}" not in broken(wrong)) is holds
+
+
+def test_simulated_radars_alone_may_be_without_filters(rig):
+    native = {n: NativeRadar(usb_serial=f"tcp://127.0.{k}.1:2000") for k, n in enumerate(rig.radar.native)}
+    served = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, native=native))
+    assert broken(changed(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
+
+
+FLOATS = [("chirp", key) for key in ("start_hz", "slope_hz_per_s", "adc_start_us", "sample_rate_hz", "ramp_end_us")]
+FLOATS += [("burst", "period_us"), ("burst", "width_us"), ("burst", "chirp_us"), ("radar", "idle_us")]
+INTS = [
+    ("chirp", "samples"),
+    ("burst", "pulses"),
+    ("burst", "chirps"),
+    ("radar", "rx_gain_db"),
+    ("radar", "tx_backoff_db"),
+]
+ANY_FLOAT = st.one_of(st.floats(), st.sampled_from([0.0, -1.0, 1e30, -1e12, 1e308, float("nan"), float("inf")]))
+ANY_INT = st.one_of(st.integers(-70_000, 70_000), st.integers())
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.dictionaries(st.sampled_from(FLOATS), ANY_FLOAT, max_size=2),
+    st.dictionaries(st.sampled_from(INTS), ANY_INT, max_size=2),
+    st.one_of(st.just(790e3), ANY_FLOAT),
+    st.integers(-1, 70_000),
+)
+def test_whatever_a_rig_file_holds_it_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
+    rig = of_receiver(native_rig(), start_offset_hz=offset_hz)
+    wrong = floats | ints
+    for table in sorted({table for table, _ in wrong}):
+        rig = changed(rig, table, **{key: value for (at, key), value in wrong.items() if at == table})
+    if all(c.holds for c in constraints(rig, frames)):
+        for board in rig.boards:
+            for sent in program(rig, board).frames(frames):
+                sent.block()
+    else:
+        with pytest.raises(ConfigError):
+            require(rig, frames)
 
 
 @pytest.mark.parametrize(("frames", "holds"), [(0, False), (1, True), (65535, True), (65536, False)])

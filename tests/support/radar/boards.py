@@ -52,6 +52,23 @@ class BoardWords:
         self.closed = True
 
 
+class Restarts(BoardWords):
+    """The board's supply fails for a moment when its host has written so many commands."""
+
+    def __init__(self, board: RadarBoard, clock: VirtualClock, after: int) -> None:
+        super().__init__(board, clock)
+        self.left, self.later = after, 0
+
+    def write(self, words: Sequence[int]) -> None:
+        super().write(words)
+        if words[0] == 0x1234:
+            self.left -= 1
+            self.later += self.left < 0
+            if self.left == 0:
+                self.board.power(False)
+                self.board.power(True)
+
+
 def native_rig() -> Instrument:
     """The published rig under native control, each receiver's direct path in the middle of its IF window."""
     rig = published_rig()

@@ -137,6 +137,14 @@ def draw(rng: random.Random) -> tuple[Case, int]:
         "flood": lambda: _flood(rng),
         "unplug": lambda: Case("unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False)),
         "power": lambda: Case("power lost", SILENT, lambda w: w.board.power(False)),
+        "brown-out": lambda: Case("brown-out", "started anew", lambda w: (w.board.power(False), w.board.power(True))),
+        "ram brown-out": lambda: Case(
+            "new board, brown-out",
+            "started anew",
+            lambda w: (w.board.power(False), w.board.power(True)),
+            b"",
+            IMAGE,
+        ),
         "low": lambda: Case("interrupt stuck low", "interrupt line", lambda w: setattr(w, "stuck", False)),
         "high": lambda: Case(
             "interrupt stuck high", "interrupt.*(stays high|stuck)|MISO", lambda w: setattr(w, "stuck", True)

@@ -9,6 +9,7 @@ chip that was pulled fails every transfer of handles opened before; plugged in a
 from __future__ import annotations
 
 import errno
+import os
 from array import array
 from types import SimpleNamespace
 
@@ -46,11 +47,14 @@ class Bus(IBackend):
         Bytes of data a read returns at most, to cut answers anywhere.
     enumerations
         How often the bus was looked at.
+    refuses
+        Error number with which interfaces are not given; 0: they are.
     """
 
     def __init__(self) -> None:
         self.chips: list[Chip] = []
         self.packet, self.enumerations, self._addresses = _PACKET - 2, 0, 1
+        self.refuses = 0
 
     def plug(self, chip: Chip) -> None:
         """Plug a chip in, at an address that no chip had before."""
@@ -116,6 +120,8 @@ class Bus(IBackend):
 
     def claim_interface(self, dev_handle, intf) -> None:
         self._check(dev_handle)
+        if self.refuses:
+            raise USBError(os.strerror(self.refuses), -6, self.refuses)
 
     def release_interface(self, dev_handle, intf) -> None:
         self._check(dev_handle)

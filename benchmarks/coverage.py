@@ -51,6 +51,7 @@ GRID = {"columns": 45, "rows": 43, "step_x_mm": 10.0, "step_y_mm": 6.0}
 PLACES = [(x, y) for y in (-34.0, 34.0) for x in (-66.0, 0.0, 66.0)]
 KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet")
 """What a scene is drawn as; "sheet" is "full" with one thin sheet in air that nobody declares."""
+WHOLE = ("full", "sheet")
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
 CHI2_68, CHI2_95 = 2.279, 5.991
 
@@ -103,8 +104,7 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
     materials = KNOWN if kind == "named" else MATERIALS
     names = rng.choice(list(materials), len(PLACES), replace=False).tolist()
-    whole = kind in ("full", "sheet")
-    metal = None if kind == "no metal" or (whole and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
+    metal = None if kind == "no metal" or (kind in WHOLE and rng.random() < 0.25) else int(rng.integers(len(PLACES)))
     tilted, plates = rng.random() < 0.5, []
     for i, (x, y) in enumerate(PLACES):
         place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
@@ -156,7 +156,7 @@ def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Ins
     """One scene, drawn, simulated and judged."""
     rig, scene = load_instrument(packaged(Path("instrument.toml"))), draw_scene(seed, kind)
     options = Options(model=None if kind == "named" else "none")
-    if kind in ("full", "sheet") and not any(p.metal for p in scene.plates):
+    if kind in WHOLE and not any(p.metal for p in scene.plates):
         options = replace(options, reference=metal_scan(rig, scene))
     if raw or kind in ("no direct path", "noise"):
         with tempfile.TemporaryDirectory(prefix="polysight-coverage-") as folder:

@@ -97,9 +97,7 @@ class CounterView:
         found = np.zeros(self.sizes.size, dtype=np.bool_)
         for span in spans:
             if span.sure is sure:
-                ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
-                steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
-                found |= (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps)
+                found |= self._of(span)[0]
         return found
 
     def came_before(self, spans: tuple[Span, ...]) -> Flags:
@@ -107,13 +105,17 @@ class CounterView:
         found = np.zeros(self.sizes.size, dtype=np.bool_)
         for span in spans:
             if span.sure and span.missing is not None:
-                ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
-                steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
-                inside = (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps)
+                inside, ahead = self._of(span)
                 for start, stop in span.missing:
                     inside &= (ahead + self.sizes <= start) | (ahead >= stop)
                 found |= inside
         return found
+
+    def _of(self, span: Span) -> tuple[Flags, Counts]:
+        """Whether each has counters of a record, and how many bytes it lies behind that one's start."""
+        ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
+        steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
+        return (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps), ahead
 
     def at(self, base: int, line: int) -> Counters:
         """The counters so many bytes from the reference, on a line."""

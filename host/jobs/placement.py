@@ -26,7 +26,10 @@ def inspect_placement(file: Path, as_json: bool) -> int:
         if strange := damage_of(scan, row):
             raise DataError(f"{row}: {strange}", "a damaged file, or one of another row", "`polysight validate SCAN`")
         if not row.with_suffix(PACKETS).exists():
-            raise DataError(f"{row}: its packets were not kept", "it is simulated, or of an older release", "")
+            why = "the scan was simulated without cards, or recorded by an older release"
+            raise DataError(
+                f"{row}: its packets were not kept", why, "`polysight validate SCAN` says whether it is whole"
+            )
     again = place_again(row)
     same = again.moved or again.missing == again.placed.missing
     if as_json:

@@ -70,7 +70,7 @@ def place_again(path: Path) -> PlacedAgain:
 
 
 def damage_of(scan: ScanFolder, path: Path) -> str:
-    """What is wrong with a row's files beside the manifest; "" when nothing is. Raises DataError."""
+    """What is wrong with a row's files beside the manifest; "" when nothing is."""
     for row in scan.committed().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from polysight.host.store import open_npz
 from polysight.shared.errors import DataError
 
 FORMAT = "polysight-library-1"
@@ -175,7 +176,7 @@ class Library:
         """
         bad = f"{path}: not a material library"
         try:
-            with path.open("rb") as f, np.load(f, allow_pickle=False) as z:
+            with open_npz(path) as z:
                 meta = json.loads(z["meta"].tobytes().decode("utf-8"))
                 h, v, p = z["h"], z["v"], z["p"]
         except FileNotFoundError:

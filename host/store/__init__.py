@@ -25,6 +25,7 @@ from polysight.host.store.scan_folder import (
 from polysight.host.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
 from polysight.host.store.sources.open import is_source, open_source
 from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
+from polysight.host.store.untrusted import inside, open_npz
 from polysight.host.store.validation import damaged_rows, to_json, validate
 
 __all__ = [
@@ -52,10 +53,12 @@ __all__ = [
     "damaged_rows",
     "drop",
     "droppable",
+    "inside",
     "is_source",
     "manifest",
     "mirrored",
     "new_scan_id",
+    "open_npz",
     "open_source",
     "place_again",
     "raw_source",

@@ -184,7 +184,8 @@ class Library:
                 f"{path}: no such library", "none was trained yet, or the path is wrong", "polysight train"
             ) from None
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
-            raise DataError(bad, f"{type(e).__name__}: {e}", "make it again with polysight train") from None
+            why = str(e) if isinstance(e, ValueError) else f"{type(e).__name__}: {e}"
+            raise DataError(bad, why, "give a library that polysight train made, or a folder of products") from None
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             found = meta.get("format") if isinstance(meta, dict) else None
             raise DataError(bad, f"its format is {found!r}, this program reads {FORMAT!r}", "train it again")

@@ -26,7 +26,7 @@ from polysight.host.products.withhold import withhold
 from polysight.host.store import Scan, open_npz, versions
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
-from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.errors import ConfigError, DataError, no_such
 from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
@@ -274,6 +274,8 @@ def read_products(folder: Path, needs: str = IMAGE) -> SavedProducts:
     """What :func:`find_products` finds. Raises DataError when that is nothing."""
     if found := find_products(folder, needs):
         return found
+    if not folder.exists():
+        raise no_such(folder)
     raise DataError(
         f"{folder}: no {needs}",
         "the folder is wrong, the scan was not processed" + ("" if needs == IMAGE else ", or only to images"),

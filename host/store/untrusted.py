@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from polysight.host.capture import kind_of
 from polysight.shared.errors import DataError
 
 MOST_BYTES = 2 << 30
@@ -56,12 +57,16 @@ def open_npz(path: Path) -> Iterator[Any]:
     ------
     DataError
         when its arrays would take more than :data:`MOST_BYTES`.
-    OSError, ValueError, zipfile.BadZipFile, KeyError, EOFError
+    OSError, ValueError, KeyError, EOFError
         when it is no such archive, as numpy does.
     """
     with path.open("rb") as f:
-        with zipfile.ZipFile(f) as archive:
-            size = sum(member.file_size for member in archive.infolist())
+        try:
+            with zipfile.ZipFile(f) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+        except zipfile.BadZipFile as e:
+            f.seek(0)
+            raise ValueError(f"it is {kind_of(f.read(512))}, not an archive of arrays ({e})") from None
         if size > MOST_BYTES:
             raise DataError(
                 f"{path}: its arrays take {size} bytes, more than the {MOST_BYTES} bytes that are read",

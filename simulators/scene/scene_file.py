@@ -260,7 +260,7 @@ def decode_scene(raw: dict[str, Any], source: str) -> Scene:
     """
     if "disturbances" in raw:
         raw = {**raw, "disturbances": _switched(raw["disturbances"], source)}
-    return decode(raw, Scene, source)
+    return decode(raw, Scene, source, "docs/spec/scene-file.md names everything that a scene may hold")
 
 
 def load_scene(path: Path) -> Scene:

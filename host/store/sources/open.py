@@ -10,7 +10,7 @@ from polysight.host.store.source import Source
 from polysight.host.store.sources.published import SYNCED, PublishedCubes, PublishedScan
 from polysight.host.store.sources.published_settings import COLLECTION
 from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.errors import DataError
+from polysight.shared.errors import DataError, no_such
 
 
 def is_source(path: Path) -> bool:
@@ -41,6 +41,8 @@ def open_source(path: Path, base: Instrument | Path | None = None) -> Source:
         scan = ScanFolder.load(path)
         require_raw(scan)
         return scan
+    if not path.exists():
+        raise no_such(path)
     if not is_source(path):
         raise DataError(
             f"{path}: not a scan: neither {MANIFEST} nor {COLLECTION} nor *{SYNCED} is in it",

@@ -268,6 +268,11 @@ def load_scene(path: Path) -> Scene:
     return decode_scene(read_toml(path), str(path))
 
 
+def without_offset(scene: Scene) -> Scene:
+    """The scene for a rig whose file tells the start frequencies: its own difference of them is in there."""
+    return msgspec.structs.replace(scene, disturbances=msgspec.structs.replace(scene.disturbances, if_offset_hz=0.0))
+
+
 def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
     """The rig with the scene's own grid, burst, image, stage and object distance.
 

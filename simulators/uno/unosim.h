@@ -54,5 +54,6 @@ void read_pty(int wait_ms);
 /* chip.c: the microcontroller */
 int chip_begin(const char *hex);
 void reset(void);
+int hang(void); /* until the next reset */
 int run_to(uint64_t cycle);
 void tell_interrupt_costs(void);

@@ -259,6 +259,11 @@ class TriggerLoop:
         """Send one burst that no edge asks for, when the loop next looks up. Only while no row is armed."""
         self._bench = spec
 
+    def check(self, spec: BurstSpec) -> None:
+        """Raise ConfigError if the lines cannot send such a burst in one piece."""
+        if isinstance(self._lines, BitLines):
+            spi_burst(spec, self._lines.bufsiz)
+
     def timed_by(self, spec: BurstSpec) -> Timing:
         """What times the pulses of a burst."""
         if isinstance(self._lines, BitLines):

@@ -52,7 +52,7 @@ def controller(rig, hub=None, **settings):
 @pytest.mark.slow
 @pytest.mark.parametrize("core", CORES)
 def test_every_position_is_a_burst_by_the_controllers_clock(rig, write_config, stage, hub, wires, core):
-    """A row of the shipped rig file's wiring: bits on MOSI, their widths and spacing those of the clock that is there."""
+    """A row of the shipped wiring: bits on MOSI, their widths and spacing those of the clock that is there."""
     core_hz, rate = CORES[core]
     with Process(
         write_config(rig), "--stage-port", stage.port, **controller(rig, hub, core_hz=f"250e6,{core_hz}")
@@ -99,7 +99,7 @@ def test_a_core_clock_that_is_not_the_drivers_ends_the_row(rig, write_config, st
 
 
 @pytest.mark.slow
-def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(rig, write_config, stage, hub, wires):
+def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(rig, write_config, stage, hub):
     """spidev takes `bufsiz` bytes. A run whose bursts are longer is refused at once; the next one runs."""
     with Process(write_config(rig), "--stage-port", stage.port, **controller(rig, hub, bufsiz="512")) as p:
         assert p.ready, p.popen.communicate()

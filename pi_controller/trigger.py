@@ -69,14 +69,10 @@ def send_burst(
             break
         deadline = start_ns + k * spec.period_ns
         lines.sleep_until(deadline)
-        rise = lines.now_ns()
-        if previous_rise_ns is not None and rise - previous_rise_ns < MIN_PERIOD_NS:
+        if previous_rise_ns is not None and lines.now_ns() - previous_rise_ns < MIN_PERIOD_NS:
             fault = PiFault.PERIOD_TOO_SHORT
             break
-        lines.set_output(True)
-        lines.sleep_until(rise + spec.width_ns)
-        lines.set_output(False)
-        end = lines.now_ns()
+        rise, end = lines.pulse(spec.width_ns)
         if k == 0:
             first = rise
         previous_rise_ns = last = rise

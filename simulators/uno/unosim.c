@@ -141,7 +141,7 @@ static void keep_pace(double speed) {
 static int serve_real_time(double speed, uint64_t boot_cycles) {
   anchor_ns = wall_ns();
   while (!ended) {
-    if (pty_opened()) { /* DTR resets the board, and the boot loader swallows what comes meanwhile */
+    if (pty_opened()) { /* the boot loader swallows what comes meanwhile */
       reset();
       for (const uint64_t boots_at = avr->cycle + boot_cycles; avr->cycle < boots_at && !ended;) {
         avr->cycle += SLICE;

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from polysight.shared.config import Instrument
+
+# The tests start some hundred programs: our modules are compiled once for all of them, whatever the shell says; and one
+# thread each for linear algebra, for two that spin against each other on few cores are ten times slower than one.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
 

@@ -22,8 +22,8 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import theilslopes
 
 Times = NDArray[np.int64]
 _EARLY = 0.1  # of the pulse period: how much sooner than the quickest known frame another may come
@@ -269,7 +269,8 @@ def _expected_arrivals(
     x, y = np.array(sent, dtype=np.float64) - zero, np.array(delay, dtype=np.float64) - base
     drift = 0.0
     if len(x) >= _DRIFT_BURSTS:
-        low, high = np.asarray(theilslopes(y, x), dtype=np.float64)[2:]  # of the slopes that fit, the smallest
+        slopes = np.asarray(scipy.stats.theilslopes(y, x), dtype=np.float64)
+        low, high = slopes[2:]  # of the slopes that fit, the smallest
         drift = float(np.clip(np.clip(0.0, low, high), -_MAX_DRIFT, _MAX_DRIFT))
     elif _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY * period_ns:
         raise _UndecidedError(f"{len(x)} bursts came whole: too few to tell how the clocks drift apart")

@@ -21,8 +21,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import scipy.linalg
-import scipy.optimize
+import scipy
 from numpy.typing import NDArray
 
 from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, head, places_crc32

@@ -17,9 +17,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.optimize
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
 from polysight.host.imaging.images import ImageBuilder
 from polysight.host.imaging.resolution import limit_m
@@ -146,7 +145,7 @@ def _cells(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.flo
             for pz in axes[0]
         ]
     )
-    between = RegularGridInterpolator(axes, area, method="linear")
+    between = scipy.interpolate.RegularGridInterpolator(axes, area, method="linear")
     return between(tuple(np.meshgrid(z, grid.y_m, grid.x_m, indexing="ij")))
 
 

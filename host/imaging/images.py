@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from polysight.host.imaging.geometry import Antennas, image_grid
 from polysight.host.imaging.reduce import reduction, scene_gate_m
@@ -165,7 +165,7 @@ class ImageBuilder:
         for _, weight, _ in (h, v):
             strong = np.abs(weight) >= _VISIBLE * np.abs(weight).max()
             # The footprint's rim ripples with the row spacing: the majority of the neighbourhood decides, not stripes.
-            share = ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
+            share = scipy.ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
             visible &= (share > 0.5) & (weight != 0)
         flat = [np.divide(raw, w, out=np.zeros_like(raw), where=visible).conj() for raw, w, _ in (h, v)]
         calibration = {name: board.rx_calibration() for name, board in self.boards.items()}

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.fft
+import scipy
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from polysight.host.imaging.aperture import Aperture, column_step_m, fft_of, pitch_y_m
 from polysight.host.imaging.geometry import excess_path_m, turn
@@ -126,7 +125,7 @@ def cross_fade(xp: Any, kernel: Any, size: int) -> Any:
     function with a narrow spectrum, so that phase ramps may shift it by any fraction.
     """
     fade = kernel.shape[-1] - size
-    curve = (1 + erf(np.linspace(-1, 1, fade + 2)[1:-1] * 2.7)) / 2  # 1e-4 from its ends
+    curve = (1 + scipy.special.erf(np.linspace(-1, 1, fade + 2)[1:-1] * 2.7)) / 2  # 1e-4 from its ends
     ramp = xp.asarray(curve, dtype=xp.float32, device=getattr(kernel, "device", None))
     period = xp.asarray(kernel[..., fade:], copy=True)
     period[..., size - fade :] = period[..., size - fade :] * (1 - ramp) + kernel[..., :fade] * ramp

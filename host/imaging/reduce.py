@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from polysight.host.imaging.geometry import Antennas, ImageGrid
@@ -102,7 +101,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: Window = "hann"
 
     echoes = np.exp(2j * np.pi * np.outer(sweep, d)) / np.sqrt(d.size)
     covariance = echoes @ echoes.conj().T + _NOISE * np.eye(b - a)
-    direct = scipy.linalg.solve(covariance, np.ones(b - a), assume_a="pos").conj()
+    direct = np.linalg.solve(covariance, np.ones(b - a)).conj()
     direct /= direct.sum()
 
     matrix = np.zeros((frequencies.size, chirp.samples), complex)

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from polysight.host.imaging.geometry import Antennas
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
@@ -98,7 +98,7 @@ class Illumination:
         level = np.abs(self.footprints[channel])
         at = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
         with np.errstate(divide="ignore", invalid="ignore"):
-            change = level[rows, columns] / ndimage.map_coordinates(level, at, order=1, mode="nearest")
+            change = level[rows, columns] / scipy.ndimage.map_coordinates(level, at, order=1, mode="nearest")
         return np.where((change > 1 / _MOST_CHANGE) & (change < _MOST_CHANGE), change, 1.0)
 
 

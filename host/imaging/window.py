@@ -13,6 +13,15 @@ Window = str | tuple[Any, ...]
 
 def window_weights(name: Window, n: int) -> NDArray[np.float64]:
     """A window of n points, float64 [n]."""
-    from scipy.signal import get_window  # imported where it is used: it brings scipy.stats along, a second's work
+    match name:  # the usual ones by NumPy: scipy.signal brings scipy.stats along, a second's work for every command
+        case "boxcar":
+            weights = np.ones(n + 2)
+        case "hann":
+            weights = np.hanning(n + 2)
+        case ("kaiser", float(beta)):
+            weights = np.kaiser(n + 2, beta)
+        case _:
+            from scipy.signal import get_window
 
-    return np.asarray(get_window(name, n + 2, fftbins=False), np.float64)[1:-1]
+            weights = np.asarray(get_window(name, n + 2, fftbins=False), np.float64)
+    return weights[1:-1]

@@ -22,7 +22,6 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
 from polysight.host.process import Options, ProcessRequest, Products, coverage_lines, save_images
 from polysight.host.products import IMAGE, check_products_folder, making_products, write_json
-from polysight.host.report import focus_figure
 from polysight.host.store import Source, open_source, raw_source
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError, advice
@@ -192,6 +191,8 @@ def image(data: Path, out: Path, config: Path | None) -> int:
 
 def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     """Find the object plane's distance and tilt by sharpness; focus.json and focus.png. Raises PolysightError."""
+    from polysight.host.report import focus_figure
+
     source = open_source(data, config)
     out.mkdir(parents=True, exist_ok=True)
     pipeline = all_rows(source, data, depth_mm / 1e3)

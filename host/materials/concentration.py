@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+import scipy
 
 from polysight.host.materials.library import Library
 from polysight.shared.errors import DataError
@@ -77,7 +77,7 @@ class Line:
         Analysis, section 1.4).
         """
         x = np.asarray(angle_rad, np.float64)
-        t = float(special.stdtrit(self.patches - 2, 0.5 + confidence / 2))
+        t = float(scipy.special.stdtrit(self.patches - 2, 0.5 + confidence / 2))
         width = t * self.residual_std * np.sqrt(1 + 1 / self.patches + (x - self.mean_rad) ** 2 / self.spread_rad2)
         middle = self.percent(x)
         return middle - width, middle + width

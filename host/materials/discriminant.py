@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import special
+import scipy
 
 from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle
@@ -322,7 +322,7 @@ class ErrorDiscriminant(Model):
         """
         width = patches.shape[1]
         free = max(dof - width + 1, 1)
-        law = float(width * dof / free * special.fdtri(width, free, 1 - REJECTED)) if dof > width else np.inf
+        law = float(width * dof / free * scipy.special.fdtri(width, free, 1 - REJECTED)) if dof > width else np.inf
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
 
         def farthest(d: Real, of: npt.NDArray, covariances: Real) -> float:

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from scipy import optimize
+import scipy
 
 from polysight.host.polarimetry import fresnel, permittivity_from_ratio
 
@@ -270,11 +270,11 @@ def invert(seen: Sequence[Seen], prior: Uncertain) -> Inversion:
     return _solution(model, found)
 
 
-def _least_squares(model: _Model, start: Real) -> optimize.OptimizeResult:
-    return optimize.least_squares(model.residuals, start, method="lm", xtol=1e-10, ftol=1e-10)
+def _least_squares(model: _Model, start: Real) -> scipy.optimize.OptimizeResult:
+    return scipy.optimize.least_squares(model.residuals, start, method="lm", xtol=1e-10, ftol=1e-10)
 
 
-def _solution(model: _Model, found: optimize.OptimizeResult) -> Inversion:
+def _solution(model: _Model, found: scipy.optimize.OptimizeResult) -> Inversion:
     x, jac, prior, n = found.x, found.jac, model.prior, model.n
     covariance = np.linalg.inv(jac.T @ jac)
     a, b, _, error = model.nuisances(x)

@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, optimize, special
+import scipy
 
 from polysight.host.materials.layers import Bands, Layer, average, check_stack
 from polysight.host.materials.permittivity import format_permittivity
@@ -109,7 +109,7 @@ class LayerFit:
                 f"ambiguous: permittivity and thickness are determined to {100 * self.relative_std:.0f} % only;"
                 " measure the thickness"
             )
-        if self.freedom > 0 and special.chdtrc(self.freedom, self.chi2) < UNLIKELY:
+        if self.freedom > 0 and scipy.special.chdtrc(self.freedom, self.chi2) < UNLIKELY:
             out.append(f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees")
         if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
             out.append("the data hardly depend on this layer: its error bar is large")
@@ -280,7 +280,7 @@ class _Model:
         chi2 = np.full(real.shape, np.inf)
         # One frequency of a sub-band is enough to find where to start where the thickness is free.
         chi2[~out] = np.sum(self.residuals(grid[~out], thin=6) ** 2, axis=-1)
-        valleys = (chi2 == ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~out
+        valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~out
         index = np.argwhere(valleys)
         order = np.argsort(chi2[tuple(index.T)])[:STARTS]
         return [grid[tuple(one)] for one in index[order]]
@@ -294,7 +294,7 @@ class _Model:
     def solve(self, start: Real, precision: float = 1e-10) -> _Solution:
         """Least squares from one start."""
         width = self.upper - self.lower
-        done = optimize.least_squares(
+        done = scipy.optimize.least_squares(
             self.residuals,
             np.clip(start, self.lower + 1e-9 * width, self.upper - 1e-9 * width),
             bounds=(self.lower, self.upper),

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
+import scipy
 
 from polysight.host.imaging import window_weights
 from polysight.host.polarimetry import multilayer
@@ -124,7 +124,9 @@ class Bands:
         if self.amplitude_h is None or self.sigma_h is None:
             return ratios
         shared = self.common_h * self.amplitude_h
-        return np.asarray(linalg.block_diag(ratios, np.diag(self.sigma_h**2) + np.outer(shared, shared)), np.float64)
+        return np.asarray(
+            scipy.linalg.block_diag(ratios, np.diag(self.sigma_h**2) + np.outer(shared, shared)), np.float64
+        )
 
 
 @dataclass(frozen=True)

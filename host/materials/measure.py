@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
+import scipy
 
 from polysight.host.materials.inversion import Seen
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
@@ -60,7 +60,7 @@ def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[f
     """Root mean square of |H| and |V| away from all patches: noise and sidelobes. NaN where there is no such place."""
     away = usable & np.isfinite(h) & np.isfinite(v)
     for patch in found.patches:
-        away &= ~np.asarray(ndimage.binary_dilation(patch.mask, iterations=_AROUND_PX), bool)
+        away &= ~np.asarray(scipy.ndimage.binary_dilation(patch.mask, iterations=_AROUND_PX), bool)
     if not away.any():
         return float("nan"), float("nan")
     levels = [float(np.sqrt(np.mean(np.abs(c[away].astype(np.complex128)) ** 2))) for c in (h, v)]

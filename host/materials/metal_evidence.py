@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import optimize
+import scipy
 
 from polysight.host.materials.inversion import BRIGHTNESS_STD, OUTLIER, Seen, Uncertain
 from polysight.host.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
@@ -109,7 +109,7 @@ def metal_evidence(seen: list[Seen], prior: Uncertain, channel_ratio: complex | 
 
 def _best(model: _Explanation, start: Real) -> float:
     """The least sum of squares from one start."""
-    return 2 * float(optimize.least_squares(model.residuals, start, method="lm", max_nfev=40 * start.size).cost)
+    return 2 * float(scipy.optimize.least_squares(model.residuals, start, method="lm", max_nfev=40 * start.size).cost)
 
 
 class _Explanation:

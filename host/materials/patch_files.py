@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import KDTree
+import scipy
 
 from polysight.host.materials.classify import features_of
 from polysight.host.materials.result import MaterialsResult
@@ -130,7 +130,7 @@ def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
         columns, kept = [patch.features], np.ones(len(places), bool)
         for partner in partners:
             theirs = partner.places_mm - partner.centre_mm
-            far, at = KDTree(theirs).query(places) if len(theirs) else (np.full(len(places), np.inf), 0)
+            far, at = scipy.spatial.KDTree(theirs).query(places) if len(theirs) else (np.full(len(places), np.inf), 0)
             kept &= far <= NEAR_MM
             columns.append(partner.features[np.minimum(at, len(theirs) - 1)] if len(theirs) else columns[0])
         out.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[kept]))

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
-from skimage import filters, measure, morphology, restoration
+import scipy
+import skimage
 
 from polysight.host.imaging import ChannelImages
 from polysight.shared.errors import DataError
@@ -121,7 +121,7 @@ def make_patch(
     x, y = axis_mm(x_m), axis_mm(y_m)
     pixel = abs(float(x[1] - x[0]))
     padded = np.pad(mask, 1)
-    depth = np.asarray(ndimage.distance_transform_edt(padded))[1:-1, 1:-1] * pixel
+    depth = np.asarray(scipy.ndimage.distance_transform_edt(padded))[1:-1, 1:-1] * pixel
     interior = mask & (depth > min(margin_mm, 0.6 * float(depth.max())))
     if usable is not None:
         interior &= usable
@@ -133,9 +133,9 @@ def make_patch(
         float(x[cols].max() + half),
         float(y[rows].max() + half),
     )
-    contour = max(measure.find_contours(padded.astype(np.float64), 0.5), key=len) - 1
+    contour = max(skimage.measure.find_contours(padded.astype(np.float64), 0.5), key=len) - 1
     outline = np.column_stack([np.interp(contour[:, 1], range(x.size), x), np.interp(contour[:, 0], range(y.size), y)])
-    return Patch(label, box, measure.approximate_polygon(outline, pixel / 2), int(mask.sum()), mask, interior)
+    return Patch(label, box, skimage.measure.approximate_polygon(outline, pixel / 2), int(mask.sum()), mask, interior)
 
 
 def level_db(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating], usable: Mask, smooth_px: float):
@@ -146,7 +146,7 @@ def level_db(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloati
     """
     power = np.zeros(h.shape)
     for channel in (h, v):
-        p = ndimage.gaussian_filter(np.where(usable, np.abs(channel).astype(np.float64) ** 2, 0.0), smooth_px)
+        p = scipy.ndimage.gaussian_filter(np.where(usable, np.abs(channel).astype(np.float64) ** 2, 0.0), smooth_px)
         top = float(np.percentile(p[usable], 99.5))
         if top > 0:
             power = np.maximum(power, p / top)
@@ -237,14 +237,14 @@ def _without_speckle(
     """
 
     def even(weight: float) -> npt.NDArray[np.float64]:
-        return np.asarray(restoration.denoise_tv_chambolle(level, weight=weight, max_num_iter=100))
+        return np.asarray(skimage.restoration.denoise_tv_chambolle(level, weight=weight, max_num_iter=100))
 
     strongest = even(cfg.speckle_db)
     inside = strongest[usable]
     if np.ptp(inside) == 0:
         return strongest, strongest
-    bright = (strongest > filters.threshold_otsu(inside)) & usable
-    middle = np.asarray(ndimage.distance_transform_edt(bright)) > cfg.margin_mm / pixel_mm
+    bright = (strongest > skimage.filters.threshold_otsu(inside)) & usable
+    middle = np.asarray(scipy.ndimage.distance_transform_edt(bright)) > cfg.margin_mm / pixel_mm
     if not middle.any():
         return strongest, strongest
     difference = (level - strongest)[middle]
@@ -257,7 +257,7 @@ def _regions(
 ) -> tuple[list[Mask], float]:
     """Masks of all patches, bright ones first, and the first threshold in dB."""
     radius = max(1, round((cfg.smallest_mm / pixel_mm - 1) / 2))
-    around = np.asarray(morphology.disk(max(1, round(cfg.margin_mm / pixel_mm))), bool)
+    around = np.asarray(skimage.morphology.disk(max(1, round(cfg.margin_mm / pixel_mm))), bool)
     found: list[Mask] = []
     rest, first = usable.copy(), 0.0
     for turn in range(_TURNS):
@@ -265,7 +265,7 @@ def _regions(
         inside = level[rest]
         if inside.size == 0 or np.ptp(inside) == 0:
             break
-        threshold = float(filters.threshold_otsu(inside))
+        threshold = float(skimage.filters.threshold_otsu(inside))
         first = threshold if turn == 0 else first
         bright = inside > threshold
         if not bright.any() or bright.all() or not _separate(inside, bright, cfg.least_contrast_db):
@@ -274,7 +274,7 @@ def _regions(
         if not new:
             break
         found += new
-        rest &= ~np.asarray(ndimage.binary_dilation(np.logical_or.reduce(new), around), bool)
+        rest &= ~np.asarray(scipy.ndimage.binary_dilation(np.logical_or.reduce(new), around), bool)
     return found, first
 
 
@@ -292,8 +292,8 @@ def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: f
 
 def _cut(amplitude: npt.NDArray[np.float64], mask: Mask, radius: int) -> list[Mask]:
     """Connected regions of a mask, each bounded where the amplitude falls to half of its own level."""
-    disk = np.asarray(morphology.disk(radius), bool)
-    skirt = np.asarray(morphology.disk(radius + 1), bool)
+    disk = np.asarray(skimage.morphology.disk(radius), bool)
+    skirt = np.asarray(skimage.morphology.disk(radius + 1), bool)
     found: list[Mask] = []
     queue = _components(_opened(mask, disk))
     while queue:
@@ -303,7 +303,7 @@ def _cut(amplitude: npt.NDArray[np.float64], mask: Mask, radius: int) -> list[Ma
         parts = _components(core)
         if not parts:
             continue
-        near = np.asarray(ndimage.binary_dilation(core, skirt), bool)
+        near = np.asarray(scipy.ndimage.binary_dilation(core, skirt), bool)
         queue += _components(_opened(region & ~near, disk))
         if len(parts) == 1:
             found.append(_even(parts[0]))
@@ -314,14 +314,14 @@ def _cut(amplitude: npt.NDArray[np.float64], mask: Mask, radius: int) -> list[Ma
 
 def _even(mask: Mask) -> Mask:
     """A region without holes, its outline evened: ringing along the edges makes it jagged."""
-    filled = np.asarray(ndimage.binary_fill_holes(mask), float)
-    return np.asarray(ndimage.gaussian_filter(filled, 1.0) > 0.5, bool)
+    filled = np.asarray(scipy.ndimage.binary_fill_holes(mask), float)
+    return np.asarray(scipy.ndimage.gaussian_filter(filled, 1.0) > 0.5, bool)
 
 
 def _opened(mask: Mask, element: npt.NDArray) -> Mask:
-    return np.asarray(ndimage.binary_opening(mask, element), bool)
+    return np.asarray(scipy.ndimage.binary_opening(mask, element), bool)
 
 
 def _components(mask: Mask) -> list[Mask]:
-    labels = np.asarray(measure.label(mask, connectivity=1))
+    labels = np.asarray(skimage.measure.label(mask, connectivity=1))
     return [labels == i for i in range(1, int(labels.max()) + 1)]

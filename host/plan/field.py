@@ -9,10 +9,8 @@ what the rest adds to it is tapered.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import scipy.optimize
 
 from polysight.host.imaging import Antennas
 from polysight.shared.config import Instrument
@@ -21,6 +19,7 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _STEP_M = 1e-4  # of the numerical derivative
 _FARTHEST_M = 20.0
+_PRECISION_M = 1e-6
 _PLACES = 5
 
 
@@ -87,5 +86,8 @@ def _nearest_ghost_m(slope: PhaseSlope, frequency_hz: float, difference_rad_per_
 
     if short_by(_FARTHEST_M) < 0:
         return float("inf")
-    root: Any = scipy.optimize.brentq(short_by, 0.0, _FARTHEST_M, xtol=1e-6)
-    return float(root)
+    near, far = 0.0, _FARTHEST_M
+    while far - near > _PRECISION_M:  # halved: scipy.optimize would load for longer than all of the plan takes
+        middle = (near + far) / 2
+        near, far = (near, middle) if short_by(middle) >= 0 else (middle, far)
+    return far

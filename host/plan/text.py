@@ -20,7 +20,6 @@ from polysight.host.capture import row_words
 from polysight.host.plan.forecast import Forecast, Noise, forecast
 from polysight.host.plan.search import Changes, propose, rig_lines
 from polysight.host.plan.timing import ROW_OVERHEAD_S, row_motion_s, tail_s, turn_s
-from polysight.host.report import SyncReport
 from polysight.host.store import EVENTS, RawSource, ScanFolder, read_events
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.shared.config import Instrument, load_instrument
@@ -159,6 +158,8 @@ def noise_of(source: RawSource) -> Noise:
     DataError
         when no row tells: bursts of one chirp, or nothing recorded.
     """
+    from polysight.host.report import SyncReport  # here: matplotlib loads for a second
+
     rig = source.instrument
     rows = list(source.rows())
     chosen = [rows[i] for i in sorted({*np.linspace(0, len(rows) - 1, _ROWS).astype(int)})] if rows else []

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
+import scipy
 
 from polysight.shared.errors import DataError, PolysightError
 
@@ -161,9 +161,9 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
         return image
     good = np.isfinite(image)
     filled = np.where(good, image, 0)
-    out = np.asarray(ndimage.gaussian_filter(filled, sigma_px, mode="nearest"))
+    out = np.asarray(scipy.ndimage.gaussian_filter(filled, sigma_px, mode="nearest"))
     if not good.all():
-        weight = ndimage.gaussian_filter(good.astype(np.float64), sigma_px, mode="nearest")
+        weight = scipy.ndimage.gaussian_filter(good.astype(np.float64), sigma_px, mode="nearest")
         out = np.where(good, out / np.where(good, weight, 1.0), image)
     return out.astype(image.dtype)
 

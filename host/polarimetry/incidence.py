@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
+import scipy
 
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
@@ -68,8 +68,6 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     x_m, y_m
         Pixel centres, rig frame, metres; [nx] and [ny].
     """
-    from scipy.signal import fftconvolve  # imported where it is used: it brings scipy.stats along, a second's work
-
     x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
     step = np.array([rig.grid.step_x_mm, rig.grid.step_y_mm]) / 1e3
     count = np.array([rig.grid.columns, rig.grid.rows])
@@ -87,16 +85,24 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         angle, path = _half_bistatic(rig, i, points)
         specular, shortest = _half_bistatic(rig, i, middle)
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
-        deviation, mass = (fftconvolve(visited, one) for one in (weight * (angle - specular), weight))
+        deviation, mass = (_convolved(visited, one) for one in (weight * (angle - specular), weight))
         # Sample (row, column) of the full convolution is the pixel at offset + displacement from the midpoint.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
         where = np.meshgrid(row, column, indexing="ij")
-        num = ndimage.map_coordinates(deviation, where, order=1, mode="constant")
-        den = ndimage.map_coordinates(mass, where, order=1, mode="constant")
+        num = scipy.ndimage.map_coordinates(deviation, where, order=1, mode="constant")
+        den = scipy.ndimage.map_coordinates(mass, where, order=1, mode="constant")
         lit = den > 1e-3 * float(weight.sum())
         total += float(specular) + np.where(lit, num / np.where(lit, den, 1.0), 0.0)
     return total / len(rig.receivers)
+
+
+def _convolved(a: Real, b: Real) -> Real:
+    """Full linear convolution of two images; scipy.signal has it too, and loads scipy.stats with it for a second."""
+    shape = [m + n - 1 for m, n in zip(a.shape, b.shape, strict=True)]
+    fast = [scipy.fft.next_fast_len(n, real=True) for n in shape]
+    both = scipy.fft.rfft2(a, fast) * scipy.fft.rfft2(b, fast)
+    return np.asarray(scipy.fft.irfft2(both, fast), np.float64)[: shape[0], : shape[1]]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
+import scipy
 
 from polysight.host.imaging import ImagedWith
 from polysight.host.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
@@ -182,7 +182,7 @@ def plane_reference(
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
         strong &= power >= max(top * 10 ** (floor_db / 10), np.finfo(np.float32).tiny)
     # The image's own border is no edge of the plate.
-    inside = np.asarray(ndimage.binary_erosion(strong, _disk(round(2 * smooth_px)), border_value=1), bool)
+    inside = np.asarray(scipy.ndimage.binary_erosion(strong, _disk(round(2 * smooth_px)), border_value=1), bool)
     if int(inside.sum()) < LEAST_PIXELS:
         raise DataError(
             "the reference scan shows no metal plate",

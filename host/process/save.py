@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tomli_w
 
@@ -35,20 +35,15 @@ from polysight.host.products import (
     write_json,
     write_scan_facts,
 )
-from polysight.host.report import (
-    ReportContext,
-    classifier_sentence,
-    context_of,
-    manifest_sentence,
-    recorded_sentence,
-    write_report,
-)
 from polysight.host.store import Scan, versions
 from polysight.host.verdict import NoResult, Verdict, verdict_of
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
 from polysight.shared.raster import RasterPlan
 from polysight.shared.tables import to_builtins
+
+if TYPE_CHECKING:  # it draws, and is loaded where something is written: matplotlib takes a second
+    from polysight.host.report import ReportContext
 
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
 
@@ -120,6 +115,8 @@ def save_materials(
 
     `unnamed` says why nothing was named; empty where it was.
     """
+    from polysight.host.report import write_report
+
     found, images, c = findings.found, findings.images, findings.found.calibrated
     accuracy = pixel_accuracy(found)
     numbers = quality.to_dict(verdict=findings.verdict.to_dict(), pixel_accuracy=accuracy)
@@ -142,12 +139,16 @@ def save_materials(
 
 def coverage_lines(coverage: dict[str, Any]) -> tuple[str, ...]:
     """For the terminal: what was recorded of the plan, and what is wrong with the manifest."""
+    from polysight.host.report import manifest_sentence, recorded_sentence
+
     damaged = manifest_sentence(coverage)
     return (recorded_sentence(coverage), damaged) if damaged else (recorded_sentence(coverage),)
 
 
 def materials_content(scan: Scan, findings: Findings, unnamed: str = "") -> dict[str, Any]:
     """Content of materials.json; `unnamed` says why there is no classifier."""
+    from polysight.host.report import classifier_sentence
+
     found, classifier = findings.found, findings.classifier
     return {
         "scan_id": scan.scan_id,
@@ -165,6 +166,8 @@ def materials_content(scan: Scan, findings: Findings, unnamed: str = "") -> dict
 def _report_context(
     scan: Scan, rig: Instrument, findings: Findings, quality: dict[str, Any], naming: tuple[str, str]
 ) -> ReportContext:
+    from polysight.host.report import context_of, manifest_sentence
+
     images, (named_by, unnamed) = findings.images, naming
     context = context_of(
         findings.found,

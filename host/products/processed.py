@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from skimage import measure
+import skimage
 
 from polysight.host.materials import PATCHES, axis_mm, box_mask
 from polysight.host.products.files import SavedProducts
@@ -129,7 +129,7 @@ def _saved_patches(products: SavedProducts) -> tuple[Labels, Mask | None]:
     for s in products.segments:
         outline = np.asarray(s.get("outline_mm") or [], np.float64)
         if len(outline):
-            inside = measure.points_in_poly(points, outline).reshape(labels.shape)
+            inside = skimage.measure.points_in_poly(points, outline).reshape(labels.shape)
         else:
             inside = box_mask(tuple(s["box_mm"]), products.x_m, products.y_m)
         labels[inside] = s["label"]

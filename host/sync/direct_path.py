@@ -25,8 +25,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import scipy.fft
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
 
 from polysight.host.sync.align import AlignedRow, whole_blocks

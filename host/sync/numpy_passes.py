@@ -7,8 +7,7 @@ centre))`, with f in cycles a sample and `centre` the middle of the linear sampl
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
-import scipy.ndimage
+import scipy
 from numpy.typing import NDArray
 
 from polysight.host.sync import high_pass_filter as hpf

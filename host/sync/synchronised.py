@@ -14,7 +14,7 @@ from itertools import product
 
 import msgspec
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
 
 from polysight.host.sync.align import AlignedRow, whole_blocks

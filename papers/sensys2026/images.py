@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 import tomli_w
 from matplotlib.patheffects import withStroke
-from scipy.ndimage import gaussian_filter
 
 from polysight.host.materials import MaterialsResult
 from polysight.host.polarimetry import ratio_from_permittivity
@@ -94,7 +94,7 @@ def _reflects(ctx: ReportContext) -> npt.NDArray[np.float64]:
     """Opacity of P: it is noise where nothing reflects, 20 dB below metal or less."""
     power = (np.abs(ctx.h).astype(np.float64) ** 2 + np.abs(ctx.v).astype(np.float64) ** 2) / 2
     power = np.nan_to_num(power)
-    level = 10 * np.log10(np.maximum(np.minimum(power, gaussian_filter(power, 1.5)), 1e-12))
+    level = 10 * np.log10(np.maximum(np.minimum(power, scipy.ndimage.gaussian_filter(power, 1.5)), 1e-12))
     return np.clip((level + 20) / 6, 0.0, 1.0)
 
 

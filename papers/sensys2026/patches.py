@@ -18,7 +18,7 @@ from functools import cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy import optimize
+import scipy
 
 from polysight.host.materials import PAPER, Entry, Library, Samples, feature_matrix, score
 from polysight.host.polarimetry import fresnel
@@ -159,5 +159,5 @@ def calibrated_errors(group_name: str, draws: int = 3, shared: float = 0.5) -> E
     def excess(log_amplitude: float) -> float:
         return h_accuracy(group, replace(start, amplitude=float(np.exp(log_amplitude))), seeds) - target
 
-    at = optimize.root_scalar(excess, bracket=(np.log(1e-4), np.log(0.3)), method="bisect", xtol=0.01)
+    at = scipy.optimize.root_scalar(excess, bracket=(np.log(1e-4), np.log(0.3)), method="bisect", xtol=0.01)
     return replace(start, amplitude=float(np.exp(at.root)))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import f as f_distribution
+import scipy
 
 from polysight.host.materials import DISCRIMINANT, MODELS, Model, Samples, SceneErrors, by_angle, calibration_error
 from polysight.host.polarimetry import fresnel
@@ -143,7 +143,7 @@ def _outside(seen: Samples, known: Samples) -> npt.NDArray[np.bool_]:
         n, d = own.shape
         off = at - own.mean(axis=0)
         q = np.einsum("pd,de,pe->p", off, np.linalg.inv(np.cov(own.T)), off)
-        out &= q > (n + 1) * (n - 1) * d / (n * (n - d)) * f_distribution.ppf(0.95, d, n - d)
+        out &= q > (n + 1) * (n - 1) * d / (n * (n - d)) * scipy.stats.f.ppf(0.95, d, n - d)
     return out
 
 

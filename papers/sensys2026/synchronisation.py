@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
-from scipy import signal
 
 from polysight.host.capture import decode_row, row_words
 from polysight.host.imaging import ImageBuilder
@@ -260,7 +260,7 @@ def _sweep(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
 
 def _draw_spectrogram(ax: Axes, one: Complex, chirp: Chirp) -> None:
     """Spectrogram of one chirp [sample], and where the used part ends."""
-    f, t, power = signal.spectrogram(
+    f, t, power = scipy.signal.spectrogram(
         one, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
     )
     f, power = np.fft.fftshift(f % chirp.sample_rate_hz), np.fft.fftshift(power, axes=0)

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
-from scipy.special import i0
 
 from polysight.shared.config import Board, Instrument
 from polysight.shared.errors import DataError
@@ -108,7 +108,8 @@ class ObjectField:
         position = (u - self.start_m[axis]) / self.step_m[axis]
         index = np.floor(position).astype(np.intp)[:, None] + np.arange(1 - TAPS // 2, 1 + TAPS // 2)
         away = position[:, None] - index
-        window = i0(_KAISER_BETA * np.sqrt(np.maximum(0.0, 1 - (2 * away / TAPS) ** 2))) / i0(_KAISER_BETA)
+        inner = np.sqrt(np.maximum(0.0, 1 - (2 * away / TAPS) ** 2))
+        window = scipy.special.i0(_KAISER_BETA * inner) / scipy.special.i0(_KAISER_BETA)
         return index, (np.sinc(away) * window).astype(np.float32)
 
 

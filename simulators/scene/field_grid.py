@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
+import scipy
 
 from polysight.shared.config import Instrument
 from polysight.shared.raster import mean_burst_travel_mm

@@ -43,7 +43,7 @@ def test_without_a_compiler(rig_without_compiler):
     assert "Python stand-in" in (rig.folder / "rig" / "logs" / "stage.log").read_text()
     ended = rig.scan("--no-process").wait()
     assert ended.status == 0, ended.err
-    validated = rig.polysight("validate", rig.folder / "scan")
+    validated = rig.here("validate", rig.folder / "scan")
     assert (validated.status, validated.err) == (0, "")
 
 

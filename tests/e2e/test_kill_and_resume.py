@@ -29,7 +29,7 @@ def check_whole(rig, before):
     after = digests(path)
     assert {file: after[file] for file in before} == before
     assert len(ScanFolder.load(path).committed()) == 6
-    validated = rig.polysight("validate", path)
+    validated = rig.here("validate", path)
     assert (validated.status, validated.out, validated.err) == (0, f"{path}: whole\n", "")
     started = [(e.row.index, e.take) for e in read_events(path / "events.msgpack").events if isinstance(e, RowStarted)]
     assert len(set(started)) == len(started), "a take was used twice"
@@ -94,7 +94,7 @@ def test_full_disk_on_the_host(rig):
     assert ended.status == 5
     assert "cannot be written: File too large" in ended.message
     assert f"do: free space; `polysight resume {rig.folder / 'scan'}`" in ended.message
-    validated = rig.polysight("validate", rig.folder / "scan")
+    validated = rig.here("validate", rig.folder / "scan")
     assert validated.status == 0, validated.out
     resumed = rig.polysight("resume", rig.folder / "scan", "--no-process")
     assert resumed.status == 0, resumed.err

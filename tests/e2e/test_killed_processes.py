@@ -269,7 +269,7 @@ def test_products_of_a_killed_scan(killed: Killed):
     resumed = killed.scan(folder, (), *METAL).wait()
     assert resumed.status == NO_RESULT, resumed.err  # one plate alone: every row is there, and nothing is named
     out = killed.rig.folder / "products"
-    processed = killed.rig.polysight("process", killed.rig.folder / "undisturbed", "--out", out, *METAL)
+    processed = killed.rig.here("process", killed.rig.folder / "undisturbed", "--out", out, *METAL)
     assert processed.status == NO_RESULT, processed.err
     with np.load(folder / "products" / "image.npz") as live, np.load(out / "image.npz") as undisturbed:
         assert live.files == undisturbed.files

@@ -1,4 +1,8 @@
-"""Whatever is wrong from outside: the exit status is not 0, and one message says what, why and what to do."""
+"""Whatever is wrong from outside: the exit status is not 0, and one message says what, why and what to do.
+
+Commands of the host run in this process. That a program's exit status and stderr are those of its `main` is shown by
+`test_rig_file`, which starts both programs, and by what is interrupted.
+"""
 
 from __future__ import annotations
 
@@ -63,16 +67,16 @@ def test_rig_file(bench, program, old, new, words):
 
 
 def test_files_that_are_not_there(bench):
-    refused(bench.polysight("scan", "--out", "s"), "instrument.toml: no such file", status=2)
+    refused(bench.here("scan", "--out", "s"), "instrument.toml: no such file", status=2)
     refused(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
     refused(
         bench.polysight("simulate", "no.toml", "--config", RIG_FILE, "--out", "d"), "no.toml: no such file", status=2
     )
     reproduce = ("reproduce", "--config", "no.toml", "--out", "r", "table1")
-    refused(bench.polysight(*reproduce), "no.toml: no such file", status=2)
-    refused(bench.polysight("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
-    refused(bench.polysight("inspect", "no.bin"), "no.bin", status=3)
-    refused(bench.polysight("inspect", "no.pcap"), "no.pcap", status=3)
+    refused(bench.here(*reproduce), "no.toml: no such file", status=2)
+    refused(bench.here("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
+    refused(bench.here("inspect", "no.bin"), "no.bin", status=3)
+    refused(bench.here("inspect", "no.pcap"), "no.pcap", status=3)
 
 
 @pytest.mark.parametrize(
@@ -95,11 +99,11 @@ def test_scene_file(bench, old, new, words):
     (last / ".polysight-demo").touch()
     (last / "report.html").touch()
     rig = ("--config", RIG_FILE)
-    refused(bench.polysight("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
+    refused(bench.here("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
     assert (last / "report.html").exists()
     refused(bench.polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
     if old:
-        refused(bench.polysight("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
+        refused(bench.here("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
     assert {p.name for p in bench.folder.iterdir() if p.is_dir()} == {"scenes", "d"}
 
 
@@ -116,8 +120,8 @@ def test_rig_file_of_a_training(bench):
     (bench.folder / "scenes").mkdir()
     (bench.folder / "scenes" / "a.toml").write_text(SCENE)
     train = ("train", "--simulate", "scenes")
-    refused(bench.polysight(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
-    refused(bench.polysight(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
+    refused(bench.here(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
+    refused(bench.here(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
 
 
 # --- recorded data ----------------------------------------------------------------------------------------------------
@@ -147,26 +151,26 @@ def test_folder_that_is_no_scan(bench, command):
     (bench.folder / "other" / "notes.txt").write_text("not a scan")
     every = ("missing", "empty", "other", "other/notes.txt")
     for name in every if command == "validate" else ("missing", "other"):
-        refused(bench.polysight(command, name, *out), name, status=3)
+        refused(bench.here(command, name, *out), name, status=3)
     assert not (bench.folder / "out").exists()
 
 
 def test_torn_last_line_is_tolerated(bench, scan):
     with (scan / "manifest.jsonl").open("ab") as f:
         f.write(b'{"fact": "row_comm')
-    ended = bench.polysight("validate", scan)
+    ended = bench.here("validate", scan)
     assert (ended.status, ended.err) == (0, "")
     assert "torn" in ended.out
-    assert bench.polysight("image", scan, "--out", "out").status == 0
+    assert bench.here("image", scan, "--out", "out").status == 0
 
 
 @pytest.mark.parametrize("content", [b"", b"junk\n" * 3, None])
 def test_damaged_first_line(bench, scan, content):
     path = scan / "manifest.jsonl"
     path.write_bytes(path.read_bytes().replace(b"scan_id", b"scan_ID", 1) if content is None else content)
-    refused(bench.polysight("process", scan, "--out", "out"), "manifest.jsonl", "scan_started", status=3)
-    refused(bench.polysight("resume", scan), "manifest.jsonl", "scan_started", status=3)
-    ended = bench.polysight("validate", scan)
+    refused(bench.here("process", scan, "--out", "out"), "manifest.jsonl", "scan_started", status=3)
+    refused(bench.here("resume", scan), "manifest.jsonl", "scan_started", status=3)
+    ended = bench.here("validate", scan)
     assert (ended.status, ended.err) == (1, "")
     assert "error: manifest.jsonl" in ended.out
 
@@ -175,35 +179,35 @@ def test_truncated_and_deleted_rows(bench, scan):
     row = scan / "raw" / "RH" / "0002.bin"
     with row.open("r+b") as f:
         f.truncate(1000)
-    refused(bench.polysight("process", scan, "--out", "out"), str(row), "1000 bytes", status=3)
-    ended = bench.polysight("validate", scan)
+    refused(bench.here("process", scan, "--out", "out"), str(row), "1000 bytes", status=3)
+    ended = bench.here("validate", scan)
     assert (ended.status, ended.err) == (1, "")
     assert ended.out.count("error:") == 1
     assert "raw/RH/0002.bin: 1000 bytes" in ended.out
     shutil.rmtree(scan / "raw")
-    refused(bench.polysight("image", scan, "--out", "out"), str(scan / "raw"), status=3)
-    ended = bench.polysight("validate", scan)
+    refused(bench.here("image", scan, "--out", "out"), str(scan / "raw"), status=3)
+    ended = bench.here("validate", scan)
     assert (ended.status, ended.out.count("error:")) == (1, 8)
 
 
 def test_scan_without_a_row(bench, scan):
     path = scan / "manifest.jsonl"
     path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
-    refused(bench.polysight("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
+    refused(bench.here("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
 
 
 def test_library(bench, scan):
     process = ("process", scan, "--out", "out", "--library")
     (bench.folder / "junk.npz").write_text("no library")
     for name in ("no.npz", "junk.npz", "scan"):
-        refused(bench.polysight(*process, name), name, "polysight train", status=3)
+        refused(bench.here(*process, name), name, "polysight train", status=3)
     assert not (bench.folder / "out").exists(), "found out before anything is processed"
-    refused(bench.polysight("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
+    refused(bench.here("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
 
 
 def test_nothing_to_refer_to(bench, scan):
     """No metal, no plates: no result, and the images and the report are written all the same."""
-    ended = bench.polysight("process", scan, "--out", "out")
+    ended = bench.here("process", scan, "--out", "out")
     assert ended.status == 7, ended
     assert "no result" in ended.out
     assert "no patch was found" in ended.out
@@ -216,14 +220,14 @@ def test_out_is_taken(bench, scan):
     mine.mkdir()
     (mine / "thesis.tex").write_text("precious")
     for command in (["image", scan], ["demo", "--config", RIG_FILE], ["scan", "--config", RIG_FILE]):
-        refused(bench.polysight(*command, "--out", mine), str(mine), "--out", status=2)
+        refused(bench.here(*command, "--out", mine), str(mine), "--out", status=2)
     for command in (["image", scan], ["demo", "--config", RIG_FILE]):
-        refused(bench.polysight(*command, "--out", mine / "thesis.tex"), "thesis.tex", "--out", status=2)
-    refused(bench.polysight("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
+        refused(bench.here(*command, "--out", mine / "thesis.tex"), "thesis.tex", "--out", status=2)
+    refused(bench.here("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
     assert (mine / "thesis.tex").read_text() == "precious"
     assert list(mine.iterdir()) == [mine / "thesis.tex"]
-    assert bench.polysight("image", scan, "--out", "out").status == 0
-    assert bench.polysight("image", scan, "--out", "out").status == 0, "earlier products may be replaced"
+    assert bench.here("image", scan, "--out", "out").status == 0
+    assert bench.here("image", scan, "--out", "out").status == 0, "earlier products may be replaced"
 
 
 @pytest.mark.parametrize("name", ["empty.bin", "empty.pcap", "text.txt", "long-text.bin", "text.pcap", "head.pcap"])
@@ -235,14 +239,14 @@ def test_inspect_what_is_no_recording(bench, name):
         "head": bytes.fromhex("d4c3b2a1020004000000000000000000ffff000001000000") + b"\0" * 7,
     }
     (bench.folder / name).write_bytes(content[name.partition(".")[0]])
-    refused(bench.polysight("inspect", name), name, status=3)
+    refused(bench.here("inspect", name), name, status=3)
 
 
 def test_inspect_a_truncated_capture(bench):
     if not CAPTURE.exists():
         pytest.skip(f"{CAPTURE} is not here: the capture of a real card is not ours to publish")
     (bench.folder / "cut.pcap").write_bytes(CAPTURE.read_bytes()[:5000])
-    refused(bench.polysight("inspect", "cut.pcap"), "cut.pcap", "truncated", status=3)
+    refused(bench.here("inspect", "cut.pcap"), "cut.pcap", "truncated", status=3)
 
 
 # --- the Pi's side ----------------------------------------------------------------------------------------------------
@@ -300,7 +304,7 @@ def silent_pty():
 
 
 def test_no_pi(bench, lonely, lonely_instrument):
-    ended = bench.polysight("scan", "--config", lonely, "--out", "s")
+    ended = bench.here("scan", "--config", lonely, "--out", "s")
     refused(ended, lonely_instrument.pi.command_address, "polysight-pi run", status=5)
     assert not (bench.folder / "s").exists()
 

@@ -1,18 +1,20 @@
-"""Commands of both halves as processes, run as a user runs them."""
+"""Commands of both halves, run as a user runs them: as processes, or in this one where the process does not matter."""
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from polysight.host.cli.main import main
 from tests.support.paths import BIN
 
 LIMIT_S = 60.0
@@ -142,6 +144,18 @@ class Bench:
     def polysight(self, *arguments: str | Path, limit_s: float = LIMIT_S) -> Ended:
         """Run a command of the host."""
         return self.run("polysight", *arguments, limit_s=limit_s)
+
+    def here(self, *arguments: str | Path) -> Ended:
+        """Run a command of the host in this process: the same without the start of a program, a second each."""
+        out, err, before = io.StringIO(), io.StringIO(), signal.getsignal(signal.SIGTERM)
+        try:
+            with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):
+                status = main([str(word) for word in arguments])
+        except SystemExit as e:  # of argparse
+            status = e.code if isinstance(e.code, int) else 1
+        finally:
+            signal.signal(signal.SIGTERM, before)
+        return Ended(status, out.getvalue(), err.getvalue())
 
     def wait_for(self, condition: Callable[[], bool], what: str) -> None:
         """Return when the condition holds; fail after a minute."""

@@ -1,0 +1,92 @@
+"""No command waits for a package it does not use: numpy loads for 0.2 s, matplotlib or scipy.stats for a second."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import scipy.signal
+from numpy.testing import assert_allclose
+
+from polysight.host.cli.main import FAMILIES
+from polysight.host.imaging import TAPERS, window_weights
+from polysight.simulators.scene import load_scene, simulate
+from tests.support.paths import RIG_FILE
+from tests.support.products import judged_products
+from tests.support.rigs import published_rig
+from tests.support.scenes import small_scene
+
+NUMBERS = {"numpy"}
+SCIPY = {"scipy"}
+HEAVY = {
+    "distributed", "h5py", "jinja2", "matplotlib", "numba", "pandas", "sklearn", "skimage.measure", "xarray", "zmq",
+    "scipy.fft", "scipy.interpolate", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.sparse",
+    "scipy.spatial", "scipy.special", "scipy.stats",
+}  # fmt: skip
+
+RUN = """
+import contextlib, io, json, sys
+from polysight.host.cli.main import main
+with contextlib.redirect_stdout(io.StringIO()):
+    try:
+        status = main(sys.argv[1:])
+    except SystemExit as e:  # of argparse
+        status = e.code
+sys.stdout.write(json.dumps([status, sorted(sys.modules)]))
+"""
+
+
+def loaded_by(*words: str | Path) -> set[str]:
+    """Modules in a new process when a command has succeeded in it."""
+    command = [sys.executable, "-c", RUN, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
+    status, modules = json.loads(done.stdout)
+    assert status == 0, done.stderr
+    return set(modules)
+
+
+def test_help_needs_no_numbers():
+    for words in (["--help"], ["--version"]):
+        assert loaded_by(*words) & (NUMBERS | SCIPY | HEAVY) == set(), words
+
+
+@pytest.mark.parametrize("command", [names[0] for names in FAMILIES.values()])
+def test_help_of_a_command_needs_no_numbers(command):
+    """One of each family: a family is one module."""
+    assert loaded_by(command, "--help") & (NUMBERS | SCIPY | HEAVY) == set()
+
+
+@pytest.mark.parametrize("command", ["materials", "report", "permittivity"])
+def test_saved_products_are_shown_without_mathematics(tmp_path, command):
+    products = judged_products(tmp_path / "products", "good")
+    (products / "report.html").write_text("<p>here</p>")
+    assert loaded_by(command, products) & HEAVY == set()
+
+
+def test_a_scan_is_validated_without_scipy(tmp_path):
+    (tmp_path / "scene.toml").write_text(small_scene(6, 3))
+    simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
+    assert loaded_by("validate", tmp_path / "scan") & (SCIPY | HEAVY) == set()
+
+
+def test_a_plan_is_made_without_scipys_parts():
+    assert loaded_by("plan", "--config", RIG_FILE) & HEAVY == set()
+
+
+def test_jobs_load_what_they_compute_with_when_they_compute():
+    drawing = {"classify", "label"}
+    jobs = {f.stem for f in (RIG_FILE.parent / "host" / "jobs").glob("[a-z]*.py")} - drawing
+    modules = [*(f"jobs.{job}" for job in sorted(jobs)), "pipeline", "acquisition", "doctor", "api", "plan"]
+    code = "import sys\n" + "".join(f"import polysight.host.{m}\n" for m in modules) + "print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
+    assert set(done.stdout.split()) & (HEAVY - {"zmq"}) == set()
+
+
+@pytest.mark.parametrize("window", ["hann", *TAPERS.values()])
+def test_windows_without_scipy_are_those_of_scipy(window):
+    for n in (1, 2, 7, 64):
+        expected = scipy.signal.get_window(window, n + 2, fftbins=False)[1:-1]
+        assert_allclose(window_weights(window, n), expected, rtol=0, atol=1e-15)

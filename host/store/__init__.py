@@ -5,7 +5,7 @@ hold data, `read_row` and facts about the recording; `raw_source` asks for one w
 """
 
 from polysight.host.store import manifest
-from polysight.host.store.append_only import sync_folder
+from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.raw import Digests, drop, droppable, require_raw
@@ -49,6 +49,7 @@ __all__ = [
     "Source",
     "check_same_scan",
     "connection_of",
+    "crc32",
     "damage_of",
     "damaged_rows",
     "drop",

@@ -25,7 +25,7 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
-import scipy.linalg
+import scipy
 from numpy.typing import NDArray
 
 from polysight.host.sync import compiled, numpy_direct_path

@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 OUT ?= out
 JOBS ?= 2
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not for each of a hundred programs
 
 .PHONY: help demo test test-long test-uml test-pi quick check bench firmware flash pi-install library reproduce docs clean
 
@@ -14,10 +15,7 @@ help:  ## this list
 
 $(VENV)/installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 2; }
-	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
-	@echo "installing the instrument and its tools into $(VENV)"
-	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -e . --group dev
+	@./tests/install-python.sh $(PYTHON) $(VENV)
 	@touch $@
 
 demo: $(VENV)/installed  ## the whole rig, simulated: scan nine materials, end with a report (OUT=out)

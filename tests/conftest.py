@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Iterator
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -47,6 +48,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--long"):
         settings.load_profile("searching")
+
+
+UNRENDERED = ("calibration", "house", "jobs", "plan", "process", "products", "store")
+"""Rooms whose tests process whole scans and look at no figure; those that do are report, api, papers and e2e."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _composed_figures(request: pytest.FixtureRequest) -> Iterator[None]:
+    """In these rooms figures are not rendered."""
+    if request.path.parent.name not in UNRENDERED:
+        yield
+        return
+    from tests.support.products import unrendered
+
+    with unrendered():
+        yield
 
 
 @pytest.fixture(scope="session")

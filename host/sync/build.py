@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -71,6 +70,8 @@ def build(folder: Path = HERE, target: str = "") -> Path:
     BuildError
         without a compiler, or when it fails.
     """
+    from concurrent.futures import ThreadPoolExecutor  # here: `compiled.py` needs this file, and no threads
+
     compiler = _zig() if target else find_compiler()
     if compiler is None:
         raise BuildError("no C compiler was found")

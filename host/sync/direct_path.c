@@ -77,12 +77,15 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
                  int farthest, const double *comparable, int32_t *bins, double *median)
 {
     int count = RX * blocks;
-    float *memory = reserve((size_t)(2 * LANES + 4) * size + 2 * (size_t)count + 64);
+    float *memory = reserve((size_t)(2 * LANES + 5) * size + 2 * (size_t)count + 64);
     if (!memory)
         return 1;
     float *re = memory, *im = re + LANES * size, *c = im + LANES * size, *s = c + size, *power = s + size;
     float *spare = power + size, *x = spare + size, *y = x + count;
+    int *bin = (int *)(y + count);
     roots_of_unity(size, c, s);
+    for (int i = 0; i < size; i++)
+        bin[i] = bin_at(i, size);
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
         memset(re, 0, sizeof *re * 2 * LANES * size);
@@ -100,7 +103,7 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
             float lower, upper;
             int p = first + k;
             for (int i = 0; i < size; i++)
-                power[bin_at(i, size)] = spare[i] = re[LANES * i + k];
+                power[bin[i]] = spare[i] = re[LANES * i + k];
             choose_peaks(power, size, nearest, farthest, (float)*comparable, bins + p, bins + positions + p);
             middle_two(spare, size, &lower, &upper);
             median[p] = (sqrt(lower) + sqrt(upper)) / 2;

@@ -7,7 +7,7 @@ cycles a sample. What is estimated, and why so, is in `direct_path.py`.
 from __future__ import annotations
 
 import numpy as np
-import scipy.fft
+import scipy
 from numpy.typing import NDArray
 
 from polysight.host.sync.numpy_passes import FOLD

@@ -248,6 +248,28 @@ static inline void mix_and_fold(Work *w, const int16_t *restrict x, const int16_
         }
 }
 
+/* Add one signal to another. */
+static inline void add(const float *restrict re, const float *restrict im, float *restrict to_re, float *restrict to_im,
+                       int values)
+{
+    for (int j = 0; j < values; j++) {
+        to_re[j] += re[j];
+        to_im[j] += im[j];
+    }
+}
+
+/* Products of x + j y with the conjugate of u + j v, and energies of x + j y. */
+static inline void multiply(const float *restrict x, const float *restrict y, const float *restrict u,
+                            const float *restrict v, float *restrict re, float *restrict im, float *restrict energy,
+                            int values)
+{
+    for (int j = 0; j < values; j++) {
+        re[j] = x[j] * u[j] + y[j] * v[j];
+        im[j] = y[j] * u[j] - x[j] * v[j];
+        energy[j] = x[j] * x[j] + y[j] * y[j];
+    }
+}
+
 /* Second pass: the tone between each chirp, mixed down, folded and filtered, and the sum of the good others; see
    `numpy_passes.against_others`. Returns the energy of that sum. */
 static float against_others(Work *w, const double *frequency, const Complex *taps, int count,
@@ -258,7 +280,7 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
     double *even_re = w->sums, *even_im = even_re + all, *odd_re = even_im + all, *odd_im = odd_re + all;
     double *rest_re = odd_im + all, *rest_im = rest_re + all, *odd_f = w->newton + 6 * chirps;
     Complex *odd_tone = (Complex *)(odd_f + chirps);
-    float level = 0;
+    float level = 0, *all_re = w->all_re, *all_im = w->all_im;
     memset(w->folded_re, 0, sizeof(float) * chirps * values);
     memset(w->folded_im, 0, sizeof(float) * chirps * values);
     memset(w->all_re, 0, sizeof(float) * values);
@@ -270,21 +292,14 @@ static float against_others(Work *w, const double *frequency, const Complex *tap
         extend(w->row_re, values, RX);
         extend(w->row_im, values, RX);
         add_filtered(w->row_re, w->row_im, taps + k * count, count, RX, re, im, values);
-        for (int j = 0; good[k] && j < values; j++) {
-            w->all_re[j] += re[j];
-            w->all_im[j] += im[j];
-        }
+        if (good[k])
+            add(re, im, all_re, all_im, values);
     }
     for (int j = 0; j < values; j++)
-        level += w->all_re[j] * w->all_re[j] + w->all_im[j] * w->all_im[j];
+        level += all_re[j] * all_re[j] + all_im[j] * all_im[j];
     for (int k = 0; k < chirps; k++) {
-        float *re = w->folded_re + k * values, *im = w->folded_im + k * values;
-        for (int j = 0; j < values; j++) {
-            float x = re[j], y = im[j], u = w->all_re[j], v = w->all_im[j];
-            w->one_re[j] = x * u + y * v;
-            w->one_im[j] = y * u - x * v;
-            w->spare[j] = x * x + y * y;
-        }
+        multiply(w->folded_re + k * values, w->folded_im + k * values, all_re, all_im, w->one_re, w->one_im, w->spare,
+                 values);
         energy[k] = 0;
         for (int p = 0; p < w->parts; p++) {
             float f[RX] = {0}, g[RX] = {0}, own[RX] = {0};

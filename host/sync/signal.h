@@ -96,19 +96,25 @@ static inline void ramp(double frequency, double turns, int step, double origin,
                         float *restrict s)
 {
     enum { FINE = 8 };
-    float fine_c[FINE], fine_s[FINE];
+    float fine_c[FINE], fine_s[FINE], coarse_c[FINE], coarse_s[FINE];
     for (int m = 0; m < FINE; m++) {
         Complex z = cis(-frequency * step * m);
         fine_c[m] = (float)z.re;
         fine_s[m] = (float)z.im;
     }
-    for (int first = 0; first < count; first += FINE) {
-        Complex z = cis(-frequency * (step * first - origin) - turns);
-        float a = (float)z.re, b = (float)z.im;
-        VECTOR
-        for (int m = 0; m < FINE; m++) {
-            c[first + m] = a * fine_c[m] - b * fine_s[m];
-            s[first + m] = a * fine_s[m] + b * fine_c[m];
+    for (int first = 0; first < count; first += FINE * FINE) {
+        for (int i = 0; i < FINE; i++) {
+            Complex z = cis(-frequency * (step * (first + i * FINE) - origin) - turns);
+            coarse_c[i] = (float)z.re;
+            coarse_s[i] = (float)z.im;
+        }
+        for (int i = 0; i < FINE && first + i * FINE < count; i++) {
+            float *restrict to_c = c + first + i * FINE, *restrict to_s = s + first + i * FINE;
+            VECTOR
+            for (int m = 0; m < FINE; m++) {
+                to_c[m] = coarse_c[i] * fine_c[m] - coarse_s[i] * fine_s[m];
+                to_s[m] = coarse_c[i] * fine_s[m] + coarse_s[i] * fine_c[m];
+            }
         }
     }
 }
@@ -116,12 +122,10 @@ static inline void ramp(double frequency, double turns, int step, double origin,
 /* scale exp(-j 2 pi frequency q) for the samples q of a block, of all RX. */
 static inline void phases_within(double frequency, double scale, float *restrict c, float *restrict s)
 {
-    for (int q = 0; q < FOLD; q++) {
-        Complex z = cis(-frequency * q);
-        for (int r = 0; r < RX; r++) {
-            c[RX * q + r] = (float)(z.re * scale);
-            s[RX * q + r] = (float)(z.im * scale);
-        }
+    for (int i = 0; i < LANES; i++) {
+        Complex z = cis(-frequency * (i / RX));
+        c[i] = (float)(z.re * scale);
+        s[i] = (float)(z.im * scale);
     }
 }
 

@@ -1,11 +1,17 @@
-"""Made-up products of a judged scan: a metal reference, a named patch, a refused one."""
+"""Made-up products of a judged scan: a metal reference, a named patch, a refused one; and reports without rendering."""
 
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
+import pytest
+from matplotlib.figure import Figure
 
 from polysight.host.products import write_image, write_json
 
@@ -67,3 +73,29 @@ def judged_products(folder: Path, level: str | None, careless: bool = False) -> 
     write_json(folder / "quality.json", quality)
     write_json(folder / "scan.json", {"scan_id": "s", "simulated": True})
     return folder
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+PIXEL = (
+    b"\x89PNG\r\n\x1a\n"
+    + _chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
+    + _chunk(b"IDAT", zlib.compress(b"\0\0"))
+    + _chunk(b"IEND", b"")
+)
+"""A PNG of one pixel."""
+
+
+@contextmanager
+def unrendered() -> Iterator[None]:
+    """Figures are composed, and saved as one pixel: rendering takes seconds a report, and tests/report looks at it."""
+
+    def save(_: Figure, file: BinaryIO, **_options: Any) -> None:
+        file.write(PIXEL)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", save)
+        patch.setattr(Figure, "draw_without_rendering", lambda _: None)
+        yield

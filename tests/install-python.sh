@@ -1,0 +1,30 @@
+#!/bin/sh
+# The instrument and its tools into the virtual environment $2, made with the Python $1: by uv where it is, else by pip.
+# Says what it does, and each minute that it still does it; warnings of packages that are none of the user's business stay away.
+set -u
+python=$1 venv=$2
+export PYTHONWARNINGS=ignore PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_QUIET=2 PIP_NO_INPUT=1 PIP_ROOT_USER_ACTION=ignore UV_NO_PROGRESS=1
+
+patiently() {  # COMMAND...: its exit status, and a line for every minute that it takes
+  "$@" &
+  job=$! seconds=0
+  while kill -0 $job 2>/dev/null; do
+    sleep 1
+    seconds=$((seconds + 1))
+    [ $((seconds % 60)) -ne 0 ] || echo "  still installing, minute $((seconds / 60))"
+  done
+  wait $job
+}
+
+if command -v uv >/dev/null; then
+  echo "installing the instrument and its tools into $venv, with uv"
+  if uv venv --quiet --seed --allow-existing --python "$python" "$venv" &&
+    patiently uv pip install --quiet --compile-bytecode --python "$venv/bin/python" --editable . --group dev; then
+    exit 0
+  fi
+  echo "uv could not; trying pip"
+fi
+"$python" -m venv "$venv" || exit 2
+echo "installing the instrument and its tools into $venv, with pip: some minutes (uv, where installed, takes seconds)"
+patiently "$venv/bin/python" -m pip install --upgrade "pip>=25.1" &&
+  patiently "$venv/bin/python" -m pip install --editable . --group dev

@@ -258,8 +258,9 @@ def _thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, floa
     """Per material: how far its pixels lie from its own pixels in other scans, 99th percentile, times a margin.
 
     At least half of the materials' median: metal is the reference, so it lies on itself in every scan of the library
-    and would accept nothing else. A material seen in one scan only has no spread between scans and gets none: it
-    accepts whatever is nearest to it.
+    and would accept nothing else. At most three times the median: one strange specimen must not open a material to
+    everything. A material seen in one scan only has no spread between scans and gets none: it accepts whatever is
+    nearest to it.
     """
     out = {}
     for name in np.unique(few.names):
@@ -273,5 +274,5 @@ def _thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, floa
                 near.append(np.partition(d, k - 1, axis=1)[:, :k].mean(axis=1))
         if near:
             out[str(name)] = MARGIN * float(np.percentile(np.concatenate(near), 99))
-    floor = 0.5 * float(np.median(list(out.values()))) if out else 0.0
-    return {name: max(value, floor) for name, value in out.items()}
+    usual = float(np.median(list(out.values()))) if out else 0.0
+    return {name: float(np.clip(value, 0.5 * usual, 3 * usual)) for name, value in out.items()}

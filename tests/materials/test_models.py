@@ -173,3 +173,13 @@ def test_weights_are_fitted_and_turn_from_a_channel_that_tells_nothing():
     other = fit_weights(Samples(without_v, data.names, data.groups, data.patches))
     assert without_h.weights.h / without_h.weights.v < other.weights.h / other.weights.v
     assert without_h.by_channel["h"] < 0.35 < without_h.by_channel["v"]
+
+
+def test_one_strange_specimen_does_not_open_a_material_to_everything():
+    """The KNN's reach of a material is at most three times the materials' median."""
+    data = samples(groups=6, noise=0.003)
+    strange = data.patches == data.patches[data.names == "m2"][0]
+    moved = data.x.copy()
+    moved[strange] += 5 * np.ptp(data.x, axis=0)
+    reach = fit_weights(Samples(moved, data.names, data.groups, data.patches)).thresholds
+    assert reach["m2"] <= 3 * np.median(list(reach.values())) * (1 + 1e-9)

@@ -24,7 +24,7 @@ SOURCES = ("burst.c", "direct_path.c")
 """Compiled once for each vector width."""
 
 _FLAGS = "-std=c99 -O3 -fPIC -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
-_FLAGS += " -fassociative-math -fvisibility=default"  # not -ffast-math, which would change how other libraries round
+_FLAGS += " -fassociative-math"  # not -ffast-math, which would change how other libraries round
 _WIDTHS = {
     128: "",
     256: "-mavx2 -mfma",
@@ -90,7 +90,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
             commands = [[*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{made}/{name}"] for words, name in jobs]
             list(workers.map(_run, commands))
         library = f"{made}/{LIBRARY}"
-        _run([*compiler, "-shared", "-o", library, *(f"{made}/{name}" for _, name in jobs), "-lm"])
+        _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *(f"{made}/{name}" for _, name in jobs), "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
         shutil.copyfile(library, new)
         new.replace(folder / LIBRARY)  # at once: a program that uses the old one keeps it

@@ -8,12 +8,14 @@ JOBS ?= 2
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not for each of a hundred programs
 
-.PHONY: help demo test test-long test-uml test-pi quick check bench firmware flash pi-install library reproduce docs clean
+.PHONY: help demo test test-long test-uml test-pi quick check bench firmware flash pi-install library reproduce wheels docs clean
 
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-$(VENV)/installed: pyproject.toml
+KERNELS := $(wildcard host/sync/*.c host/sync/*.h) host/sync/build.py setup.py
+
+$(VENV)/installed: pyproject.toml $(KERNELS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 2; }
 	@./tests/install-python.sh $(PYTHON) $(VENV)
 	@touch $@
@@ -62,6 +64,11 @@ reproduce: $(VENV)/installed  ## the paper's tables and figures from simulation,
 
 library: $(VENV)/installed  ## make the simulated reference library of the classifier again
 	$(BIN)/polysight train --simulate examples/library --times 2 --out host/materials/simulated-library.npz
+
+wheels: $(VENV)/installed  ## wheels for users, x86-64 and ARM64, any Python, for machines without a compiler (OUT=out)
+	for platform in manylinux_2_17_x86_64 manylinux_2_17_aarch64; do \
+	  POLYSIGHT_WHEEL=$$platform $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels . || exit 1; done
+	@ls $(OUT)/wheels
 
 docs: $(VENV)/installed  ## make the API reference (OUT=out), check all links, run every command that README and docs show
 	$(BIN)/python -m docs.reference --out $(OUT)/docs

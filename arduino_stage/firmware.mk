@@ -1,6 +1,8 @@
 # Firmware for the Arduino UNO without arduino-cli: Debian's gcc-avr, avr-libc and arduino-core-avr.
 # Flags are those of /usr/share/arduino/hardware/arduino/avr/{platform,boards}.txt.
+# Another compiler: AVR=/folder/of/its/programs/avr-
 ARD     ?= /usr/share/arduino/hardware/arduino/avr
+AVR     ?= avr-
 AVRDUDE ?= avrdude
 AVR_B    = build/uno
 CORE     = $(ARD)/cores/arduino
@@ -15,27 +17,27 @@ CORE_OBJ = $(patsubst $(CORE)/%,$(AVR_B)/core/%.o,$(wildcard $(CORE)/*.c $(CORE)
 OWN_OBJ  = $(AVR_B)/arduino_stage.ino.o $(patsubst %.cpp,$(AVR_B)/%.cpp.o,$(wildcard *.cpp))
 
 firmware: $(AVR_B)/arduino_stage.hex
-	avr-size --format=avr --mcu=atmega328p $(AVR_B)/arduino_stage.elf
+	$(AVR)size --format=avr --mcu=atmega328p $(AVR_B)/arduino_stage.elf
 flash: $(AVR_B)/arduino_stage.hex
 	@test -n "$(PORT)" || { echo "which port? make flash PORT=/dev/ttyACM0"; exit 2; }
 	@command -v $(AVRDUDE) >/dev/null || { echo "no avrdude: sudo apt-get install avrdude"; exit 2; }
 	$(AVRDUDE) -p atmega328p -c arduino -P $(PORT) -b 115200 -D -U flash:w:$<:i
 $(AVR_B)/core/%.c.o: $(CORE)/%.c | $(AVR_B)/core
-	avr-gcc -c $(AVR_C) $(AVR_DEFS) $(AVR_INC) $< -o $@
+	$(AVR)gcc -c $(AVR_C) $(AVR_DEFS) $(AVR_INC) $< -o $@
 $(AVR_B)/core/%.cpp.o: $(CORE)/%.cpp | $(AVR_B)/core
-	avr-g++ -c -w $(AVR_CXX) $(AVR_DEFS) $(AVR_INC) $< -o $@
+	$(AVR)g++ -c -w $(AVR_CXX) $(AVR_DEFS) $(AVR_INC) $< -o $@
 $(AVR_B)/core/%.S.o: $(CORE)/%.S | $(AVR_B)/core
-	avr-gcc -c -g -x assembler-with-cpp -flto -MMD $(AVR_DEFS) $(AVR_INC) $< -o $@
+	$(AVR)gcc -c -g -x assembler-with-cpp -flto -MMD $(AVR_DEFS) $(AVR_INC) $< -o $@
 $(AVR_B)/core.a: $(CORE_OBJ)
-	rm -f $@; avr-gcc-ar rcs $@ $^
+	rm -f $@; $(AVR)gcc-ar rcs $@ $^
 $(AVR_B)/%.cpp.o: %.cpp $(wildcard *.h) | $(AVR_B)/core
-	avr-g++ -c $(AVR_CXX) -Wall -Wextra -Werror $(AVR_DEFS) $(AVR_INC) $< -o $@
+	$(AVR)g++ -c $(AVR_CXX) -Wall -Wextra -Werror $(AVR_DEFS) $(AVR_INC) $< -o $@
 $(AVR_B)/%.ino.o: %.ino $(wildcard *.h) | $(AVR_B)/core
-	avr-g++ -c -x c++ -include Arduino.h $(AVR_CXX) -Wall -Wextra -Werror $(AVR_DEFS) $(AVR_INC) $< -o $@
+	$(AVR)g++ -c -x c++ -include Arduino.h $(AVR_CXX) -Wall -Wextra -Werror $(AVR_DEFS) $(AVR_INC) $< -o $@
 $(AVR_B)/arduino_stage.elf: $(OWN_OBJ) $(AVR_B)/core.a
-	avr-gcc $(AVR_LD) -o $@ $^ -lm
+	$(AVR)gcc $(AVR_LD) -o $@ $^ -lm
 %.hex: %.elf
-	avr-objcopy -O ihex -R .eeprom $< $@
+	$(AVR)objcopy -O ihex -R .eeprom $< $@
 $(AVR_B)/core:
 	mkdir -p $@
 .PHONY: firmware flash

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,8 @@ def run(out: Path, positions: int, board_name: str, snr_db: float = SNR_DB) -> s
     rig = load_instrument(Path(__file__).parents[1] / "instrument.toml")
     radar = SimulatedRig(rig, decode_scene(SCENE, "static_chirps").with_disturbances(direct_snr_db=snr_db))
     board, chirp = radar.rig.by_name(board_name), radar.rig.chirp
-    setup, row = BoardSetup.of(radar.rig, board), 350
+    row = 350
+    setup = replace(BoardSetup.of(radar.rig, board), examined=row)
     report = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
     for at in range(0, positions, row):
         still = np.zeros(min(row, positions - at) * radar.rig.burst.pulses)

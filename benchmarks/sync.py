@@ -83,7 +83,7 @@ class Theirs:
                 recording = np.memmap(path, dtype=np.uint8, mode="r")
                 for i in self._chosen:
                     burst = method.decode(recording[i * size : (i + 1) * size], pulses)
-                    aligned.append(method.align(method.compensate(burst)))
+                    aligned.append(method.align(burst))
             with second.timed():
                 for mean in aligned:
                     method.reference(mean)

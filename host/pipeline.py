@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Unpack
 
 from polysight.host import calibration, imaging, materials, polarimetry, process, store, sync
 
@@ -14,22 +12,26 @@ from polysight.host import calibration, imaging, materials, polarimetry, process
 class Pipeline:
     """Processes one scan, row by row as they are committed, then to the end.
 
-    With `live`, the images so far can be looked at after every row at next to no cost (`images.current()`).
-    `depth_m` keeps what lies that much nearer or farther than the rig file says: plates are looked for there. With
-    `bands` above 1 that many sub-bands of the sweep are imaged too.
+    `choices` (`process.Choices`) say how far to look around the plane, which sub-bands, plane and pixels to image,
+    whether the images so far can be looked at after every row, and whether kept samples are read and written.
     """
 
-    def __init__(self, source: store.Source, live: bool = False, depth_m: float = 0.0, bands: int = 1) -> None:
+    def __init__(self, source: store.Source, **choices: Unpack[process.Choices]) -> None:
         self.source, self.calibration = source, calibration.of_scan(source)
         rig = self.calibration.rig(source.instrument)
-        self.rig = store.mirrored(rig) if source.mirrored else rig  # of the images: x from TX to RX
-        self.synchroniser = sync.RowSynchroniser(source, rig, self.calibration.high_passes(rig))
-        depth_m = max(depth_m, imaging.PLANE_REACH_M)
-        self.images = imaging.ImageBuilder(rig, live=live, depth_m=depth_m)
-        self.sub_bands, self.plane = imaging.SubBandImages(rig, bands, depth_m), imaging.UNKNOWN_PLANE
-        self.quality = process.Quality(rig, source)
+        filters, self.plane = self.calibration.high_passes(rig), imaging.UNKNOWN_PLANE
+        self.synchroniser, self.quality = sync.RowSynchroniser(source, rig, filters), process.Quality(rig, source)
+        self.samples = process.KeptSamples(source, rig, filters, self.quality, **choices)
+        self.images, self.sub_bands = self.samples.images, self.samples.sub_bands
+        self.rig = store.mirrored(self.images.rig) if source.mirrored else self.images.rig  # x from TX to RX
 
-    def add_row(self, row: int) -> dict[str, sync.SyncedRow]:
+    def add_row(self, row: int) -> None:
+        """Have one row of every board in the images: from kept samples, or from raw data."""
+        if not self.samples.restore(row):
+            self.synchronise_row(row)
+            self.samples.save(row)
+
+    def synchronise_row(self, row: int) -> dict[str, sync.SyncedRow]:
         """Read, synchronise and reduce one row of every board for the images; returns the synchronised rows."""
         synced: dict[str, sync.SyncedRow] = {}
         for board in self.quality.boards:
@@ -47,21 +49,13 @@ class Pipeline:
         """Both channels, flattened by their footprint, on the rig file's plane, not yet referenced to metal."""
         with self.quality.timed("image"):
             images = self.images.finish()
-        with self.quality.timed("point response"):
-            self.quality.note(imaging=imaging.imaging_facts(self.images, images))
         self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 
-    @property
-    def axes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pixel centres of the images, x and y, ascending."""
-        grid = self.images.grid
-        return (grid.y_m, grid.x_m) if self.source.mirrored else (grid.x_m, grid.y_m)
-
     def metal_plane(self, options: process.Options, in_scene: bool = False) -> polarimetry.PlaneReference | None:
         """Metal scanned on its own: as asked for, or as calibrated unless metal `in_scene` is named."""
-        in_scene = in_scene or options.metal_box_mm is not None
-        return self.calibration.metal_plane(self.rig, options.reference, in_scene, options.bands)
+        named = in_scene or options.metal_box_mm is not None
+        return self.calibration.metal_plane(self.rig, options.reference, named, options.bands)
 
     def place_plane(self, images: imaging.ChannelImages, move: bool = True) -> imaging.ChannelImages:
         """Find the plane that the plates lie on; the images on it. They stay as they are when `move` is False."""
@@ -106,9 +100,15 @@ class Pipeline:
         shown = found if verdict.usable else found.without_result()
         return process.Findings(images, shown, verdict, self.plane, classifier, plates)
 
-    def finish(self, out: Path, options: process.Options, plates: materials.Plates = ()) -> process.Products:
-        """Images, materials, verdict and report into `out`; the images are written first, and stay in any case."""
+    def finish(
+        self, out: Path, options: process.Options, plates: materials.Plates = (), tell: process.Tell = process.untold
+    ) -> process.Products:
+        """Images, then point response, materials, verdict and report into `out`; the images stay in any case."""
         images = self.form_images()
         process.save_images(out, self.source, self.rig, images, self.quality)
+        tell("point response")
+        self.quality.note_imaging(self.images, images)
+        tell("materials")
         findings = self.examine(images, options, plates)
+        tell("figures and report")
         return process.save_materials(out, self.source, self.rig, findings, options.unnamed(self.rig), self.quality)

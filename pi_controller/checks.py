@@ -273,10 +273,7 @@ def measure_calls(lines: GpiodLines, pairs: int = 500) -> list[int]:
     widths_ns = []
     for _ in range(pairs):
         lines.sleep_until(lines.now_ns() + PAUSE_NS)
-        before = lines.now_ns()
-        lines.set_output(False)
-        lines.set_output(False)
-        widths_ns.append(lines.now_ns() - before)
+        widths_ns.append(lines.measure())
     return sorted(widths_ns)
 
 

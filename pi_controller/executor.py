@@ -269,6 +269,7 @@ class Executor:
     def _begins_later(self, request: Request, run: m.BeginRun) -> bool:
         """Check a run. If a row runs, it is ended first, and the request is taken again then. Raises RefusedError."""
         check_run(run, self._machine.stage.config)
+        self._loop.check(self._burst_of(run))
         begun = self._run
         other = begun is not None and (run.scan_id, run.owner) != (begun.scan_id, begun.owner)
         if begun is not None and other and self._machine.host_lives:
@@ -327,8 +328,10 @@ class Executor:
             return self._accept()  # a repeated request: the row runs, or has run
         self._machine.require("RunRow")
         row = row_of(run.plan, command.row_index)
-        spec = BurstSpec(run.pulses, us_to_ns(run.period_us), us_to_ns(run.width_us), self._check_width)
-        return self._accept("RunRow", row, command.take, spec, run.speed_mm_s)
+        return self._accept("RunRow", row, command.take, self._burst_of(run), run.speed_mm_s)
+
+    def _burst_of(self, run: m.BeginRun) -> BurstSpec:
+        return BurstSpec(run.pulses, us_to_ns(run.period_us), us_to_ns(run.width_us), self._check_width)
 
     def _row_ended(self, row: tuple[int, int]) -> None:
         self._last_row = row

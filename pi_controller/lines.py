@@ -99,17 +99,13 @@ class Clock(Protocol):
         ...
 
 
-class TriggerLines(Clock, Protocol):
-    """Trigger input and SYNC_IN outputs. Every method raises DeviceError when the lines are gone."""
+class _Lines(Clock, Protocol):
+    """Trigger input and SYNC_IN. Every method raises DeviceError when the lines are gone."""
 
     name: str
 
     def wait_edge(self, limit_s: float) -> Edge | None:
         """The next rising edge of the trigger line, or None when none came within `limit_s` of wall time."""
-        ...
-
-    def set_output(self, active: bool) -> None:
-        """Set all SYNC_IN lines."""
         ...
 
     def flush(self) -> None:
@@ -121,8 +117,16 @@ class TriggerLines(Clock, Protocol):
         ...
 
 
+class PulseLines(_Lines, Protocol):
+    """Lines whose pulses this program makes, one by one."""
+
+    def pulse(self, width_ns: int) -> tuple[int, int]:
+        """Set all SYNC_IN lines and clear them, `width_ns` later or as soon as can be; the times before and after."""
+        ...
+
+
 @runtime_checkable
-class BitLines(TriggerLines, Protocol):
+class BitLines(_Lines, Protocol):
     """Lines whose bursts hardware clocks out, each in one piece."""
 
     bufsiz: int
@@ -130,3 +134,6 @@ class BitLines(TriggerLines, Protocol):
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
         """Send a burst; the times before and after. Raises DeviceError."""
         ...
+
+
+TriggerLines = PulseLines | BitLines

@@ -46,8 +46,16 @@ class WireLines:
                 return Edge(message.t_ns, self._seqno)
         return None
 
+    def pulse(self, width_ns: int) -> tuple[int, int]:
+        """Note a pulse on all output lines from wire time now on; :meth:`flush` sends it."""
+        begin_ns = self._now_ns
+        self.set_output(True)
+        self.sleep_until(begin_ns + width_ns)
+        self.set_output(False)
+        return begin_ns, self._now_ns
+
     def set_output(self, active: bool) -> None:
-        """Note the change of all output lines at wire time now; :meth:`flush` sends it."""
+        """Note the change of all output lines at wire time now."""
         if active != self._active:
             self._active = active
             self._unsent += [WireEdge(self._now_ns, line, int(active)) for line in self._outputs]

@@ -103,9 +103,6 @@ class SpiLines(TriggerInput):
         """Send a burst. Raises DeviceError."""
         return self._device.transfer(burst.data, burst.clock_hz)
 
-    def set_output(self, active: bool) -> None:
-        """MOSI is low whenever no transfer runs: there is nothing to set."""
-
     def close(self) -> None:
         """Lines released; MOSI is low."""
         try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import queue
+import termios
 import threading
 import time
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from polysight.shared.errors import DeviceError, ProtocolError
 from polysight.shared.faults import StageError, explain
 from polysight.shared.stage_line import MAX_LINE_BYTES, MAX_SEQUENCE, PROTOCOL_VERSION, Command, Immediate, Reply
 
-# Opening the port resets an UNO: its boot loader takes up to 2 s before the sketch sends its banner.
+# The first opening of the port resets an UNO: its boot loader takes up to 2 s before the sketch sends its banner.
 BANNER_LIMIT_S = 3.0
 # Longer than the longest line and its answer take at 115200 baud (14 ms), with room for a busy machine.
 ANSWER_LIMIT_S = 0.5
@@ -77,6 +78,13 @@ class StatusWatch:
         return silent_s if silent_s > self._silence_s else 0.0
 
 
+def _keep_dtr(port: int) -> None:
+    """Let DTR stay up when the port is closed: its rise resets an UNO, which would forget where the stage stands."""
+    settings = termios.tcgetattr(port)
+    settings[2] &= ~termios.HUPCL
+    termios.tcsetattr(port, termios.TCSANOW, settings)
+
+
 class StageLink:
     """One open serial link to `port`. Every method raises StageLostError when the stage does not answer.
 
@@ -106,7 +114,8 @@ class StageLink:
         self._news = news
         try:
             self._serial = serial.Serial(port, baud, timeout=read_slice_s, write_timeout=1.0, exclusive=True)
-        except (OSError, ValueError) as e:  # SerialException is an OSError
+            _keep_dtr(self._serial.fileno())
+        except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
             reason = os.strerror(e.errno) if isinstance(e, OSError) and e.errno else str(e)
             raise StageLostError(
                 f"stage port {port} cannot be opened: {reason}",

@@ -69,14 +69,10 @@ def send_burst(
             break
         deadline = start_ns + k * spec.period_ns
         lines.sleep_until(deadline)
-        rise = lines.now_ns()
-        if previous_rise_ns is not None and rise - previous_rise_ns < MIN_PERIOD_NS:
+        if previous_rise_ns is not None and lines.now_ns() - previous_rise_ns < MIN_PERIOD_NS:
             fault = PiFault.PERIOD_TOO_SHORT
             break
-        lines.set_output(True)
-        lines.sleep_until(rise + spec.width_ns)
-        lines.set_output(False)
-        end = lines.now_ns()
+        rise, end = lines.pulse(spec.width_ns)
         if k == 0:
             first = rise
         previous_rise_ns = last = rise
@@ -258,6 +254,11 @@ class TriggerLoop:
     def send(self, spec: BurstSpec) -> None:
         """Send one burst that no edge asks for, when the loop next looks up. Only while no row is armed."""
         self._bench = spec
+
+    def check(self, spec: BurstSpec) -> None:
+        """Raise ConfigError if the lines cannot send such a burst in one piece."""
+        if isinstance(self._lines, BitLines):
+            spi_burst(spec, self._lines.bufsiz)
 
     def timed_by(self, spec: BurstSpec) -> Timing:
         """What times the pulses of a burst."""

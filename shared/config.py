@@ -5,6 +5,7 @@ Unknown keys, wrong types and broken rules are refused with the file, the key, t
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -283,6 +284,9 @@ class Instrument(Section, frozen=True):
             " swallows every trigger; 0 switches it off",
         )
         names = [b.name for b in self.boards]
+        for name in names:  # folders of a scan are named after them
+            rule = "boards name must be 1..64 letters, digits, spaces, _ - or ., the first a letter, a digit or _"
+            require(re.fullmatch(r"\w[\w .-]{0,63}", name) is not None, f"{rule}: {name!r}")
         require(len(set(names)) == len(names), f"board names must differ: {names}")
         hosts = [(b.host_address, b.data_port) for b in self.boards]
         require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")

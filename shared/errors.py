@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+
 
 class PolysightError(Exception):
     """Base of every error this project raises on purpose.
@@ -36,6 +40,12 @@ def advice(*parts: str) -> str:
     return "; ".join(part for part in parts if part)
 
 
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """`did you mean 'step_mm'?`, of what is known; "" when nothing is like the word."""
+    near = get_close_matches(word, list(known), n=1, cutoff=0.7)
+    return f"did you mean {near[0]!r}?" if near else ""
+
+
 class ConfigError(PolysightError):
     """A configuration file has a wrong, missing or unknown key."""
 
@@ -46,6 +56,17 @@ class DataError(PolysightError):
     """A file or folder is not what it claims to be, or is damaged."""
 
     exit_status = 3
+
+
+def no_such(path: Path) -> DataError:
+    """The error for a path at which there is nothing."""
+    try:
+        near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()])
+    except OSError:
+        near = f"{path.parent} is not there either"
+    return DataError(
+        f"{path}: does not exist", "the path is wrong", near or "give the path of what was recorded or made"
+    )
 
 
 class ProtocolError(PolysightError):

@@ -127,7 +127,9 @@ EXPLANATIONS: dict[int, Explanation] = {
         "narrow the grid, or raise accel_mm_s2",
     ),
     StageError.SEQUENCE: Explanation("the sequence number is not the next one", "a line was lost", "say hello again"),
-    StageError.DISABLED: Explanation("the motors are switched off", "motor enable is off", "enable the motors"),
+    StageError.DISABLED: Explanation(
+        "the motors are switched off", "it was reset, or just switched on", "polysight-pi home"
+    ),
     PiFault.STAGE_LOST: Explanation(
         "the stage does not answer",
         "cable unplugged, board reset or wrong port",

@@ -5,16 +5,18 @@ Unknown keys, wrong types and broken rules are refused with the file, the key, t
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from polysight.shared.errors import ConfigError
+from polysight.shared.errors import ConfigError, did_you_mean
 
 T = TypeVar("T")
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+_RIG_KEYS = "instrument.toml in the repository shows every key with its meaning"
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
@@ -41,8 +43,10 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not valid TOML: {e}", "a typing error", "correct that line") from None
 
 
-def decode(raw: dict[str, Any], kind: type[T], source: str) -> T:
+def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T:
     """Check a parsed TOML or JSON table against a typed declaration.
+
+    `keys` says where its keys are explained; "" for the rig file.
 
     Raises
     ------
@@ -56,11 +60,31 @@ def decode(raw: dict[str, Any], kind: type[T], source: str) -> T:
         path = path.rstrip("`") or "$"
         value = _lookup(raw, path)
         key = path.removeprefix("$").lstrip(".") or "(top level)"
+        if unknown := re.search(r"unknown field `(.*)`", rule):
+            rule = f"no key {unknown[1]!r}: {_likelier(unknown[1], kind)}"
         raise ConfigError(
             f"{source}: {key}{' = ' + value if value else ''}: {rule}",
             "the file does not follow its declaration",
-            f"correct {key} in {source}; instrument.toml in the repository shows every key with its meaning",
+            f"correct {key} in {source}; {keys or _RIG_KEYS}",
         ) from None
+
+
+def _likelier(key: str, kind: Any) -> str:
+    """What to write instead of an unknown key: the table it belongs to, or a key like it."""
+    known: dict[str, set[str]] = {}
+    _collect(msgspec.inspect.type_info(kind), "", known)
+    if key in known:
+        return f"it belongs to {' or '.join(f'[{table}]' if table else 'the top' for table in sorted(known[key]))}"
+    return did_you_mean(key, known) or "nor one like it"
+
+
+def _collect(kind: Any, table: str, known: dict[str, set[str]]) -> None:
+    """Every key of a declaration, with the tables that hold it."""
+    for field in getattr(kind, "fields", ()):
+        known.setdefault(field.name, set()).add(table)
+        parts = [field.type, *getattr(field.type, "types", ()), *getattr(field.type, "item_types", ())]
+        for part in (*parts, getattr(field.type, "item_type", None), getattr(field.type, "value_type", None)):
+            _collect(part, f"{table}.{field.name}".lstrip("."), known)
 
 
 def to_builtins(config: Any) -> dict[str, Any]:

@@ -43,13 +43,20 @@ _LOG_LINES = 15
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 
-def under_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
+def _under_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
     """Let the host configure a rig's radars: each is reached at its card's address, receivers get a start offset."""
     names = [board["name"] for board in table["boards"]]
     table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}
     for board in table["boards"]:
         if board["role"] != "transmit" and not board["start_offset_hz"]:
             board["start_offset_hz"] = if_offset_hz or _NATIVE_OFFSET_HZ
+
+
+def _as_programmed(table: dict[str, Any], if_offset_hz: float) -> None:
+    """Have the rig file tell what somebody programmed the receivers with: the scene's offset, added to its own."""
+    for board in table["boards"]:
+        if board["role"] != "transmit":
+            board["start_offset_hz"] += if_offset_hz
 
 
 def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = False) -> Instrument:
@@ -66,7 +73,9 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     """
     table: dict[str, Any] = to_builtins(rig if scene is None else apply_scene(rig, scene))
     if native:
-        under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+        _under_native_control(table, _NATIVE_OFFSET_HZ if scene is None else scene.disturbances.if_offset_hz)
+    elif table["radar"]["control"] != "native" and scene is not None:
+        _as_programmed(table, scene.disturbances.if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
         table["radar"]["firmware"] = str(folder / IMAGE_FILE)  # the boards come with an empty flash
     table["stage"]["port"] = str(folder / "ttySTAGE")
@@ -239,7 +248,7 @@ def card_groups(rig: Instrument) -> list[str]:
 
 
 def _card_options(scene: Path | None, options: RigOptions) -> list[str]:
-    given = ["--scene", str(scene)] if scene is not None else []
+    given = ["--scene", str(scene), "--offset-in-rig"] if scene is not None else []
     given += ["--pattern"] if options.pattern else []
     given += ["--seed", str(options.seed)] if options.seed is not None else []
     given += ["--faults", str(options.faults)] if options.faults is not None else []

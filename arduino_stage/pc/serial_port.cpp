@@ -16,6 +16,11 @@ SerialPort::SerialPort(const std::string& link) : link_(link) {
     error_ = std::string("no pseudo terminal: ") + strerror(errno);
     return;
   }
+  termios t;
+  if (tcgetattr(master_, &t) == 0) {
+    t.c_cflag |= HUPCL;  // as a serial port has, and a pseudo terminal not
+    tcsetattr(master_, TCSANOW, &t);
+  }
   flush();
   watch_ = inotify_init1(IN_NONBLOCK | IN_CLOEXEC);
   if (inotify_add_watch(watch_, name, IN_OPEN | IN_CLOSE) < 0) {
@@ -36,14 +41,24 @@ SerialPort::~SerialPort() {
   if (master_ >= 0) close(master_);
 }
 
+// The kernel raises DTR when a serial port is opened, and lowers it at the last close unless HUPCL was taken away.
+void SerialPort::closed() {
+  termios t;
+  if (--clients_ == 0 && tcgetattr(master_, &t) == 0 && (t.c_cflag & HUPCL)) dtr_ = false;
+}
+
 bool SerialPort::opened() {
   alignas(inotify_event) char events[4096];
   bool anew = false;
   for (ssize_t n; (n = ::read(watch_, events, sizeof events)) > 0;) {
     for (char* p = events; p < events + n;) {
       const inotify_event* event = (const inotify_event*)p;
-      if (event->mask & IN_OPEN) anew |= clients_++ == 0;
-      if (event->mask & IN_CLOSE) clients_--;
+      if (event->mask & IN_OPEN) {
+        anew |= !dtr_;
+        dtr_ = true;
+        clients_++;
+      }
+      if (event->mask & IN_CLOSE) closed();
       p += sizeof(inotify_event) + event->len;
     }
   }

@@ -12,7 +12,7 @@ class SerialPort {
   int fd() const { return master_; }
   int watch_fd() const { return watch_; }  // readable when a client opens or closes the port
 
-  // Take note of opening and closing. True when the port was opened anew, however shortly it had been closed.
+  // Take note of opening and closing. True when DTR rose, which resets an UNO, however shortly it had been low.
   bool opened();
   // Whether a client held the port open when opened() was last called.
   bool is_open() const { return clients_ > 0; }
@@ -26,4 +26,7 @@ class SerialPort {
  private:
   std::string link_, error_;
   int master_ = -1, watch_ = -1, clients_ = 0;
+  bool dtr_ = false;
+
+  void closed();
 };

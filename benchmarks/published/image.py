@@ -1,7 +1,8 @@
-"""Imaging as published (paper, section 6.1): for each range bin and RX one full-size convolution with its kernel.
+"""Imaging as published (paper, section 6.1; the authors' `sum_bins`): one convolution for each range bin and RX.
 
 Range is read off the nearest bin of a zero-padded FFT of every position, and the kernel of a bin holds the phase of
-every pixel whose excess path falls into it. More points make finer bins, and more convolutions.
+every pixel whose excess path falls into it. Products are summed over the bins before one inverse transform an RX. More
+points make finer bins, and more convolutions.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ def form_image(
     points
         Points of the range FFT.
     tuned
-        The same convolutions in complex64 instead of the complex128 that NumPy makes of a kernel, padded to sizes
-        whose transforms are fast, and summed before the inverse transform.
+        The same convolutions padded to sizes whose transforms are fast, with a kernel's phases made once and not for
+        every bin, and one inverse transform for all RX.
 
     Returns
     -------
@@ -52,22 +53,22 @@ def form_image(
     x = _lattice(grid.x_m, columns)
     excess = Antennas.of(rig, board).excess_m(x[None, :], y[:, None], grid.z_m)
     start_hz = chirp.first_sample_hz + chirp.hz_per_sample * a
-    precision = np.complex64 if tuned else np.complex128
     full = rows + y.size - 1, columns + x.size - 1
     shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full) if tuned else full
     seen = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
-    image, total = np.zeros((ny, nx), precision), np.zeros(shape, precision)
+    image, total = np.zeros((ny, nx), np.complex64), np.zeros(shape, np.complex64)
     for rx in range(n_rx):
         spectrum = np.asarray(scipy.fft.fft(cube[rx, :, :, a:b], points))
         bins = np.round(excess[rx] / SPEED_OF_LIGHT_M_S * chirp.hz_per_sample * points).astype(int)
-        matched = np.exp(-2j * np.pi * start_hz / SPEED_OF_LIGHT_M_S * excess[rx]).astype(precision)
+        turns = (-2 * np.pi * start_hz / SPEED_OF_LIGHT_M_S * excess[rx]).astype(np.float32)
+        wave = np.exp(1j * turns) if tuned else None
         for n in range(int(bins.min()), int(bins.max()) + 1):
-            kernel = np.asarray(scipy.fft.fft2(np.where(bins == n, matched, 0), shape))
-            slab = np.asarray(scipy.fft.fft2(spectrum[:, :, n % points].astype(precision), shape))
-            if tuned:
-                total += kernel * slab
-            else:
-                image += np.asarray(scipy.fft.ifft2(kernel * slab))[seen]
+            kernel = np.where(bins == n, wave, 0) if wave is not None else np.exp(1j * turns) * (bins == n)
+            kernel = np.asarray(scipy.fft.fft2(kernel, shape))
+            total += kernel * np.asarray(scipy.fft.fft2(spectrum[:, :, n % points], shape))
+        if not tuned:
+            image += np.asarray(scipy.fft.ifft2(total))[seen]
+            total[:] = 0
     return np.asarray(scipy.fft.ifft2(total))[seen] if tuned else image
 
 

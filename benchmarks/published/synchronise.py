@@ -1,4 +1,4 @@
-"""Synchronisation as published (paper, section 5.2): position after position, by division and large transforms."""
+"""Synchronisation as published (paper, section 5.2; notebook 1): a loop over positions, division, transforms."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from polysight.shared.geometry import rx_positions_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Complex = NDArray[np.complexfloating]
-FFT = 16_384
-ZOOM, TUNED_ZOOM = 4_096, 512  # points of a zoom transform; the published size is not stated (docs/benchmarks.md)
+UPSCALE = 64  # alignment transforms are so many times longer than a chirp
+RANGE_BINS = 1024  # of the spectra in which the direct path is looked for
+ZOOM = 100  # points of the closer look, over two bins
+SYNC_RX = 0  # alignment looks at this channel alone
 
 
 class Synchroniser:
@@ -24,108 +26,108 @@ class Synchroniser:
     rig, board
         Rig file and one of its receiving boards: the linear samples, and where the direct path comes from.
     tuned
-        The same steps in complex64 instead of the complex128 that NumPy makes of int16 `I + 1j * Q`, smaller zooms, and
-        one transform of the RX's sum instead of the sum of their transforms.
+        The same numbers without what is done twice or too precisely: single precision throughout, I and Q copied
+        instead of multiplied, transforms without their reordering, one transform of the RX's sum instead of one of
+        each, and the closer look as a product with a matrix that is made once.
     """
 
     def __init__(self, rig: Instrument, board: Board, tuned: bool = False) -> None:
         chirp, self._tuned = rig.chirp, tuned
-        self._type, self._zoom = (np.complex64, TUNED_ZOOM) if tuned else (np.complex128, ZOOM)
-        self._chirp, (self._a, self._b) = chirp, chirp.linear_samples
-        sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+        self._samples, (self._a, self._b) = chirp.samples, chirp.linear_samples
+        middle = chirp.first_sample_hz + chirp.hz_per_sample * chirp.samples / 2
         tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
         path = np.linalg.norm(rx - tx, axis=-1)
-        turns = np.outer(path - path[0], sweep) / SPEED_OF_LIGHT_M_S
-        self._steering = np.exp(-2j * np.pi * turns).astype(self._type)
+        self._beam = np.exp(-2j * np.pi * middle / SPEED_OF_LIGHT_M_S * (path - path[0])).astype(np.complex64)
         self._n = np.arange(chirp.samples)
-        t = chirp.sample_rate_hz
-        f = np.fft.fftfreq(chirp.samples, 1 / t)
-        f = np.where(f < 0, f + t, f) if chirp.if_mode == "complex1x" else f
-        h = np.ones(f.shape, complex)
-        for corner_hz in (khz * 1e3 for khz in (chirp.hpf1_khz, chirp.hpf2_khz) if khz):
-            h *= (1j * f / corner_hz) / (1 + 1j * f / corner_hz)
-        self._unfilter = (h.conj() / np.maximum(np.abs(h) ** 2, 1 / 16)).astype(self._type)
+        self._n_single = self._n.astype(np.float32)
+        self._wide = scipy.signal.ZoomFFT(self._b - self._a, [0, RANGE_BINS], RANGE_BINS, fs=RANGE_BINS)
+        fine = (2 * np.arange(ZOOM) / ZOOM - 1) / RANGE_BINS
+        self._fine = np.exp(-2j * np.pi * np.outer(np.arange(self._b - self._a), fine)).astype(np.complex64)
 
     def decode(self, payload: NDArray[np.uint8], chirps: int) -> Complex:
-        """One position's bytes to complex [chirp, rx, sample]: I of RX1..RX4, then Q, for every sample."""
-        words = payload.view("<i2").reshape(chirps, self._chirp.samples, 2, -1)
-        return (words[:, :, 0] + 1j * words[:, :, 1]).astype(self._type).transpose(0, 2, 1)
+        """One position's bytes to complex64 [rx, chirp, sample]: I of RX1..RX4, then Q, for every sample."""
+        words = payload.view("<i2").reshape(chirps, self._samples, 2, -1)
+        if not self._tuned:
+            return (words[:, :, 0] + 1j * words[:, :, 1]).astype(np.complex64).transpose(2, 0, 1)
+        out = np.empty((words.shape[-1], chirps, self._samples), np.complex64)
+        out.real, out.imag = words.transpose(2, 3, 0, 1)
+        return out
 
     def align(self, chirps: Complex) -> Complex:
-        """Every chirp turned into the first one's frequency and phase, then the mean.
+        """Every chirp turned into the strongest one's frequency and phase, then the mean, complex64 [rx, sample].
 
-        The quotient of two chirps is a tone (paper, equation 4): its frequency and phase are read off the largest of
-        16,384 points, summed over the RX, which share a clock.
+        The quotient of two chirps is a tone (paper, equation 4): its frequency and phase are read off the largest
+        point of a transform of one RX, and hold for all of them, which share a clock.
 
         Parameters
         ----------
         chirps
-            complex [chirp, rx, sample].
-
-        Returns
-        -------
-        complex [rx, sample].
+            complex64 [rx, chirp, sample].
         """
-        total = chirps[0].copy()
-        for chirp, (frequency, phase) in zip(chirps[1:], self.offsets(chirps)[1:], strict=True):
-            total += chirp * np.exp(-1j * (2 * np.pi * frequency * self._n + phase)).astype(self._type)
-        return total / len(chirps)
+        frequency, phase = (part[:, None] for part in self.offsets(chirps))
+        if self._tuned:
+            turns = np.float32(2 * np.pi) * frequency.astype(np.float32) * self._n_single + phase.astype(np.float32)
+            turn = np.empty(turns.shape, np.complex64)
+            turn.real, turn.imag = np.cos(turns), -np.sin(turns)
+            return (chirps * turn).mean(axis=1)
+        out = np.empty_like(chirps)
+        for rx, channel in enumerate(chirps):  # each makes the same factors again, in double precision
+            out[rx] = channel * np.exp(-1j * (2 * np.pi * frequency * self._n + phase))
+        return out.mean(axis=1)
 
-    def offsets(self, chirps: Complex) -> list[tuple[float, float]]:
-        """Frequency (cycles a sample) and phase (rad at the first linear sample) of each chirp against the first."""
-        reference = chirps[0, :, self._a : self._b]
-        found = [(0.0, 0.0)]
-        for chirp in chirps[1:]:
-            quotient = chirp[:, self._a : self._b] / reference
-            if self._tuned:
-                quotient = quotient.sum(axis=0, keepdims=True)
-            spectrum = np.asarray(scipy.fft.fft(quotient, FFT)).sum(axis=0)
-            peak = int(np.argmax(np.abs(spectrum)))
-            frequency = (peak if peak < FFT // 2 else peak - FFT) / FFT
-            found.append((frequency, float(np.angle(spectrum[peak])) - 2 * np.pi * frequency * self._a))
-        return found
-
-    def compensate(self, chirps: Complex) -> Complex:
-        """The high-pass filter taken out of every chirp; the paper does this first."""
-        spectrum = np.asarray(scipy.fft.fft(chirps))
-        spectrum *= self._unfilter
-        return np.asarray(scipy.fft.ifft(spectrum))
+    def offsets(self, chirps: Complex) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Frequency (cycles a sample) and phase (rad at the first sample) of each chirp against the strongest."""
+        channel = chirps[SYNC_RX]
+        reference = channel[np.abs(channel).sum(axis=1).argmax()].copy()
+        reference[np.abs(reference) < 0.1] = 0.1
+        points = UPSCALE * self._samples
+        if self._tuned:
+            spectra = np.asarray(scipy.fft.fft(channel / reference, points))
+            peaks = (spectra.real**2 + spectra.imag**2).argmax(axis=1)
+            frequency = np.where(peaks < points // 2, peaks, peaks - points) / points
+        else:
+            spectra = np.fft.fftshift(np.fft.fft(channel / reference, points), -1)
+            peaks = np.abs(spectra).argmax(axis=1)
+            frequency = (peaks - points / 2) / points
+        return frequency, np.angle(spectra[np.arange(len(peaks)), peaks])
 
     def reference(self, mean: Complex) -> tuple[Complex, float]:
         """A position's samples with the direct path's frequency and phase taken out of every RX.
 
-        The RX are steered to the direct path and summed; the peak of 16,384 points is found and looked at twice more
-        closely.
+        The RX's spectra are steered to the direct path and summed; the first peak of 1,024 points is looked at
+        more closely, and the phase is read off a spectrum of the result.
 
         Parameters
         ----------
         mean
-            complex [rx, sample].
+            complex64 [rx, sample].
 
         Returns
         -------
         complex [rx, sample], and the direct path's phase (rad) at the first linear sample.
         """
-        beam = (mean * self._steering).mean(axis=0)[self._a : self._b]
-        peak = int(np.argmax(np.abs(np.asarray(scipy.fft.fft(beam, FFT)))))
-        frequency, width = peak / FFT, 1 / FFT
-        value = 0j
-        for _ in range(2):
-            near = scipy.signal.zoom_fft(beam, [frequency - width, frequency + width], self._zoom, fs=1, endpoint=True)
-            best = int(np.argmax(np.abs(near)))
-            frequency += width * (2 * best / (self._zoom - 1) - 1)
-            width /= self._zoom / 4
-            value = near[best]
-        phase = float(np.angle(value))
-        turn = np.exp(-1j * (2 * np.pi * frequency * (self._n - self._a) + phase)).astype(self._type)
-        return mean * self._steering * turn, phase
+        linear = mean[:, self._a : self._b]
+        beam = self._beam @ linear if self._tuned else None
+        spectrum = self._beam @ self._wide(linear) if beam is None else np.asarray(scipy.fft.fft(beam, RANGE_BINS))
+        power = np.abs(spectrum)
+        peaks, _ = scipy.signal.find_peaks(power, height=power.max() / 2, distance=2)
+        best = int(peaks[0] if len(peaks) else power.argmax())
+        if beam is not None:
+            turned = beam * np.exp(np.float32(-2 * np.pi * best / RANGE_BINS) * 1j * self._n_single[: len(beam)])
+            frequency = (best + 2 * int(np.abs(turned @ self._fine).argmax()) / ZOOM - 1) / RANGE_BINS
+            turn = np.exp(np.float32(-2 * np.pi * frequency) * 1j * (self._n_single - self._a))
+            phase = float(np.angle(beam @ turn[self._a : self._b]))
+            return mean * turn * (self._beam * np.exp(-1j * phase)).astype(np.complex64)[:, None], phase
+        near = scipy.signal.ZoomFFT(linear.shape[1], [best - 1, best + 1], ZOOM, fs=RANGE_BINS)
+        frequency = (best + 2 * int(np.abs(self._beam @ near(linear)).argmax()) / ZOOM - 1) / RANGE_BINS
+        moved = (mean * np.exp(-2j * np.pi * frequency * (self._n - self._a))).astype(np.complex64)
+        again = self._beam @ np.fft.fft(moved[:, self._a : self._b], RANGE_BINS)
+        phase = float(np.angle(again[0]))
+        return moved * (self._beam * np.exp(-1j * phase)).astype(np.complex64)[:, None], phase
 
     def row(self, payload: NDArray[np.uint8], positions: int) -> Complex:
         """All steps for the positions of a row: bytes to complex [rx, position, sample]."""
         size = payload.size // positions
-        chirps = size // (self._chirp.samples * 4 * len(self._steering))
-        done = []
-        for i in range(positions):
-            burst = self.compensate(self.decode(payload[i * size : (i + 1) * size], chirps))
-            done.append(self.reference(self.align(burst))[0])
-        return np.stack(done, axis=1)
+        chirps = size // (self._samples * 4 * len(self._beam))
+        bursts = (self.decode(payload[i * size : (i + 1) * size], chirps) for i in range(positions))
+        return np.stack([self.reference(self.align(burst))[0] for burst in bursts], axis=1)

@@ -37,14 +37,14 @@ class Processing:
     @cached_property
     def pipeline(self) -> Pipeline:
         """The pipeline, without rows at first. Raises PolysightError when calibration and rig do not fit."""
-        return Pipeline(self.source, bands=self.options.bands)
+        return Pipeline(self.source, bands=self.options.bands, samples="read")
 
     @cached_property
     def _images(self) -> ChannelImages:
         """Both channels from all rows that hold data. Raises DataError when there are none."""
-        if isinstance(self.source, ScanFolder):
-            require_raw(self.source)
         rows = list(self.source.rows())
+        if isinstance(self.source, ScanFolder) and not self.pipeline.samples.holds(rows):
+            require_raw(self.source)
         if not rows:
             raise DataError(
                 f"{self.folder}: no row is recorded whole",
@@ -53,7 +53,9 @@ class Processing:
             )
         for row in rows:
             self.pipeline.add_row(row)
-        return self.pipeline.form_images()
+        images = self.pipeline.form_images()
+        self.pipeline.quality.note_imaging(self.pipeline.images, images)
+        return images
 
     @cached_property
     def unreferenced(self) -> ProcessedScan:

@@ -16,7 +16,7 @@ import msgspec
 
 from polysight.host.calibration.files import FilterFile, MetalFile, PlacesFile, places_crc32, read
 from polysight.host.imaging import ImagedWith, image_grid
-from polysight.host.store import MANIFEST, ScanFolder, manifest
+from polysight.host.store import MANIFEST, ScanFolder, inside, manifest
 from polysight.shared.config import Board, Instrument, MountStep
 from polysight.shared.errors import ConfigError, DataError
 from polysight.shared.tables import to_builtins
@@ -180,7 +180,7 @@ def of_scan(scan: Any) -> Calibration:
         return of_rig(scan.instrument)
     paths = {}
     for kind, fact in recorded.items():
-        path = paths[kind] = scan.path / fact["file"]
+        path = paths[kind] = inside(scan.path, fact["file"])
         if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != fact["crc32"]:
             raise DataError(
                 f"{path}: absent, or not the calibration that the scan was taken with",

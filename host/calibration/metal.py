@@ -17,6 +17,7 @@ import numpy.typing as npt
 from polysight.host.calibration.files import MetalBand, MetalFile, SourceScan, head, write
 from polysight.host.imaging import SubBand
 from polysight.host.polarimetry import PlaneReference
+from polysight.host.store import open_npz
 from polysight.shared.errors import DataError, DeviceError
 
 IMAGES = ("h", "v", "valid")
@@ -91,7 +92,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
             "the two files were parted",
             "copy both, or calibrate again",
         )
-    with np.load(images, allow_pickle=False) as f:
+    with open_npz(images) as f:
         arrays: dict[str, npt.NDArray] = dict(f)
     whole = PlaneReference(
         *(arrays[name] for name in IMAGES),

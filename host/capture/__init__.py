@@ -8,6 +8,7 @@ payload into samples. `inspect_bin` and `inspect_pcap` say what is in any record
 from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.host.capture.dca1000 import CARD_SOURCE_PORT, MAX_PAYLOAD_BYTES, Code, Status, Version
 from polysight.host.capture.decode import decode_row, raw_words, row_words, valid_frames
+from polysight.host.capture.file_kinds import kind_of
 from polysight.host.capture.inspect import CardReport, Known, Report, inspect_bin
 from polysight.host.capture.network import check_receive_buffer, route_interface, silent_radar
 from polysight.host.capture.packet_file import PACKETS, Evidence, read_packets, write_packets
@@ -43,6 +44,7 @@ __all__ = [
     "inspect_bin",
     "inspect_pcap",
     "is_pcap",
+    "kind_of",
     "place_record",
     "program_eeprom",
     "raw_words",

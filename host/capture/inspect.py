@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
+from polysight.host.capture.file_kinds import MAGIC
 from polysight.host.capture.layouts import (
     SAMPLES_TRIED,
     Guess,
@@ -38,12 +39,6 @@ _MUCH_DC = 0.05 * _FULL_SCALE
 _CLEARLY = 0.08  # so much less disorder in another layout contradicts the one that was given
 _WHITE = 0.94  # of the disorder of white noise
 _UNIFORM = 0.45 * _FULL_SCALE  # standard deviation of values that fill the whole range
-_MAGIC = {
-    b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
-    b"PK\x03\x04": "an archive (zip)", b"\x1f\x8b": "compressed (gzip)", b"\x89HDF": "HDF5",
-    b"BZh": "compressed (bzip2)", b"\xfd7zXZ": "compressed (xz)", b"\x93NUMPY": "a numpy array",
-    b"RIFF": "sound or video (RIFF)",
-}  # fmt: skip
 
 
 def is_mirrored(power: NDArray[np.float64]) -> bool:
@@ -254,7 +249,7 @@ def _contradiction(values: NDArray[np.uint8], shape: Shape) -> list[str]:
 def _not_a_capture(payload: NDArray[np.uint8], words: NDArray[np.int16], guesses: list[Guess]) -> str:
     """Why these bytes were not written by a card; "" when they may have been."""
     head = payload[:8].tobytes()
-    for magic, kind in _MAGIC.items():
+    for magic, kind in MAGIC.items():
         if head.startswith(magic):
             return f"it begins as {kind}"
     if not (words != words[:1]).any():

@@ -125,6 +125,8 @@ def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
 def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
     """The log again. Raises ValueError where payload is missing."""
     many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
+    if expected != row.size or not PacketLog.would_keep(expected, int((many * sizes).sum())) or (sizes == 0).any():
+        raise ValueError("it is of another row, or of more payload than a receiver keeps")
     nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
     each = np.repeat(sizes, many)
     parts = []

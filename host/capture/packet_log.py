@@ -113,6 +113,11 @@ class PacketLog:
         self.payload = grown
         return True
 
+    @staticmethod
+    def would_keep(expected: int, payload_bytes: int) -> bool:
+        """Whether so much payload of a row is ever kept."""
+        return payload_bytes <= _MOST * (expected + _SPARE_BYTES)
+
     def _note(self, t_ns: int) -> None:
         if self._noted + 2 > len(self._batches):
             self._batches = _doubled(self._batches, 2)

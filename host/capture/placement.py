@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from polysight.host.capture.dca1000 import Counters
 from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.next_record import past_after
+from polysight.host.capture.packet_counts import PacketCounts, count_packets
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.record_search import Found, find_record
 
@@ -23,28 +24,7 @@ Gap = tuple[int, int]
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-
-
-@dataclass
-class PacketCounts:
-    """Packets of one row by what became of them: every packet is in exactly one of the first eight.
-
-    The others say more about some of them.
-    """
-
-    placed: int = 0
-    duplicates: int = 0  # every byte was there already, and the same
-    conflicting: int = 0  # other bytes than another packet of the same counters: both are masked where they overlap
-    leftover: int = 0  # of a record before this one
-    restarted: int = 0  # of counters that began anew within the row
-    outside: int = 0  # after the record's last expected byte, or not kept for want of memory
-    disagreeing: int = 0  # byte count and sequence contradict each other
-    malformed: int = 0  # no payload, or longer than the card's packets
-    late: int = 0  # placed, after a packet that follows it
-    late_by_bytes: int = 0  # how far the latest of them was behind
-    short: int = 0  # placed, not full; a healthy record has one at most, its last
-    before_pulses: int = 0  # leftover, known by having come before the row's first pulse
-    clock_jumps: int = 0  # times at which the clock of the arrivals went backwards
+_ANEW = "the card began anew"
 
 
 @dataclass(frozen=True)
@@ -72,7 +52,7 @@ class Placed:
     conflicts
         Byte ranges of which packets brought different bytes; they are missing.
     holes
-        Byte ranges below the furthest byte that did not come, in the order in which the card sent the bytes.
+        Byte ranges below the furthest byte that did not come or are in conflict, in the order in which the card sent.
     slipped
         Whether it is only not located because frames may be missing before any byte of it: missed triggers.
     at
@@ -156,15 +136,17 @@ def place_record(
     """
     past = past or Past()
     found = find_record(log, frame_bytes, past, not_before_ns)
-    row = _Row(log, found)
+    row = _Row(log, found, past)
     located, reason = found.located, found.reason
     if dropped_by_card:
         located, reason = False, f"the card dropped data before numbering it ({dropped_by_card})"
     row.put_in_place()
     if located and row.conflicts and not found.foreseen:
         located, reason = False, "packets with the same counters brought different bytes: the card may have begun anew"
-    holes = _gaps(row.covered, row.extent)
-    missing = _merged([*holes, *row.conflicts, *([(row.extent, log.expected)] if row.extent < log.expected else [])])
+    if not located and row.counts.restarted and _ANEW not in reason:
+        reason = f"{_ANEW} within it" + (f"; {reason}" if found.certain else "")
+    holes = _merged([*_gaps(row.covered, row.extent), *row.conflicts])
+    missing = _merged([*holes, *([(row.extent, log.expected)] if row.extent < log.expected else [])])
     out = row.bytes(missing if located else holes)
     placed = Placed(
         log.expected,
@@ -179,7 +161,10 @@ def place_record(
         row.arrivals(),
         _merged(row.conflicts),
         holes,
-        slipped=not located and (found.certain or found.fresh) and row.extent > 0 and not dropped_by_card,
+        slipped=not located
+        and (found.certain or (found.fresh and not row.counts.restarted))
+        and row.extent > 0
+        and not dropped_by_card,
         _full=found.full,
     )
     return placed, out
@@ -203,8 +188,8 @@ def preview(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int) ->
 class _Row:
     """The packets of the record, put in place."""
 
-    def __init__(self, log: PacketLog, found: Found) -> None:
-        self._log, self._found = log, found
+    def __init__(self, log: PacketLog, found: Found, past: Past) -> None:
+        self._log, self._found, self._past = log, found, past
         self._sizes, self._starts = log.sizes, np.cumsum(log.sizes) - log.sizes
         kept = np.arange(log.count) < log.kept
         self._own = found.own & (found.offsets < log.expected) & kept
@@ -212,14 +197,16 @@ class _Row:
         self.covered: list[Gap] = []  # sorted, joined
         self.conflicts: list[Gap] = []
         self.received = self.extent = 0
-        self.counts = PacketCounts(malformed=log.malformed, clock_jumps=found.clock_jumps)
         self._stops = np.minimum(found.offsets + self._sizes, log.expected)
-        self._placed = np.zeros(log.count, dtype=np.bool_)
+        self._placed, self._duplicate, self._conflicting = np.zeros((3, log.count), dtype=np.bool_)
+        self.counts = PacketCounts()
 
     def put_in_place(self) -> None:
         """Decide which packets are placed, and compare those that overlap."""
         self._place()
-        self._count_others()
+        self.counts = count_packets(
+            self._log, self._found, self._past, self._placed, self._duplicate, self._conflicting
+        )
         mine = np.flatnonzero(self._placed)
         if not mine.size:
             return
@@ -231,7 +218,7 @@ class _Row:
         self.extent, self.received = int(b[-1]), sum(stop - start for start, stop in self.covered)
         reached = np.maximum.accumulate(np.append(0, stops))[:-1]
         behind = reached - starts
-        self.counts.placed, self.counts.late = mine.size, int((behind > 0).sum())
+        self.counts.late = int((behind > 0).sum())
         self.counts.late_by_bytes = max(0, int(behind.max()))
         self.counts.short = int((self._sizes[mine] < self._found.full).sum())
 
@@ -259,43 +246,17 @@ class _Row:
             both = min(int(self._stops[k]), int(self._stops[longest])) - offset
             if not np.array_equal(self._payload(k)[:both], self._payload(longest)[:both]):
                 self.conflicts.append((offset, offset + both))
-                self.counts.conflicting += 1
-                self._placed[k], self.at[k] = False, -1
+                self._placed[k], self._conflicting[k], self.at[k] = False, True, -1
                 if self._stops[k] > self._stops[longest]:
                     self.conflicts.append((offset, int(self._stops[k])))
                     self.conflicts.append((offset, int(self._stops[longest])))
             elif self._stops[k] > self._stops[longest]:
                 longest = k
             else:
-                self.counts.duplicates += 1
-                self._placed[k] = False
+                self._placed[k], self._duplicate[k] = False, True
 
     def _payload(self, k: int) -> Bytes:
         return self._log.payload[self._starts[k] : self._starts[k] + self._sizes[k]]
-
-    def _count_others(self) -> None:
-        """Name what became of the packets that are not the record's."""
-        f, log, c = self._found, self._log, self.counts
-        left = f.early | f.old
-        c.before_pulses = int(f.early.sum())
-        rest = ~left & ~self._own
-        if rest.any():
-            outside = rest & f.own  # behind the row's last byte, or not kept
-            before = rest & ~outside & (f.offsets < 0) & (f.steps < 0)
-            anew = rest & ~outside & self._began_anew()
-            beyond = rest & ~outside & ~anew & (f.offsets >= log.expected) & (f.steps > 0)
-            near = beyond & (f.offsets < 2 * log.expected)
-            left |= before & ~anew
-            outside |= near
-            c.restarted, c.outside = int(anew.sum()), int(outside.sum())
-            c.disagreeing = int((rest & ~outside & ~anew & ~left).sum())
-        c.leftover = int(left.sum())
-
-    def _began_anew(self) -> Flags:
-        """Which packets, behind one of the record, have the counters of a card that was reset: sequence 1 at byte 0."""
-        log, counts, index = self._log, self._log.byte_counts, np.arange(self._log.count)
-        fresh = (counts == self._found.full * (log.sequences - 1)) & (counts < log.expected)
-        return fresh & (index > np.argmax(self._own)) if self._own.any() else fresh
 
     def arrivals(self) -> Counts:
         """When batches of packets came, and up to which byte the row was there then."""

@@ -108,7 +108,7 @@ class RowCapture(_Words, frozen=True):
 
     `bytes` is what was placed, `missing` the byte ranges that are not (the whole row when `located` is false).
     Arrival times are the host's monotonic clock, 0 when no packet came. Counts of packets as in
-    :class:`polysight.host.capture.placement.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
+    :class:`polysight.host.capture.packet_counts.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
     :class:`polysight.host.capture.placement.Losses`. `card_status` is what the card reported by itself during the row.
     `holes` and `slipped` as in :class:`polysight.host.capture.placement.Placed`.
     """

@@ -58,6 +58,8 @@ class Found:
         Times at which the clock of the arrivals went backwards; then arrival decides nothing.
     restarted
         Whether the card may have begun anew just before it: then it ends where its last packet does.
+    again
+        bool [packet]: has counters that came before, and is no copy by what is known; None when there is none.
     """
 
     base: Counters | None
@@ -76,6 +78,7 @@ class Found:
     foreseen: bool = False
     clock_jumps: int = 0
     restarted: bool = False
+    again: Flags | None = None
 
 
 @dataclass(frozen=True)
@@ -127,10 +130,11 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
         # Counters that came already, in a row that lacks its end: copies on a slow path, or the card began anew.
         if found is not None and found.located:
             why = "packets with counters that came before, and the end is not there: the card may have begun anew"
-            return replace(found, located=False, certain=False, reason=why, restarted=True)
+            return replace(found, located=False, certain=False, reason=why, restarted=True, again=again)
         unknown = Past(spans=past.spans, joint=past.joint, joined=past.joined, unseen=True, anew=past.anew)
         packets = CounterView(log, Counters(int(log.byte_counts[again][0]), int(log.sequences[again][0])), full)
-        found = _found(packets, live | again, log.expected, frame_bytes, unknown, replace(sorted_out, old=old & ~again))
+        sorted_out = replace(sorted_out, old=old & ~again, again=again)
+        found = _found(packets, live | again, log.expected, frame_bytes, unknown, sorted_out)
     if found is None:
         why = "every packet is of an earlier record, by its counters or because it came before the first pulse"
         return replace(sorted_out, reason=why)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,9 +56,11 @@ def _process(args: argparse.Namespace) -> int:
 
 
 def _image(args: argparse.Namespace) -> int:
+    from polysight.host.imaging import View
     from polysight.host.jobs.process import image
 
-    return image(args.data, args.out, rig_file(args.config, args.data))
+    view = View(args.depth, *(args.grid or (None, None, None)))
+    return image(args.data, args.out, rig_file(args.config, args.data), view)
 
 
 def _focus(args: argparse.Namespace) -> int:
@@ -83,6 +86,8 @@ def add_commands(add: Add) -> None:
         if name == "process":
             add_material_options(sub)
             _add_polarimetry_options(sub)
+        else:
+            _add_view_options(sub)
     sub = add(
         "focus",
         _focus,
@@ -142,6 +147,32 @@ def _add_data_arguments(sub: argparse.ArgumentParser, several: bool) -> None:
     many.add_argument("--again", action="store_true", help="process scans again that are finished")
     many.add_argument(
         "--dask", metavar="ADDRESS", help="on a Dask cluster, e.g. tcp://host:8786, whose workers see the same folders"
+    )
+
+
+def grid(text: str) -> tuple[int, int, float]:
+    """`COLUMNSxROWS@MM`: pixels and their distance."""
+    words = re.fullmatch(r"(\d{1,4})x(\d{1,4})@(\d+(?:\.\d+)?)", text)
+    columns, rows, pixel_mm = (int(words[1]), int(words[2]), float(words[3])) if words else (0, 0, 0.0)
+    if min(columns, rows) < 2 or pixel_mm <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: a grid is COLUMNSxROWS@MM, for example 300x300@1")
+    return columns, rows, pixel_mm
+
+
+def _add_view_options(sub: argparse.ArgumentParser) -> None:
+    """`--depth` and `--grid` of `polysight image`."""
+    sub.add_argument(
+        "--depth",
+        type=float,
+        default=0.0,
+        metavar="MM",
+        help="image a plane that lies so much farther than the rig file's, or nearer below 0 (default: 0)",
+    )
+    sub.add_argument(
+        "--grid",
+        type=grid,
+        metavar="COLUMNSxROWS@MM",
+        help="pixels, and their distance in mm, about the same centre (default: the rig file's)",
     )
 
 

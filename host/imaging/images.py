@@ -85,6 +85,34 @@ class ChannelImages:
         return levelled(self.h, self.v, self.lit, [plate], [self.lit.rise(self.h, self.v, plate)])
 
 
+@dataclass(frozen=True)
+class View:
+    """Another plane and other pixels than the rig file's; None: as there. A plane lies `depth_mm` farther."""
+
+    depth_mm: float = 0.0
+    columns: int | None = None
+    rows: int | None = None
+    pixel_mm: float | None = None
+
+    def of(self, rig: Instrument, swapped: bool = False) -> Instrument:
+        """The rig with this plane and these pixels; `swapped`: its x is the image's y."""
+        columns, rows = (self.rows, self.columns) if swapped else (self.columns, self.rows)
+        wanted = {"columns": columns, "rows": rows, "pixel_mm": self.pixel_mm}
+        image = msgspec.structs.replace(rig.image, **{k: v for k, v in wanted.items() if v is not None})
+        distance = rig.geometry.object_distance_mm + self.depth_mm
+        geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=distance)
+        return msgspec.structs.replace(rig, image=image, geometry=geometry)
+
+
+AS_IN_RIG_FILE = View()
+
+
+def needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
+    """Smallest and largest excess path of a rig's image, `depth_m` nearer or farther."""
+    antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
+    return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
+
+
 class ImageBuilder:
     """Collects rows in any order, and forms the images of those it has.
 
@@ -105,6 +133,8 @@ class ImageBuilder:
         nothing after each; and make the kernels of the final image beforehand.
     depth_m
         Keep echoes of a scene that may lie this much nearer or farther than the rig file says, for autofocus.
+    gate_m
+        Excess paths to keep, as samples kept earlier have them; None: those that grid and `depth_m` need.
     """
 
     def __init__(
@@ -114,14 +144,15 @@ class ImageBuilder:
         taper: Window | None = None,
         live: bool = False,
         depth_m: float = 0.0,
+        gate_m: tuple[float, float] | None = None,
     ) -> None:
-        self.grid = image_grid(rig)
+        self.rig, self.grid = rig, image_grid(rig)
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
-        gate = scene_gate_m(antennas, plan, self.grid, depth_m)
+        self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m
         taper = TAPERS[rig.image.apodisation] if taper is None else taper
         weights = np.outer(window_weights(taper, plan.rows), window_weights(taper, plan.columns)).astype(np.float32)
-        gated = reduction(rig.chirp, gate, window)
+        gated = reduction(rig.chirp, self.gate_m, window)
         self._antennas, self._middle_hz = antennas, float(np.mean(gated.frequencies_hz))
         self.boards = {b.name: BoardSamples(rig, b, self.grid, gated, weights, live) for b in rig.receivers}
 
@@ -225,13 +256,13 @@ class SubBandImages:
         The scan's rig file.
     count
         Sub-bands; 1: none, the image of the whole sweep is enough.
-    depth_m
+    gate_m
         As of the image of the whole sweep.
     """
 
-    def __init__(self, rig: Instrument, count: int, depth_m: float = 0.0) -> None:
+    def __init__(self, rig: Instrument, count: int, gate_m: tuple[float, float] | None = None) -> None:
         self.bands = sub_bands(rig.chirp, count) if count > 1 else ()
-        self.builders = tuple(ImageBuilder(_part(rig, band), depth_m=depth_m) for band in self.bands)
+        self.builders = tuple(ImageBuilder(_part(rig, band), gate_m=gate_m) for band in self.bands)
 
     def add_row(self, board_name: str, row_index: int, row: SyncedRow) -> None:
         """Take in one synchronised row of one board; a row taken again replaces the earlier take."""

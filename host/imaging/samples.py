@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,17 @@ def mirror_samples(antennas: Antennas, z_m: float, chirp: Chirp) -> NDArray[np.c
 def mirror_reduced(antennas: Antennas, z_m: float, chirp: Chirp, reduction: Reduction) -> NDArray[np.complex128]:
     """The same after the range gate, [rx, frequency]."""
     return mirror_samples(antennas, z_m, chirp) @ reduction.matrix.T
+
+
+class ReducedRow(NamedTuple):
+    """One board's row behind the range gate, columns from the smallest x: what images are made from.
+
+    samples complex64 [rx, frequency, column], direct path complex64 [rx, column], valid bool [column].
+    """
+
+    samples: NDArray[np.complex64]
+    direct: NDArray[np.complex64]
+    valid: NDArray[np.bool_]
 
 
 class BoardSamples:
@@ -176,15 +187,30 @@ class BoardSamples:
             raise _stranger(
                 f"row {index} of board {self.board.name} has {row.valid.size} positions, the plan {self._plan.columns}"
             )
-        self._show(index, -1)
         forward = slice(None, None, self._plan.row(index).direction)
         reduced = self._reduced(row.samples)
         if row.turn is not None:
             reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
-        reduced = reduced[..., forward]
-        self.valid[index] = row.valid[forward]
-        self._cube[:, :, index] = reduced[:, :-1] * self.valid[index]
-        self._direct[:, index] = reduced[:, -1] * self.valid[index]
+        reduced, valid = reduced[..., forward], row.valid[forward]
+        self._put(index, ReducedRow(reduced[:, :-1] * valid, reduced[:, -1] * valid, valid), offsets_m, forward)
+
+    def put(self, index: int, row: ReducedRow) -> None:
+        """Take in a row that this range gate has reduced before, see :meth:`reduced`."""
+        self._put(index, row)
+
+    def reduced(self, index: int) -> ReducedRow:
+        """A row as it was taken in."""
+        return ReducedRow(self._cube[:, :, index], self._direct[:, index], self.valid[index])
+
+    def _put(
+        self,
+        index: int,
+        row: ReducedRow,
+        offsets_m: NDArray[np.float64] | None = None,
+        forward: slice = slice(None),
+    ) -> None:
+        self._show(index, -1)
+        self._cube[:, :, index], self._direct[:, index], self.valid[index] = row
         if offsets_m is not None:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
             self._final, self._moved = None, True

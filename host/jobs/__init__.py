@@ -2,5 +2,6 @@
 
 Entered by module, so that a command loads no more than it needs: `process` (images, materials), `label` and `train`,
 `batch` and its worker, `live_scan`, `demo`, `materials` (on saved products), `calibrate`, `cards`, `look` (validate,
-inspect), `drop_raw`. They print for people or, with `as_json`, for programs; libraries below them never do.
+inspect), `drop_raw`; `steps` shows progress. They print for people or, with `as_json`, for programs; libraries below
+them never do.
 """

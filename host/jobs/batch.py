@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Event
@@ -21,7 +22,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from polysight.host.process import ProcessRequest
+from polysight.host.process import ProcessRequest, cores
 from polysight.host.products import FINISHED, SavedProducts, write_json
 from polysight.host.store import COLLECTION, MANIFEST, ScanFolder, is_source, versions
 from polysight.shared.errors import ConfigError, PolysightError
@@ -31,15 +32,18 @@ Status = Literal["done", "skipped", "failed", "stopped"]
 _PRODUCTS = ("image.npz", "quality.json")
 PROGRAM = (sys.executable, "-m", "polysight.host.jobs.batch_worker")
 """Processes the one job on its standard input."""
+ALIVE = "POLYSIGHT_PARENT_ALIVE"
+"""Environment of the program: number of a pipe that ends with the program that started it."""
 _FREE = 0.8  # of the free memory is used
 _POLL_S = 0.2
 
 
 class Job(msgspec.Struct, frozen=True):
-    """One scan to process, as plain data: what is asked, and what the products will depend on."""
+    """One scan to process, as plain data: what is asked, what the products will depend on, rows at a time."""
 
     request: ProcessRequest
     made_with: dict[str, Any]
+    threads: int = 1
 
     @property
     def out(self) -> Path:
@@ -96,7 +100,7 @@ def jobs_of(requests: Sequence[ProcessRequest]) -> list[Job]:
 
 
 PRODUCTS_VERSION = 4  # counts changes of what products of the same data hold
-NOT_DATA = ("products", ".products.new", ".products.old", "products-export", "control")  # folders of a scan
+NOT_DATA = ("samples", "products", ".products.new", ".products.old", "products-export", "control")  # folders of a scan
 
 
 def made_with(request: ProcessRequest) -> dict[str, Any]:
@@ -129,29 +133,53 @@ def finished(job: Job) -> bool:
 
 
 def run_scan(job: Job, stop: Event | None = None) -> Outcome:
-    """Process one scan in a program of its own; what it says goes to `<out>.log`. Never raises for what it does."""
+    """Process one scan in a program of its own; what it says goes to `<out>.log`. Never raises for what it does.
+
+    That program ends when this one does, however this one ends. A scan that carries its mark is done: a Dask worker
+    may have been killed between the mark and its answer.
+    """
+    if finished(job):
+        return _done(job)
     began = time.monotonic()
     log = job.out.with_name(job.name + ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    with log.open("wb") as said:
-        child = subprocess.Popen(PROGRAM, stdin=subprocess.PIPE, stdout=said, stderr=said, env=environment)
-        if child.stdin is not None:
-            child.stdin.write(msgspec.msgpack.encode(job))
-            child.stdin.close()
-        while child.poll() is None:
-            if stop is not None and stop.wait(_POLL_S):
-                child.terminate()
-                child.wait()
-            elif stop is None:
-                child.wait()
+    alive, promise = os.pipe()  # nothing is written: the child sees its end when this program is gone
+    try:
+        environment[ALIVE] = str(alive)
+        with log.open("wb") as said:
+            child = subprocess.Popen(
+                PROGRAM, stdin=subprocess.PIPE, stdout=said, stderr=said, env=environment, pass_fds=(alive,)
+            )
+            _follow(child, job, stop)
+    finally:
+        os.close(alive)
+        os.close(promise)
     seconds = time.monotonic() - began
     if stop is not None and stop.is_set() and child.returncode:
         return Outcome(job.name, "stopped", seconds)
     if child.returncode:
         return Outcome(job.name, "failed", seconds, message=_why(log, child.returncode))
+    return _done(job, seconds)
+
+
+def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> None:
+    """Give a program its job, and wait for its end; end it when `stop` is set."""
+    if child.stdin is not None:
+        with suppress(BrokenPipeError):  # it ended before it read; its log says why
+            child.stdin.write(msgspec.msgpack.encode(job))
+            child.stdin.close()
+    while child.poll() is None:
+        if stop is not None and stop.wait(_POLL_S):
+            child.terminate()
+            child.wait()
+        elif stop is None:
+            child.wait()
+
+
+def _done(job: Job, seconds: float = 0.0) -> Outcome:
     mark = json.loads((job.out / FINISHED).read_text(encoding="utf-8"))
-    return Outcome(job.name, "done", seconds, float(mark["memory_gb"]))
+    return Outcome(job.name, "done", seconds or float(mark.get("seconds", 0.0)), float(mark["memory_gb"]))
 
 
 def _why(log: Path, status: int) -> str:
@@ -200,12 +228,15 @@ def run_on_dask(jobs: Sequence[Job], address: str, timeout: str = "30s") -> Iter
             "start one with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`",
         ) from None
     with client:
+        jobs_by_name = {job.name: job for job in jobs}
         named = {client.submit(run_scan, job, pure=False): job.name for job in jobs}
         for future in as_completed(list(named)):
             if future.status == "finished":
                 yield future.result()
+            elif finished(jobs_by_name[named[future]]):  # its worker was lost behind the mark
+                yield _done(jobs_by_name[named[future]])
             else:
-                yield Outcome(named[future], "failed", message=f"its worker was lost: {future.exception()}")
+                yield Outcome(named[future], "failed", message=f"its workers were lost: {future.exception()}")
 
 
 def memory_bytes(positions: int) -> int:
@@ -229,11 +260,6 @@ def free_memory_bytes() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def cores() -> int:
-    """Cores that this program may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def process_many(
     jobs: Sequence[Job], out: Path, jobs_at_once: int, dask: str | None = None, again: bool = False
 ) -> list[Outcome]:
@@ -250,6 +276,8 @@ def process_many(
     where = f"on the cluster at {dask}" if dask else f"{jobs_at_once} at a time"
     sys.stderr.write(f"{len(jobs)} scans: {len(passed_over)} finished before, {len(todo)} to process, {where}\n")
     out.mkdir(parents=True, exist_ok=True)
+    for job in todo:
+        (job.out / FINISHED).unlink(missing_ok=True)  # from now on a mark is one of this run
     results = run_on_dask(todo, dask) if dask else run_here(todo, jobs_at_once)
     for n, outcome in enumerate(results if todo else (), 1):
         outcomes[outcome.name] = outcome
@@ -274,7 +302,10 @@ def process_several(
     jobs = jobs_of(requests)
     positions = max((_positions(Path(r.data)) for r in requests), default=0)
     n = at_a_time or at_once(positions, cores(), free_memory_bytes())
-    outcomes = process_many(jobs, out, min(n, len(jobs)), dask, again)
+    n = min(n, len(jobs))
+    if dask is None:
+        jobs = [msgspec.structs.replace(job, threads=max(1, cores() // n)) for job in jobs]
+    outcomes = process_many(jobs, out, n, dask, again)
     sys.stdout.write(table(outcomes, out))
     return 0 if all(o.status in ("done", "skipped") for o in outcomes) else 1
 

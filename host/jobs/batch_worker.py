@@ -2,26 +2,41 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import sys
+import threading
 import time
 
 import msgspec
 
-from polysight.host.jobs.batch import Job
+from polysight.host.jobs.batch import ALIVE, Job
 from polysight.host.jobs.process import process
 from polysight.host.products import FINISHED, write_json
 from polysight.host.verdict import NoResult
 from polysight.shared.errors import PolysightError
 
 
+def end_with(pipe: str | None) -> None:
+    """End this program when the one that holds the other end of a pipe does: a killed worker leaves nothing running."""
+    if pipe is None:
+        return
+
+    def wait() -> None:
+        os.read(int(pipe), 1)
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def main() -> int:
     """Process one job; returns the exit status. What it says goes to stdout and stderr."""
+    end_with(os.environ.get(ALIVE))
     job = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=Job)
     began = time.monotonic()
     try:
         (job.out / FINISHED).unlink(missing_ok=True)
-        status = process(job.request)
+        status = process(job.request, job.threads)
     except PolysightError as e:
         sys.stderr.write(f"{e}\n")
         return e.exit_status

@@ -42,6 +42,9 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
         f"{folder}: the raw data of {len(what.files)} rows, {what.bytes / 1e6:.1f} MB, is removed. {products} stays;"
         " it cannot be processed again."
     )
+    for where in sorted({path.parent for boards in what.files.values() for path in boards.values()}):
+        names = sorted(path.name for boards in what.files.values() for path in boards.values() if path.parent == where)
+        sys.stdout.write(f"to be removed: {where.relative_to(folder)}: {', '.join(names)}\n")
     said = typed(text, WORD, yes)
     if said != WORD:
         raise ConfigError(f"nothing dropped: answered {said!r}", f"{WORD!r} was asked for", f"type {WORD}, or --yes")

@@ -29,7 +29,7 @@ from polysight.host.acquisition import (
 )
 from polysight.host.calibration import Calibration, of_rig, of_scan
 from polysight.host.imaging import image_grid
-from polysight.host.jobs.process import check_options, load_options, make_products, truth_of
+from polysight.host.jobs.process import check_options, load_options, make_products, publish_images, truth_of
 from polysight.host.materials import TRUTH, read_truth
 from polysight.host.pipeline import Pipeline
 from polysight.host.process import Options, ProcessRequest
@@ -104,7 +104,7 @@ class ScanBar:
 
 
 class _Live:
-    """Feeds committed rows to a pipeline, which is made when the first row is there."""
+    """Feeds committed rows to a pipeline, made with the first row; behind the last one the images are written."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -115,9 +115,11 @@ class _Live:
         """Process one committed row."""
         if self._source is None or self.pipeline is None:
             self._source = ScanFolder.load(self._folder)
-            self.pipeline = Pipeline(self._source, live=True)
+            self.pipeline = Pipeline(self._source, live=True, samples="keep")
         self._source.reload()
         self.pipeline.add_row(row)
+        if self._source.complete:
+            publish_images(self.pipeline, self._folder / PRODUCTS)
 
 
 @hangups_pass()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,15 @@ from rich.console import Console
 from rich.progress import track
 
 from polysight.host.calibration import of_scan
-from polysight.host.imaging import ChannelImages, Focus, PlaneEstimate, focus_sweep
+from polysight.host.imaging import (
+    AS_IN_RIG_FILE,
+    PLANE_REACH_M,
+    ChannelImages,
+    Focus,
+    PlaneEstimate,
+    View,
+    focus_sweep,
+)
 from polysight.host.materials import (
     TruthPlate,
     read_labels,
@@ -20,22 +30,43 @@ from polysight.host.materials import (
 )
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
-from polysight.host.process import Options, ProcessRequest, Products, coverage_lines, save_images
-from polysight.host.products import IMAGE, check_products_folder, making_products, write_json
-from polysight.host.store import Source, open_source, raw_source
+from polysight.host.process import (
+    Options,
+    ProcessRequest,
+    Products,
+    Tell,
+    coverage_lines,
+    each_row,
+    quality_content,
+    save_images,
+    untold,
+)
+from polysight.host.products import IMAGE, QUALITY, check_products_folder, making_products, write_json
+from polysight.host.store import ScanFolder, Source, open_source, raw_source, require_raw
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError, advice
 
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
+REPORT = "report.html"
 
 
 def all_rows(
-    source: Source, data: Path, depth_m: float = 0.0, bands: int = 1, options: Options | None = None
+    source: Source,
+    data: Path,
+    depth_m: float = PLANE_REACH_M,
+    bands: int = 1,
+    options: Options | None = None,
+    view: View = AS_IN_RIG_FILE,
+    threads: int | None = None,
 ) -> Pipeline:
-    """A pipeline with all rows of a source, with a progress bar. What `options` cannot use is refused first."""
-    pipeline = Pipeline(source, depth_m=depth_m, bands=bands)
+    """A pipeline with all rows of a source, `threads` at a time (None: one a core), with a progress bar.
+
+    What `options` cannot use is refused first. Rows whose samples the scan folder keeps are not synchronised again;
+    others are, and then kept.
+    """
+    pipeline = Pipeline(source, depth_m=depth_m, bands=bands, samples="keep", view=view)
     if options is not None:
-        metal = check_options(options, pipeline.rig, pipeline.axes_m)
+        metal = check_options(options, pipeline.rig, axes_of(pipeline))
         pipeline.metal_plane(options, metal is not None)
     rows = list(source.rows())
     if not rows:
@@ -44,15 +75,24 @@ def all_rows(
             "the scan was stopped in its first row, or files are missing",
             f"`polysight resume {data}` takes the missing rows of a scan folder",
         )
+    if isinstance(source, ScanFolder) and not pipeline.samples.holds(rows):
+        require_raw(source)
     console = Console(stderr=True)
-    for row in track(rows, "rows", console=console, disable=not console.is_terminal):
-        pipeline.add_row(row)
+    done = each_row(pipeline.add_row, rows, threads)
+    for _ in track(done, "rows", total=len(rows), console=console, disable=not console.is_terminal):
+        pass
     return pipeline
+
+
+def axes_of(pipeline: Pipeline) -> Axes:
+    """Pixel centres of the images, x and y, ascending."""
+    grid = pipeline.images.grid
+    return (grid.y_m, grid.x_m) if pipeline.source.mirrored else (grid.x_m, grid.y_m)
 
 
 def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, ChannelImages]:
     """A recorded scan of any layout, processed up to its images. Raises PolysightError."""
-    pipeline = all_rows(open_source(data, config), data, bands=bands)
+    pipeline = all_rows(open_source(data, config, dropped=True), data, bands=bands)
     return pipeline, pipeline.form_images()
 
 
@@ -92,23 +132,47 @@ def check_options(options: Options, rig: Instrument, axes_m: Axes) -> int | None
     return metal
 
 
+def publish_images(pipeline: Pipeline, out: Path) -> None:
+    """The images alone, and what was recorded, unless `out` holds a report: nothing else is waited for.
+
+    Raises PolysightError.
+    """
+    if (out / REPORT).exists():
+        return
+    images = pipeline.form_images()
+    with making_products(out, pipeline.source.scan_id) as new:
+        save_images(new, pipeline.source, pipeline.rig, images, pipeline.quality)
+    sys.stderr.write(f"image: {out / IMAGE}\n")
+
+
 def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
-    """All products, which take the place of those in `out`.
+    """All products, which take the place of those in `out`; what is being made is shown on a terminal.
 
     When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
     are. Raises PolysightError.
     """
-    with making_products(out, pipeline.source.scan_id) as new:
+    with making_products(out, pipeline.source.scan_id) as new, _telling() as tell:
         try:
-            return replace(pipeline.finish(new, options, plates), folder=out)
+            return replace(pipeline.finish(new, options, plates, tell), folder=out)
         except DataError as e:
             if not (new / IMAGE).exists():
                 raise
-            if (out / "report.html").exists():
+            if (out / REPORT).exists():
                 where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
                 raise DataError(e.what, e.why, advice(e.remedy, where)) from None
             failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"))
     raise failed
+
+
+@contextmanager
+def _telling() -> Iterator[Tell]:
+    """Shows the step that is being done, on a terminal."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield untold
+        return
+    with console.status("image") as status:
+        yield status.update
 
 
 def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
@@ -164,28 +228,35 @@ def load_options(request: ProcessRequest) -> Options:
     )
 
 
-def process(request: ProcessRequest) -> int:
-    """Images, materials and report of one scan; returns the exit status. Raises PolysightError."""
+def process(request: ProcessRequest, threads: int | None = None) -> int:
+    """Images, materials and report of one scan, rows on `threads` (None: all cores); returns the exit status.
+
+    Raises PolysightError.
+    """
     options, data, out = load_options(request), Path(request.data), Path(request.out)
     source = open_source(data, None if request.config is None else Path(request.config))
     plates = truth_of(data)
     check_products_folder(out, source.scan_id)
-    pipeline = all_rows(source, data, bands=options.bands, options=options)
+    pipeline = all_rows(source, data, bands=options.bands, options=options, threads=threads)
+    publish_images(pipeline, out)
     products = make_products(pipeline, out, options, plates)
     sys.stdout.write(products.summary())
     return products.exit_status
 
 
-def image(data: Path, out: Path, config: Path | None) -> int:
+def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FILE) -> int:
     """image.npz and quality.json only; returns the exit status. Raises PolysightError."""
-    source = open_source(data, config)
+    source = open_source(data, config, dropped=True)
     check_products_folder(out, source.scan_id)
-    pipeline = all_rows(source, data)
+    pipeline = all_rows(source, data, depth_m=PLANE_REACH_M if view == AS_IN_RIG_FILE else 0.0, view=view)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:
         save_images(new, source, pipeline.rig, images, pipeline.quality)
     told = (*coverage_lines(pipeline.quality.coverage()), f"image: {out / IMAGE}")
     sys.stdout.write("".join(f"{line}\n" for line in told))
+    sys.stdout.flush()
+    pipeline.quality.note_imaging(pipeline.images, images)
+    write_json(out / QUALITY, quality_content(pipeline.quality))
     return 0
 
 
@@ -193,9 +264,9 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     """Find the object plane's distance and tilt by sharpness; focus.json and focus.png. Raises PolysightError."""
     from polysight.host.report import focus_figure
 
-    source = open_source(data, config)
+    source = open_source(data, config, dropped=True)
     out.mkdir(parents=True, exist_ok=True)
-    pipeline = all_rows(source, data, depth_mm / 1e3)
+    pipeline = all_rows(source, data, max(depth_mm / 1e3, PLANE_REACH_M))
     builder = pipeline.images
     images = pipeline.form_images()
     pipeline.place_plane(images, move=False)
@@ -208,7 +279,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
         found, plates, pictures = found.transposed(), plates.transposed(), (pictures[0].T, pictures[1].T)
     sweep = found.to_dict() | {"plates": plates.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
-    (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pipeline.axes_m, source.simulated))
+    (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *axes_of(pipeline), source.simulated))
     head = f"{'simulated ' if source.simulated else ''}scan {source.scan_id}"
     at = pipeline.rig.geometry.object_distance_mm
     sys.stdout.write("".join(f"{line}\n" for line in _focus_lines(head, at, found, plates)))

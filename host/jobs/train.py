@@ -19,6 +19,7 @@ import numpy as np
 
 from polysight.host.jobs.demo import check_scenes, run_simulator
 from polysight.host.jobs.process import all_rows
+from polysight.host.jobs.steps import steps
 from polysight.host.materials import (
     TRUTH,
     ImagePair,
@@ -235,10 +236,12 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
         check_told(folder)
     if files:
         check_scenes(files, config)
-    scans = [training_scan(folder, config) for folder in data]
+    scans = [training_scan(folder, config) for folder in steps(data, [str(folder) for folder in data])]
     if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
-            for file, again in product(files, range(times)):
+            drawn = list(product(files, range(times)))
+            called = [f"simulating and imaging {file.name}, specimens {again}" for file, again in drawn]
+            for file, again in steps(drawn, called):
                 folder = Path(temporary) / f"{file.stem}-{again}"
                 command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
                 if run_simulator([*command, "--specimens", str(again)]):

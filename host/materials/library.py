@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from polysight.host.store import open_npz
 from polysight.shared.errors import DataError
 
 FORMAT = "polysight-library-1"
@@ -175,7 +176,7 @@ class Library:
         """
         bad = f"{path}: not a material library"
         try:
-            with path.open("rb") as f, np.load(f, allow_pickle=False) as z:
+            with open_npz(path) as z:
                 meta = json.loads(z["meta"].tobytes().decode("utf-8"))
                 h, v, p = z["h"], z["v"], z["p"]
         except FileNotFoundError:
@@ -183,7 +184,8 @@ class Library:
                 f"{path}: no such library", "none was trained yet, or the path is wrong", "polysight train"
             ) from None
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
-            raise DataError(bad, f"{type(e).__name__}: {e}", "make it again with polysight train") from None
+            why = str(e) if isinstance(e, ValueError) else f"{type(e).__name__}: {e}"
+            raise DataError(bad, why, "give a library that polysight train made, or a folder of products") from None
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             found = meta.get("format") if isinstance(meta, dict) else None
             raise DataError(bad, f"its format is {found!r}, this program reads {FORMAT!r}", "train it again")

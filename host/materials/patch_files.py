@@ -22,6 +22,7 @@ from polysight.host.materials.classify import features_of
 from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.samples import Real
 from polysight.host.materials.segment import axis_mm
+from polysight.host.store import open_npz
 from polysight.shared.errors import DataError
 
 PATCHES = "patches.npz"
@@ -90,7 +91,7 @@ def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike,
 def read_patches(path: Path) -> SeenPatches:
     """Read `patches.npz` (no pickle). Raises DataError."""
     try:
-        with path.open("rb") as f, np.load(f, allow_pickle=False) as z:
+        with open_npz(path) as z:
             meta = json.loads(z["meta"].tobytes().decode("utf-8"))
             places, features = z["places_mm"].astype(np.float64), z["features"].astype(np.float64)
         if meta["format"] != FORMAT:

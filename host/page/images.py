@@ -234,7 +234,7 @@ class RowViewer:
                 continue
             row, take = todo
             try:
-                pipeline = pipeline or Pipeline(self._source, live=True)
+                pipeline = pipeline or Pipeline(self._source, live=True, samples="read")
                 self._add(pipeline, row, take)
             except PolysightError as e:
                 self._fail(row, take, of_error(e))
@@ -244,11 +244,12 @@ class RowViewer:
 
     def _add(self, pipeline: Pipeline, row: int, take: int) -> None:
         """Take a row in; show it unless others wait and something was shown just now."""
-        synced = pipeline.add_row(row)
+        pipeline.add_row(row)
         self._done[row] = take
         self._keep_sync(pipeline, row)
         if self._left > 1 and time.monotonic() - self._shown_at < _PICTURES_S:
             return
+        synced = pipeline.synchronise_row(row)  # kept samples hold the scene; the profile shows the direct path too
         rig = pipeline.source.instrument
         self._scene_m = self._scene_m or scene_m(rig)
         excess = np.linspace(-_BEFORE_M, self._scene_m[1] + _BEYOND_M, 240)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.imaging import ChannelImages, ImageBuilder, imaging_facts
 from polysight.host.materials import MaterialsResult, permittivity_change
 from polysight.host.polarimetry import IncidenceChoice, PlaneReference
 from polysight.host.store import CubeRow, RowData, Source
@@ -33,8 +35,7 @@ class BoardQuality:
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Take in one row."""
-        self.echoes[row] = echo_of_row(synced, self._filter)
-        self.rows[row] = {
+        figures = {
             "frames_expected": recorded.frames_expected,
             "frames_received": frames_valid,
             "bytes_missing": recorded.missing_bytes,
@@ -42,10 +43,15 @@ class BoardQuality:
             "positions": int(synced.valid.size),
             "positions_masked": int(synced.valid.size - synced.valid.sum()),
             "masked_columns": masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
-            "direct_hz": synced.direct_hz[synced.valid],
+            "direct_hz": np.where(synced.valid, synced.direct_hz, np.nan),
             "stages": synced.stages,
             "direct_snr": _direct_snr(synced),
         }
+        self.put(row, figures, echo_of_row(synced, self._filter))
+
+    def put(self, row: int, figures: dict[str, Any], echo: NDArray[np.complex64]) -> None:
+        """Take in what :meth:`add` made of a row before."""
+        self.rows[row], self.echoes[row] = figures, echo
 
     @property
     def positions(self) -> int:
@@ -69,7 +75,7 @@ class BoardQuality:
 
         None where it is not known (cubes that were synchronised elsewhere).
         """
-        values = np.concatenate([r["direct_snr"] for r in self.rows.values()]) if self.rows else np.zeros(0)
+        values = _known([r["direct_snr"] for r in self.rows.values()])
         return float(10 * np.log10(np.median(values))) if values.size else None
 
     def residual(self, stage: str) -> float | None:
@@ -79,7 +85,8 @@ class BoardQuality:
 
     def summary(self) -> dict[str, Any]:
         """Plain numbers for quality.json. Residuals are root mean squares over rows, weighted by valid positions."""
-        rows = list(self.rows.values())
+        ordered = dict(sorted(self.rows.items()))  # they come from several threads, in any order
+        rows = list(ordered.values())
         total: dict[str, Any] = {
             key: sum(r[key] for r in rows)
             for key in ("frames_expected", "frames_received", "bytes_missing", "positions", "positions_masked")
@@ -91,7 +98,7 @@ class BoardQuality:
             weight = sum(n for _, n in found)
             f, p, a = (float(np.sqrt(sum(s[i] ** 2 * n for s, n in found) / weight)) for i in range(3))
             stages[stage] = {"frequency_std_hz": f, "phase_std_rad": p, "amplitude_std": a}
-        direct = np.concatenate([r["direct_hz"] for r in rows]) if rows else np.zeros(0)
+        direct = _known([r["direct_hz"] for r in rows])
         if direct.size:
             total["direct_path_hz"] = {
                 "median": float(np.median(direct)),
@@ -101,9 +108,9 @@ class BoardQuality:
         snr = self.direct_snr_db
         total["direct_path_snr_db"] = None if snr is None else round(snr, 2)
         total["stage_backlash_mm"] = self._backlash()
-        total["masked_columns"] = {row: r["masked_columns"] for row, r in self.rows.items() if r["masked_columns"]}
-        total["rows_recorded"] = sorted(self.rows)
-        total["raw_crc32"] = {row: r["crc32"] for row, r in self.rows.items() if r["crc32"]}
+        total["masked_columns"] = {row: r["masked_columns"] for row, r in ordered.items() if r["masked_columns"]}
+        total["rows_recorded"] = list(ordered)
+        total["raw_crc32"] = {row: r["crc32"] for row, r in ordered.items() if r["crc32"]}
         return {**total, "synchronisation": stages}
 
     def _backlash(self) -> dict[str, float] | None:
@@ -113,11 +120,21 @@ class BoardQuality:
 
 
 def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
-    """Power of the direct path over that of noise in one sample of one chirp and channel, of the valid positions."""
-    if row.noise is None:
-        return np.zeros(0)
-    good = row.valid & np.isfinite(row.noise) & (row.noise > 0)
-    return np.asarray(row.direct_amplitude[good] ** 2 / row.noise[good], np.float64)
+    """Power of the direct path over that of noise in one sample of one chirp and channel, float64 [position].
+
+    Not a number where a position is not valid, or the noise is not known.
+    """
+    out = np.full(row.valid.size, np.nan)
+    if row.noise is not None:
+        good = row.valid & np.isfinite(row.noise) & (row.noise > 0)
+        out[good] = row.direct_amplitude[good] ** 2 / row.noise[good]
+    return out
+
+
+def _known(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The numbers among the values of all rows."""
+    values = np.concatenate(rows) if rows else np.zeros(0)
+    return values[np.isfinite(values)]
 
 
 def masked_runs(masked: NDArray[np.bool_]) -> list[list[int]]:
@@ -134,6 +151,7 @@ class Quality:
         self.boards = {board.name: BoardQuality(rig, board) for board in rig.receivers}
         self.seconds: dict[str, float] = {}
         self.notes: dict[str, Any] = {}
+        self._lock = threading.Lock()  # rows are processed in several threads
 
     def coverage(self) -> dict[str, Any]:
         """Rows, positions and frames compared with the plan; rows that were never recorded count as not received."""
@@ -155,6 +173,11 @@ class Quality:
         """Keep entries for quality.json."""
         self.notes |= entries
 
+    def note_imaging(self, builder: ImageBuilder, images: ChannelImages) -> None:
+        """Keep what the aperture makes of a point."""
+        with self.timed("point response"):
+            self.note(imaging=imaging_facts(builder, images))
+
     def note_materials(
         self,
         found: MaterialsResult,
@@ -169,12 +192,13 @@ class Quality:
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the wall time of a block to a stage's seconds."""
+        """Add the wall time of a block to a stage's seconds, those of rows at the same time each."""
         began = time.perf_counter()
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
+            with self._lock:
+                self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
 
     def to_dict(self, **more: Any) -> dict[str, Any]:
         """Content of quality.json; `more` are further entries."""

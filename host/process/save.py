@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -45,7 +46,13 @@ from polysight.shared.tables import to_builtins
 if TYPE_CHECKING:  # it draws, and is loaded where something is written: matplotlib takes a second
     from polysight.host.report import ReportContext
 
+Tell = Callable[[str], None]
+"""Called with what is done next, in a word or two."""
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
+
+
+def untold(_: str) -> None:
+    """Tell nobody."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +112,12 @@ def save_images(out: Path, scan: Scan, rig: Instrument, images: ChannelImages, q
     p = ratio(images.h, images.v)
     write_image(out / IMAGE, images.h, images.v, p, images.x_m, images.y_m, images.valid)
     write_scan_facts(out, scan, rig, images)
-    write_json(out / QUALITY, quality.to_dict(verdict=verdict_of(recording_verdict(quality)).to_dict()))
+    write_json(out / QUALITY, quality_content(quality))
+
+
+def quality_content(quality: Quality) -> dict[str, Any]:
+    """Content of quality.json of images in which no material was looked for."""
+    return quality.to_dict(verdict=verdict_of(recording_verdict(quality)).to_dict())
 
 
 def save_materials(

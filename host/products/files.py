@@ -23,10 +23,10 @@ import numpy.typing as npt
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials import PATCHES, SeenPatches, read_patches
 from polysight.host.products.withhold import withhold
-from polysight.host.store import Scan, versions
+from polysight.host.store import Scan, open_npz, versions
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
-from polysight.shared.errors import ConfigError, DataError
+from polysight.shared.errors import ConfigError, DataError, no_such
 from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
@@ -90,7 +90,7 @@ def read_image(path: Path) -> dict[str, npt.NDArray]:
     """Read image.npz (no pickle); `p_sigma` only where the file holds it. Raises DataError."""
     names = ("h", "v", "p", "x_m", "y_m", "valid")
     try:
-        with path.open("rb") as f, np.load(f, allow_pickle=False) as z:
+        with open_npz(path) as z:
             return {k: z[k] for k in (*names, *(k for k in _OPTIONAL if k in z))}
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(f"{path}: not an image product: {e}", "made by polysight process or image") from None
@@ -274,6 +274,8 @@ def read_products(folder: Path, needs: str = IMAGE) -> SavedProducts:
     """What :func:`find_products` finds. Raises DataError when that is nothing."""
     if found := find_products(folder, needs):
         return found
+    if not folder.exists():
+        raise no_such(folder)
     raise DataError(
         f"{folder}: no {needs}",
         "the folder is wrong, the scan was not processed" + ("" if needs == IMAGE else ", or only to images"),

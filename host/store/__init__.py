@@ -5,7 +5,7 @@ hold data, `read_row` and facts about the recording; `raw_source` asks for one w
 """
 
 from polysight.host.store import manifest
-from polysight.host.store.append_only import sync_folder
+from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.raw import Digests, drop, droppable, require_raw
@@ -25,6 +25,7 @@ from polysight.host.store.scan_folder import (
 from polysight.host.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
 from polysight.host.store.sources.open import is_source, open_source
 from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
+from polysight.host.store.untrusted import inside, open_npz
 from polysight.host.store.validation import damaged_rows, to_json, validate
 
 __all__ = [
@@ -48,14 +49,17 @@ __all__ = [
     "Source",
     "check_same_scan",
     "connection_of",
+    "crc32",
     "damage_of",
     "damaged_rows",
     "drop",
     "droppable",
+    "inside",
     "is_source",
     "manifest",
     "mirrored",
     "new_scan_id",
+    "open_npz",
     "open_source",
     "place_again",
     "raw_source",

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from polysight.host.store.append_only import AppendFile
-from polysight.shared.errors import DataError, DeviceError, PolysightError
+from polysight.shared.errors import DataError, DeviceError, PolysightError, no_such
 
 Fact = dict[str, Any]
 
@@ -164,6 +164,8 @@ def read(path: Path) -> Manifest:
     try:
         return parse(path.read_bytes())
     except OSError as e:
+        if not path.parent.exists():
+            raise no_such(path.parent) from None
         raise DataError(
             f"{path}: cannot be read: {e.strerror}", f"{path.parent} is not a scan folder", "give the folder of a scan"
         ) from None

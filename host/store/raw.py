@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from polysight.host.store.append_only import sync_folder
+from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact
 from polysight.host.store.scan_folder import CommittedRow, ScanFolder, utc_now
 from polysight.shared.errors import DataError, DeviceError, ScanError
@@ -50,7 +50,7 @@ def require_raw(scan: ScanFolder) -> None:
 
 
 def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
-    """The files of every row that was processed as it was committed, and that are still there.
+    """The files of every row that was processed as it was committed, and that are still there and the same.
 
     Parameters
     ----------
@@ -78,8 +78,13 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
         for name, board in row.boards.items():
             digest = processed.get(name, {}).get(row.row)
             if digest == board.crc32:
-                if (scan.path / board.file).exists():
-                    files.setdefault(row.row, {})[name] = scan.path / board.file
+                path = scan.path / board.file
+                if not path.exists():
+                    continue
+                if f"{crc32(path.read_bytes()):08x}" == board.crc32:
+                    files.setdefault(row.row, {})[name] = path
+                else:
+                    kept.append(f"{board.file}: not the bytes that were committed")
             elif board.file not in dropped_files(scan):
                 why = "not processed" if digest is None else "not the bytes the products were made from"
                 kept.append(f"{board.file}: {why}")

@@ -23,6 +23,7 @@ from polysight.host.store import manifest
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.source import RowData
+from polysight.host.store.untrusted import inside
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, DeviceError
@@ -234,7 +235,10 @@ class ScanFolder:
         return [f for f in self.content.facts if f["fact"] == kind]
 
     def committed(self) -> dict[int, CommittedRow]:
-        """Committed rows by index; the last valid take wins, unless it was withdrawn."""
+        """Committed rows by index; the last valid take wins, unless it was withdrawn.
+
+        Raises DataError where the manifest names a file outside `raw`.
+        """
         return dict(self._committed())
 
     def _committed(self) -> dict[int, CommittedRow]:
@@ -253,6 +257,8 @@ class ScanFolder:
             row = decode_config(
                 {k: fact.get(k) for k in CommittedRow.__struct_fields__}, CommittedRow, f"{self.path / MANIFEST}"
             )
+            for board in row.boards.values():
+                inside(self.path, board.file, "raw")
             rows[row.row] = row
         return dict(sorted(rows.items()))
 

@@ -17,9 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.host.sync import compiled
 from polysight.host.sync import high_pass_filter as hpf
+from polysight.host.sync import numpy_passes as passes
 from polysight.host.sync.numpy_passes import FOLD
-from polysight.host.sync.passes import Passes, passes_for
 from polysight.host.sync.tone import Real, Tone, cis
 
 _REFERENCES = 4  # reference chirps to try before a position is given up
@@ -75,9 +76,8 @@ def align_row(
     linear: tuple[int, int],
     equaliser: hpf.Equaliser | None = None,
     full_scale: int = 32767,
-    by: Passes | None = None,
 ) -> AlignedRow:
-    """Align and average the burst of every position.
+    """Align and average the burst of every position: compiled (`burst.c`) where that is possible, else in NumPy.
 
     Parameters
     ----------
@@ -91,14 +91,25 @@ def align_row(
         Compensates the receiver's filter; None leaves it in.
     full_scale
         A chirp with a sample at it was clipped, and is left out: its IF holds tones that are not there.
-    by
-        The passes over raw samples, compiled or plain; None takes the fastest.
     """
-    by = by or passes_for(words.shape[-1])
+    loops = compiled.library() if words.shape[-1] == compiled.RX else None
+    if loops is None:
+        return align_in_numpy(words, valid, linear, equaliser, full_scale)
+    return AlignedRow(*loops.align(words, valid, whole_blocks(linear), equaliser, full_scale))
+
+
+def align_in_numpy(
+    words: NDArray[np.int16],
+    valid: NDArray[np.bool_],
+    linear: tuple[int, int],
+    equaliser: hpf.Equaliser | None = None,
+    full_scale: int = 32767,
+) -> AlignedRow:
+    """The same in NumPy, for any number of RX: the readable form of `burst.c`, with equal results."""
     words = np.ascontiguousarray(words)
     pieces = [
-        _align(words[i : i + by.CHUNK], valid[i : i + by.CHUNK], linear, equaliser, full_scale, by)
-        for i in range(0, valid.shape[0], by.CHUNK)
+        _align(words[i : i + passes.CHUNK], valid[i : i + passes.CHUNK], linear, equaliser, full_scale)
+        for i in range(0, valid.shape[0], passes.CHUNK)
     ]
     if len(pieces) == 1:
         return pieces[0]
@@ -112,11 +123,10 @@ def _align(
     linear: tuple[int, int],
     equaliser: hpf.Equaliser | None,
     full_scale: int,
-    by: Passes,
 ) -> AlignedRow:
     """The same for a few positions."""
     linear = whole_blocks(linear)
-    first, centre, coherence, usable, peak = _against_one(words, valid, linear, full_scale, by)
+    first, centre, coherence, usable, peak = _against_one(words, valid, linear, full_scale)
     good = _coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
     taps = _taps(equaliser, frequency)
@@ -124,7 +134,7 @@ def _align(
 
     # Second pass: each chirp against the sum of the others.
     turned = taps * cis(-start)[..., None]
-    off, product, own, level, apart = by.against_others(words, frequency, _c64(turned), good, linear)
+    off, product, own, level, apart = passes.against_others(words, frequency, _c64(turned), good, linear)
     n = good.sum(axis=1)
     level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     others = n[:, None] - good
@@ -141,7 +151,7 @@ def _align(
     turned *= cis(2 * np.pi * FOLD * lag * correction[..., None] - shift[..., None])
     weights = turned * (good / np.maximum(good.sum(axis=1), 1)[:, None])[..., None]
     second_half = np.cumsum(good, axis=1) % 2 == 0
-    mean, halves = by.average(words, frequency + correction, _c64(weights), second_half, linear)
+    mean, halves = passes.average(words, frequency + correction, _c64(weights), second_half, linear)
     return AlignedRow(
         mean,
         halves,
@@ -164,7 +174,7 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
 
 
 def _against_one(
-    words: NDArray[np.int16], valid: NDArray[np.bool_], linear: tuple[int, int], full_scale: int, by: Passes
+    words: NDArray[np.int16], valid: NDArray[np.bool_], linear: tuple[int, int], full_scale: int
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]:
     """Offsets from one chirp of each position; another one is taken where the first matches few of the others.
 
@@ -180,7 +190,7 @@ def _against_one(
     coherence, usable, peak = np.zeros(valid.shape), valid, np.zeros(valid.shape, np.int32)
     for attempt in range(min(_REFERENCES, chirps)):
         tried = order[todo, attempt]
-        offset, product, middle, energy, highest = by.match(words if attempt == 0 else words[todo], tried, linear)
+        offset, product, middle, energy, highest = passes.match(words if attempt == 0 else words[todo], tried, linear)
         if attempt == 0:
             usable, peak = valid & (highest < full_scale) & (energy > 0), highest
         at = np.arange(todo.size), tried

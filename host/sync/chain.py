@@ -21,12 +21,16 @@ _FULL_SCALE = 32767  # largest int16: a sample at it was clipped
 
 @dataclass(frozen=True)
 class BoardSetup:
-    """What synchronisation needs to know of a board. Build with :meth:`of`; one serves for a whole scan."""
+    """What synchronisation needs to know of a board. Build with :meth:`of`; one serves for a whole scan.
+
+    `examined` positions of a row at most tell the residuals (`residuals.errors`).
+    """
 
     chirp: Chirp
     pulses: int
     equaliser: hpf.Equaliser | None
     path: direct_path.DirectPath
+    examined: int = residuals.EXAMINED
 
     @classmethod
     def of(
@@ -133,7 +137,7 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
         np.abs(done.amplitude),
         residual[0] * rate,
         residual[1],
-        residuals.errors(aligned, done, setup.path, rate),
+        residuals.errors(aligned, done, setup.path, rate, setup.examined),
         residuals.noise_power(aligned),
         turn_along(done),
     )

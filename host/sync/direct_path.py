@@ -22,28 +22,59 @@ the other of the two strongest peaks is tried; nothing is smoothed.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from polysight.host.sync import compiled, numpy_direct_path
 from polysight.host.sync.align import AlignedRow, whole_blocks
 from polysight.host.sync.numpy_passes import FOLD
-from polysight.host.sync.tone import Complex, cis, phasor
+from polysight.host.sync.tone import cis
 from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 _FFT = 256  # of averaged samples
-_STEPS = 3
 _SPREAD_M = 0.1  # where echoes come from, relative to the mirror point: std of a normal distribution in x and y
 _GAIN_SPREAD = 0.3  # relative gain and phase differences of the RX that the nulls must bear with
 _NOISE = 1e-2  # noise power of one sample beside an echo as strong as the direct path
 _COMPARABLE = 0.35  # a second peak this strong, one object distance below the first, is the direct path
 _LOST = 0.3  # a direct path under this part of the row's median is not the direct path
 _OUTLIER = 5.0  # standard deviations at which an amplitude is out of line with its row's
+_C64, _F64 = NDArray[np.complex64], NDArray[np.float64]
 _PRESENT = 30.0  # nor is one under this power beside its estimate's noise: the best of 100,000 noises has 12
+
+
+class Loops(Protocol):
+    """What `numpy_direct_path` and `compiled.Library` both have; documented in the first."""
+
+    def search(
+        self, halves: _C64, weights: _C64, size: int, object_bins: tuple[int, int], comparable: float
+    ) -> tuple[NDArray[np.int32], _F64]:
+        """Bins of the direct path and of the other that it might be."""
+        ...
+
+    def refine(
+        self, halves: _C64, steering: _C64, estimator: _C64, frequency: _F64
+    ) -> tuple[_F64, NDArray[np.complex128], _F64]:
+        """Frequency, estimate, and last step."""
+        ...
+
+    def turn(
+        self,
+        mean: _C64,
+        halves: _C64,
+        steering: _C64,
+        folded_steering: _C64,
+        origin: float,
+        frequency: _F64,
+        phase: _F64,
+        found: NDArray[np.bool_],
+    ) -> tuple[_C64, _C64]:
+        """Samples and halves with the direct path as zero."""
+        ...
 
 
 class DirectPath(NamedTuple):
@@ -159,7 +190,7 @@ def _least_squares(model: NDArray[np.complex128], covariance: NDArray[np.complex
     return np.linalg.solve(model.conj().T @ whitened, whitened.conj().T).astype(np.complex128)
 
 
-def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp) -> Referenced:
+def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> Referenced:
     """Find the direct path of every position and take its frequency and phase out of all RX.
 
     Parameters
@@ -170,22 +201,26 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp) -> Referenced
         From :func:`prepare`.
     chirp
         The chirp the samples were taken with.
+    by
+        Its loops: compiled or `numpy_direct_path`, with equal results; None: compiled where that is possible.
     """
+    loops = by or (compiled.library() if len(path.beam) == compiled.RX else None) or cast(Loops, numpy_direct_path)
     a, b = whole_blocks(chirp.linear_samples)
     n = (b - a) // FOLD
     usable: NDArray[np.bool_] = np.any(aligned.good, axis=1)
-    halves = aligned.halves * path.folded_steering
-    folded = halves[:, 0] + halves[:, 1]
-    peaks, floor = _search(np.einsum("r,prn->pn", path.beam, folded), path.object_bins)
-    frequency, estimate, _ = _refine(folded, peaks[0], path.drift_estimator)
+    window = np.hanning(n + 2)[1:-1].astype(np.float32)
+    nearest, farthest = int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)
+    beam = _c64(path.beam[:, None] * path.folded_steering * window)
+    bins, median = loops.search(aligned.halves, beam, _FFT, (nearest, farthest), _COMPARABLE)
+    peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
+    floor = median**2 / np.log(2) / (window**2).sum()  # the median bin's: tones fill few bins
+    three, two = _c64(path.drift_estimator), _c64(path.estimator)
+    frequency, estimate, _ = loops.refine(aligned.halves, path.folded_steering, three, peaks[0])
     drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
     drift = float(np.median(drifts)) if usable.any() else 0.0
-    time = (np.arange(n) - (n - 1) / 2) * FOLD
-    flat = cis(-0.5 * drift * time**2)
-    folded *= flat
-    halves *= flat
-    frequency, estimate, step = _refine(folded, frequency, path.estimator)
-    _try_others(folded, peaks, usable, path.estimator, frequency, estimate, step)
+    flat = _c64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
+    frequency, estimate, step = loops.refine(aligned.halves, flat, two, frequency)
+    _try_others(aligned.halves, peaks, usable, (loops, flat, two), frequency, estimate, step)
 
     # An IF outside the receiver's band was aliased or filtered away; a step that does not shrink has found no tone.
     amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging shrank the tone
@@ -201,46 +236,25 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp) -> Referenced
     if found.any():
         found &= strength > _LOST * np.median(strength[found])
 
-    halves *= phasor(-frequency * FOLD, -np.angle(amplitude), n, (n - 1) / 2)[:, None, None]
-    every = np.arange(chirp.samples) - (a + b - 1) / 2
-    turn = phasor(-frequency, -np.angle(amplitude), chirp.samples, (a + b - 1) / 2) * found[:, None]
-    samples = np.empty((len(path.beam), *turn.shape), np.complex64)
-    np.multiply(aligned.mean.swapaxes(0, 1), (path.steering * cis(-0.5 * drift * every**2))[:, None], out=samples)
-    samples *= turn
+    origin = (a + b - 1) / 2
+    steering = _c64(path.steering * cis(-0.5 * drift * (np.arange(chirp.samples) - origin) ** 2))
+    samples, halves = loops.turn(
+        aligned.mean, aligned.halves, steering, flat, origin, frequency, np.angle(amplitude), found
+    )
     return Referenced(samples, heard, amplitude, found, drift, halves)
 
 
-def _refine(
-    folded: Complex, frequency: NDArray[np.float64], estimator: NDArray[np.complex128]
-) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
-    """Gauss-Newton: frequency [position], the estimate [position, 2 or 3] there, and the last step taken."""
-    positions, _, n = folded.shape
-    weights = estimator.T.astype(np.complex64)
-    zero = step = np.zeros(positions)
-    reach = 1 / (n * FOLD)
-
-    def estimate_at(frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
-        demodulated = folded * phasor(-frequency * FOLD, zero, n, (n - 1) / 2)[:, None]
-        return (demodulated.reshape(positions, -1) @ weights).astype(complex)
-
-    estimate = estimate_at(frequency)
-    for _ in range(_STEPS):
-        step = np.clip(_ratio(estimate[:, 1], estimate[:, 0]) / (2 * np.pi), -reach, reach)
-        frequency = frequency + step
-        estimate = estimate_at(frequency)
-    return frequency, estimate, step
-
-
 def _try_others(
-    folded: Complex,
+    halves: NDArray[np.complex64],
     peaks: NDArray[np.float64],
     usable: NDArray[np.bool_],
-    estimator: NDArray[np.complex128],
+    how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
     *found: NDArray[np.generic],
 ) -> None:
     """Where the amplitude is out of line with the row's, take the other peak if it is in line; changes `found`.
 
-    `found` is frequency, estimate and last step, as :func:`_refine` gives them. Out of line is beyond `_OUTLIER`
+    `how` are the loops, the steering and the estimator; `found` is frequency, estimate and last step, as `refine` gives
+    them. Out of line is beyond `_OUTLIER`
     standard deviations, from the row's own median deviation.
     """
     level = np.log(np.maximum(np.abs(found[1][:, 0]), 1e-30))
@@ -251,7 +265,8 @@ def _try_others(
     odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
     if odd.size == 0:
         return
-    other = _refine(folded[odd], peaks[1, odd], estimator)
+    loops, steering, estimator = how
+    other = loops.refine(halves[odd], steering, estimator, peaks[1, odd])
     theirs = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
     better = np.abs(theirs - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
     for whole, part in zip(found, other, strict=True):
@@ -264,30 +279,5 @@ def _ratio(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) ->
     return np.real(ratio)
 
 
-def _search(
-    beam: NDArray[np.complex64], object_bins: tuple[float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Frequency of the direct path (cycles a sample), and of what else it might be, within a bin, [2, position]; and
-    the noise power of an averaged sample [position].
-
-    The object's echo is later, so higher in IF by a distance the geometry tells. When the strongest peak has a
-    comparable one that far below it, the strongest is the object. Noise is the median bin's: tones fill few bins.
-    """
-    n = beam.shape[-1]
-    window = np.hanning(n + 2)[1:-1].astype(np.float32)
-    spectrum = np.abs(np.asarray(scipy.fft.fft(beam * window, _FFT, axis=-1)))
-    middle = np.sort(spectrum, axis=-1)[:, _FFT // 2 - 1 : _FFT // 2 + 1]  # its mean is the median, ten times as fast
-    floor = middle.mean(axis=-1) ** 2 / np.log(2) / (window**2).sum()
-    rows = np.arange(len(beam))
-    top = np.argmax(spectrum, axis=-1)
-    below = top[:, None] - np.arange(int(object_bins[0] * 0.9), int(object_bins[1] * 1.1) + 1)
-    values = spectrum[rows[:, None], below % _FFT]
-    is_peak = (values >= spectrum[rows[:, None], (below - 1) % _FFT]) & (
-        values >= spectrum[rows[:, None], (below + 1) % _FFT]
-    )
-    values = np.where(is_peak, values, 0)
-    best = np.argmax(values, axis=-1)
-    lower = np.where(values[rows, best] > 0, below[rows, best], top)
-    comparable = values[rows, best] > _COMPARABLE * spectrum[rows, top]
-    peaks = np.where(comparable, [lower, top], [top, lower])
-    return ((peaks + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD, floor
+def _c64(values: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
+    return np.ascontiguousarray(values, np.complex64)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from polysight.host.materials import (
     told_angle,
 )
 from polysight.host.polarimetry import correct_leakage
-from polysight.host.store import COLLECTION, read_settings, rig_of
+from polysight.host.store import COLLECTION, open_npz, read_settings, rig_of
 from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError
@@ -174,9 +175,9 @@ def _imaged_here(scan: LabelledScan, images: Path, notices: list[str]) -> Labell
     """The scan's boxes with the images made here, turned so that they lie as the authors' own images do."""
     file = images / scan.scan / "image.npz"
     try:
-        with np.load(file, allow_pickle=False) as z:
+        with open_npz(file) as z:
             h, v, valid = z["h"], z["v"], z["valid"]
-    except (OSError, ValueError, KeyError) as e:
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, DataError) as e:
         notices.append(f"{scan.scan}: no image made here: {e}")
         return None
     seen = valid & np.isfinite(h) & np.isfinite(v)

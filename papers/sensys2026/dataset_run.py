@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from polysight.host.jobs.steps import steps
 from polysight.host.materials import Permittivity, estimate_permittivity
 from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.report import INK, PALETTE
@@ -87,12 +88,13 @@ def reproduce_authors(
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
     failed: dict[str, str] = {}
-    for key in dict.fromkeys(keys) or MAKERS:
+    made = list(dict.fromkeys(keys) or MAKERS)
+    for key in steps(made, made):
         try:
             item = MAKERS[key](judge)
         except PolysightError as e:
             failed[key] = str(e)
-            sys.stderr.write(f"{key}: {e}\n")
+            sys.stderr.write(f"\n{key}: {e}\n")
             continue
         pictures |= write_item(out, item, origin)
         items.append(item)

@@ -6,7 +6,6 @@ import base64
 import csv
 import io
 import sys
-import time
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from matplotlib.figure import Figure
 
+from polysight.host.jobs.steps import steps
 from polysight.host.products import write_atomically, write_json
 from polysight.host.report import STAMP, png
 from polysight.papers.sensys2026.classification import fig18, fig20
@@ -85,17 +85,16 @@ def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> in
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
     failed: dict[str, str] = {}
-    for key in dict.fromkeys(keys) or MAKERS:
-        began = time.monotonic()
+    made = list(dict.fromkeys(keys) or MAKERS)
+    for key in steps(made, [f"simulating {TITLES[key]}" for key in made]):
         try:
             item = MAKERS[key](run)
             pictures |= write_item(out, item)
         except PolysightError as e:
             failed[key] = str(e)
-            sys.stderr.write(f"{key}: {e}\n")
+            sys.stderr.write(f"\n{key}: {e}\n")
             continue
         items.append(item)
-        sys.stderr.write(f"simulated {item.title}: {time.monotonic() - began:.0f} s\n")
     page = write_page(out, items, pictures, failed, run.quick)
     sys.stdout.write(f"{page}: {len(items)} simulated items beside the published values\n")
     return 1 if failed else 0

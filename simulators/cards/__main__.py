@@ -25,7 +25,15 @@ from polysight.simulators.cards.sync_in import StageTrack
 from polysight.simulators.faults import read_faults
 from polysight.simulators.process import announce_ready, command_line, die_with_parent, stop_requested
 from polysight.simulators.radars import LineServer, RadarSocket
-from polysight.simulators.scene import Disturbances, PatternSource, Scene, SignalSource, SimulatedRig, load_scene
+from polysight.simulators.scene import (
+    Disturbances,
+    PatternSource,
+    Scene,
+    SignalSource,
+    SimulatedRig,
+    load_scene,
+    without_offset,
+)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -37,6 +45,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--config", type=Path, required=True, help="rig file of the simulated rig")
     parser.add_argument("--wires", type=Path, required=True, help="Unix socket of the wires hub")
     parser.add_argument("--scene", type=Path, help="scene file; not needed with --pattern")
+    parser.add_argument(
+        "--offset-in-rig",
+        action="store_true",
+        help="the rig file tells the start frequencies, the scene's offset with it",
+    )
     parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene")
     parser.add_argument("--time-scale", type=float, default=1.0, help="wire time over wall time")
     parser.add_argument("--seed", type=int, default=None, help="default: the scene's")
@@ -80,6 +93,8 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     known = tuple(b.name for b in rig.boards)
     names = _check_arguments(args, known)
     scene = None if args.scene is None else load_scene(args.scene)
+    if scene is not None and args.offset_in_rig:
+        scene = without_offset(scene)
     base = {} if scene is None else {"loss": scene.disturbances.packet_loss}
     faults = read_faults(args.faults, args.fault, known, base, rig.radar.control)
     seed = args.seed if args.seed is not None else 0 if scene is None else scene.seed

@@ -1,8 +1,8 @@
 """A stand-in GPIO chip, for one program at a time: the unmodified libgpiod bindings talk to it as to a kernel.
 
-A library (`gpioshim.c` the calls, `lines.c` the lines) is preloaded into the program and answers the GPIO character
-device's calls; its outside world are the simulated wires (shared/wires.py). It is compiled on demand; :func:`missing`
-tells what that needs.
+A library (`gpioshim.c` the calls, `lines.c` the lines, `spidev.c` an SPI controller beside them) is preloaded into the
+program and answers the calls of the GPIO character device and of spidev; its outside world are the simulated wires
+(shared/wires.py). It is compiled on demand; :func:`missing` tells what that needs.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ def environment(
     label: str = "pinctrl-bcm2835",
     faults: tuple[str, ...] = (),
     wire_time: bool = False,
+    spi: Path | None = None,
+    **spi_settings: str,
 ) -> dict[str, str]:
     """Environment variables of a program that shall find a chip at `chip`.
 
@@ -60,6 +62,10 @@ def environment(
     wire_time
         The thread that reads edges lives in wire time, where a sleep is exact and over at once: nothing is late,
         however busy the machine is. Else everything is at real time.
+    spi
+        Path of a spidev device, made too: its transfers are edges of MOSI, GPIO 10.
+    spi_settings
+        `mosi`, `bufsiz`, `core_hz`: spidev.c says what they are.
 
     Raises
     ------
@@ -67,6 +73,8 @@ def environment(
         when the library does not compile.
     """
     variables = {"LD_PRELOAD": str(shim()), "GPIOSHIM_CHIP": str(chip), "GPIOSHIM_LABEL": label}
+    if spi is not None:
+        variables |= {"GPIOSHIM_SPI": str(spi)} | {f"GPIOSHIM_{k.upper()}": v for k, v in spi_settings.items()}
     if wire_time:
         variables["GPIOSHIM_CLOCK"] = "wires"
     if wires is not None:

@@ -6,6 +6,7 @@
  *                          changes of outputs, with the time (CLOCK_MONOTONIC) at which they were made
  *   GPIOSHIM_LABEL, GPIOSHIM_LINES                                    what the chip says of itself
  *   GPIOSHIM_FAULTS=denied,no-edges,busy:LINE,slow:US                 faults from the start
+ *   GPIOSHIM_SPI=PATH      a spidev device beside it: spidev.c
  *   GPIOSHIM_CLOCK=wires   edges carry their wire time; the thread that reads them lives in it: a sleep ends at once and
  *                          takes as long as was asked for. So a burst is exact however busy the machine is
  *   SIGUSR1                                                           the chip vanishes, as when a driver is unloaded
@@ -34,9 +35,11 @@
 #define EDGES (GPIO_V2_LINE_FLAG_EDGE_RISING | GPIO_V2_LINE_FLAG_EDGE_FALLING)
 #define MAX_EVENTS (GPIO_V2_LINES_MAX * 16) /* the kernel's limit */
 
-static char chip[200];
+#define BUFSIZ_FILE "/sys/module/spidev/parameters/bufsiz"
+
+static char chip[200], spi[200];
 static int no_edges, denied, slow_us;
-static uint8_t is_chip[MAX_FD];
+static uint8_t is_chip[MAX_FD], is_spi[MAX_FD];
 static struct request *by_fd[MAX_FD];
 
 /* ---- requests: each returns an error number, 0 for none; the mutex is held ---- */
@@ -154,11 +157,15 @@ static int ask_lines(struct request *r, int fd, unsigned long what, void *arg) {
 }
 
 /* ---- the calls that are stood in for ---- */
-int open(const char *path, int flags, ...) {
-  va_list more;
-  va_start(more, flags);
-  const int mode = va_arg(more, int);
-  va_end(more);
+static int show_bufsiz(void) {
+  char text[16];
+  const int length = shown_bufsiz(text, sizeof text), fd = memfd_create("bufsiz", MFD_CLOEXEC);
+  if (fd >= 0 && (write(fd, text, length) != length || lseek(fd, 0, SEEK_SET))) errno = EIO;
+  return fd;
+}
+
+static int open_one(const char *path, int flags, int mode) {
+  if (spi[0] && !strcmp(path, BUFSIZ_FILE)) return show_bufsiz();
   const int ours = chip[0] && !strcmp(path, chip);
   if (ours && (denied || gone)) {
     errno = gone ? ENODEV : EACCES;
@@ -166,16 +173,33 @@ int open(const char *path, int flags, ...) {
   }
   const int fd = REAL(open)(path, flags, mode);
   if (ours && fd >= 0 && fd < MAX_FD) is_chip[fd] = 1;
+  if (spi[0] && !strcmp(path, spi) && fd >= 0 && fd < MAX_FD) is_spi[fd] = 1;
   return fd;
 }
+
+#define OPEN(name) \
+  int name(const char *path, int flags, ...) { \
+    va_list more; \
+    va_start(more, flags); \
+    const int mode = va_arg(more, int); \
+    va_end(more); \
+    return open_one(path, flags, mode); \
+  }
+OPEN(open)
+OPEN(open64)
 
 int ioctl(int fd, unsigned long what, ...) {
   va_list more;
   va_start(more, what);
   void *arg = va_arg(more, void *);
   va_end(more);
-  if (fd < 0 || fd >= MAX_FD || !(is_chip[fd] || by_fd[fd])) return REAL(ioctl)(fd, what, arg);
+  if (fd < 0 || fd >= MAX_FD || !(is_chip[fd] || is_spi[fd] || by_fd[fd])) return REAL(ioctl)(fd, what, arg);
   what = (uint32_t)what; /* some callers extend the sign */
+  if (is_spi[fd]) { /* not under the mutex: the call lasts as long as the transfer */
+    const int done = ask_spi(what, arg);
+    if (done < 0) errno = -done;
+    return done < 0 ? -1 : done;
+  }
   pthread_mutex_lock(&mutex);
   const int error = gone ? ENODEV : is_chip[fd] ? ask_chip(what, arg) : ask_lines(by_fd[fd], fd, what, arg);
   pthread_mutex_unlock(&mutex);
@@ -207,7 +231,7 @@ ssize_t read(int fd, void *buffer, size_t size) {
 int close(int fd) {
   if (fd >= 0 && fd < MAX_FD) {
     pthread_mutex_lock(&mutex);
-    is_chip[fd] = 0;
+    is_chip[fd] = is_spi[fd] = 0;
     if (by_fd[fd]) release(by_fd[fd]);
     by_fd[fd] = 0;
     pthread_mutex_unlock(&mutex);
@@ -271,6 +295,12 @@ __attribute__((constructor)) static void start(void) {
   wire_clock = getenv("GPIOSHIM_CLOCK") && !strcmp(getenv("GPIOSHIM_CLOCK"), "wires");
   unlink(chip);
   if (symlink("/dev/null", chip)) give_up(chip);
+  if (getenv("GPIOSHIM_SPI")) {
+    snprintf(spi, sizeof spi, "%s", getenv("GPIOSHIM_SPI"));
+    read_spi_settings();
+    unlink(spi);
+    if (symlink("/dev/null", spi)) give_up(spi);
+  }
   shared = mmap(0, sizeof *shared, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
   if (shared == MAP_FAILED) give_up("mmap");
   signal(SIGUSR1, vanish);

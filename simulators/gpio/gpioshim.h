@@ -1,4 +1,4 @@
-/* What gpioshim.c (the calls that are stood in for) and lines.c (levels, edges and their times) share. */
+/* What gpioshim.c (the calls that are stood in for), lines.c (levels, edges, times) and spidev.c (transfers) share. */
 #ifndef GPIOSHIM_H
 #define GPIOSHIM_H
 #define _GNU_SOURCE
@@ -44,8 +44,14 @@ extern struct line lines[MAX_LINES];
 extern struct shared *shared;
 extern __thread uint64_t thread_ns; /* of a thread that lives in wire time */
 
+uint64_t now_ns(clockid_t clock);
+void sleep_until(uint64_t ns); /* CLOCK_MONOTONIC, or wire time in a thread that lives in it */
 int level(const struct line *line);
 void set_output(unsigned line, int value);
+void set_output_at(unsigned line, int value, uint64_t ns);
+void read_spi_settings(void);
+int ask_spi(unsigned long what, void *arg); /* bytes transferred, or an error number below 0 */
+int shown_bufsiz(char *text, int size);
 void carry(int alive);
 void *listen_to_wires(void *unused);
 

@@ -1,5 +1,6 @@
 /* The lines of the stand-in chip: times, outputs on their way to the simulated wires, and edges that come from there. */
 #include "gpioshim.h"
+#include <errno.h>
 #include <poll.h>
 #include <stdio.h>
 #include <string.h>
@@ -35,10 +36,16 @@ int clock_nanosleep(clockid_t clock, int flags, const struct timespec *t, struct
   return 0;
 }
 
-static uint64_t now_ns(clockid_t clock) {
+uint64_t now_ns(clockid_t clock) {
   struct timespec t;
   clock_gettime(clock, &t);
   return to_ns(&t);
+}
+
+void sleep_until(uint64_t ns) {
+  const struct timespec t = { ns / 1000000000, ns % 1000000000 };
+  while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, 0) == EINTR) {
+  }
 }
 
 static uint64_t edge_ns(clockid_t clock, uint64_t wire_ns) { /* the mutex is held */
@@ -52,7 +59,9 @@ static uint64_t edge_ns(clockid_t clock, uint64_t wire_ns) { /* the mutex is hel
 }
 
 /* ---- outputs ---- */
-void set_output(unsigned n, int value) {
+void set_output(unsigned n, int value) { set_output_at(n, value, 0); }
+
+void set_output_at(unsigned n, int value, uint64_t ns) { /* 0: now */
   if (shared->high[n] == value) return;
   if (wires < 0) {
     shared->high[n] = value;
@@ -60,7 +69,7 @@ void set_output(unsigned n, int value) {
   }
   const uint32_t head = shared->head;
   while (head - shared->tail >= RING) usleep(100); /* nothing is dropped */
-  shared->ring[head % RING] = (struct change){ now_ns(CLOCK_MONOTONIC), n, value };
+  shared->ring[head % RING] = (struct change){ ns ? ns : now_ns(CLOCK_MONOTONIC), n, value };
   shared->high[n] = value;
   shared->head = head + 1;
 }

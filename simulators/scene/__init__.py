@@ -29,6 +29,7 @@ from polysight.simulators.scene.scene_file import (
     apply_scene,
     decode_scene,
     load_scene,
+    without_offset,
 )
 from polysight.simulators.scene.simulated_scan import lost_bytes, row_offsets_mm, simulate, truth
 from polysight.simulators.scene.specimens import draw_specimens
@@ -59,6 +60,7 @@ __all__ = [
     "strips",
     "synced_cube",
     "truth",
+    "without_offset",
     "write_cube",
     "write_labels",
     "write_material",

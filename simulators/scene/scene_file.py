@@ -260,12 +260,17 @@ def decode_scene(raw: dict[str, Any], source: str) -> Scene:
     """
     if "disturbances" in raw:
         raw = {**raw, "disturbances": _switched(raw["disturbances"], source)}
-    return decode(raw, Scene, source)
+    return decode(raw, Scene, source, "docs/spec/scene-file.md names everything that a scene may hold")
 
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file. Raises ConfigError."""
     return decode_scene(read_toml(path), str(path))
+
+
+def without_offset(scene: Scene) -> Scene:
+    """The scene for a rig whose file tells the start frequencies: its own difference of them is in there."""
+    return msgspec.structs.replace(scene, disturbances=msgspec.structs.replace(scene.disturbances, if_offset_hz=0.0))
 
 
 def apply_scene(rig: Instrument, scene: Scene) -> Instrument:

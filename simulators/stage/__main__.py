@@ -46,6 +46,9 @@ class SerialPort:
         try:
             self._master, slave = os.openpty()
             tty.setraw(slave, termios.TCSANOW)
+            settings = termios.tcgetattr(slave)
+            settings[2] |= termios.HUPCL  # as a serial port has, and a pseudo terminal not
+            termios.tcsetattr(slave, termios.TCSANOW, settings)
             os.set_blocking(self._master, False)
             name = os.ttyname(slave)
             os.close(slave)
@@ -53,7 +56,7 @@ class SerialPort:
             self._watch = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
             if libc.inotify_add_watch(self._watch, os.fsencode(name), _IN_OPEN | _IN_CLOSE) < 0:
                 raise OSError(ctypes.get_errno(), f"no watch on {name}")
-            self._clients = 0
+            self._clients, self._dtr = 0, False
             fresh = link.with_name(link.name + ".new")
             fresh.unlink(missing_ok=True)
             fresh.symlink_to(name)
@@ -75,7 +78,10 @@ class SerialPort:
         poll.poll(timeout_ms)
 
     def opened(self) -> bool:
-        """Take note of opening and closing. True when opened anew, however shortly it had been closed."""
+        """Take note of opening and closing. True when DTR rose, which resets an UNO, however shortly it had been low.
+
+        The kernel raises DTR when a serial port is opened, and lowers it at the last close unless HUPCL was taken away.
+        """
         try:
             events = os.read(self._watch, 4096)
         except BlockingIOError:
@@ -83,10 +89,12 @@ class SerialPort:
         anew = False
         for _, mask, _, _ in _EVENT.iter_unpack(events):  # a watch on one file: no names follow
             if mask & _IN_OPEN:
-                anew |= self._clients == 0
+                anew |= not self._dtr
+                self._dtr = True
                 self._clients += 1
             if mask & _IN_CLOSE:
                 self._clients -= 1
+                self._dtr = self._clients > 0 or not termios.tcgetattr(self._master)[2] & termios.HUPCL
         return anew
 
     def read(self) -> bytes:

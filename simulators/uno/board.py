@@ -145,6 +145,10 @@ class EmulatedUno:
         """The reset button."""
         self._do("reset")
 
+    def hang(self) -> None:
+        """Let the main program stand still until the next reset; interrupts go on."""
+        self._do("hang")
+
     def watch(self, *pins: int) -> None:
         """Edges of these pins are collected from now on."""
         self._do("watch " + ",".join(map(str, pins)))
@@ -183,8 +187,13 @@ def emulator() -> Path:
     return compiled("unosim", _SOURCES, [*_CC, "-o", "{folder}/unosim", *code, *_LIBRARIES], _ON_FAILURE)
 
 
-def firmware() -> Path:
+def firmware(compiler: Path | None = None) -> Path:
     """The image that `make flash` puts on a board, a .hex file.
+
+    Parameters
+    ----------
+    compiler
+        Folder of another avr-gcc and its tools; None: those that are on the path.
 
     Raises
     ------
@@ -199,4 +208,5 @@ def firmware() -> Path:
         )
     sources = [p for p in SKETCH_DIR.iterdir() if p.suffix in (".cpp", ".h", ".ino", ".mk")]
     command = ["make", "-s", "-C", str(SKETCH_DIR), "firmware", "AVR_B={folder}"]
+    command += [f"AVR={compiler}/avr-"] if compiler else []
     return compiled("arduino_stage.hex", sources, command, _ON_FAILURE)

@@ -33,6 +33,24 @@ static void tifr_write(avr_t *a, avr_io_addr_t addr, uint8_t value, void *param)
     if (flags[i]->raised.reg == addr && value >> flags[i]->raised.bit & 1) avr_clear_interrupt(a, flags[i]);
 }
 
+/* A program that stands still is a jump to itself; a reset cures it, the watchdog's too. Whose reset it was and when: simavr
+ * begins its count of cycles anew. */
+#define JUMP_TO_ITSELF 0xcfff
+static int hangs, by_watchdog;
+static avr_flashaddr_t hangs_at;
+static uint16_t jumped_over;
+static uint64_t reset_at;
+
+static void put_word(avr_flashaddr_t at, uint16_t word) {
+  avr->flash[at] = word & 0xff;
+  avr->flash[at + 1] = word >> 8;
+}
+
+static void on_reset(avr_t *a) {
+  by_watchdog = 1; /* unless reset() says otherwise */
+  reset_at = a->cycle;
+}
+
 static void correct_simavr(void) {
   for (avr_io_t *io = avr->io_port; io; io = io->next) {
     if (strcmp(io->kind, "timer")) continue;
@@ -70,21 +88,40 @@ int chip_begin(const char *hex) {
   avr->frequency = HZ;
   avr_loadcode(avr, code, size, base);
   avr->codeend = avr->flashend;
+  avr->reset = on_reset;
   correct_simavr();
   after_reset();
   return 0;
 }
 
-void reset(void) {
+static void begin_anew(uint64_t now, const char *why) {
+  avr->cycle = now;
+  by_watchdog = 0;
   serial_reset();
+  if (hangs) put_word(hangs_at, jumped_over);
+  hangs = 0;
+  after_reset();
+  rig_reset();
+  say("X %llu %s\n", (u64)now, why);
+}
+
+void reset(void) {
   const avr_cycle_count_t now = avr->cycle;
   avr_reset(avr);
   memset(avr->data + 32, 0, 0x100 - 32); /* the io space: pins are let go */
   avr_reset(avr);
-  avr->cycle = now;
-  after_reset();
-  rig_reset();
-  say("X %llu reset\n", (u64)avr->cycle);
+  begin_anew(now, "reset");
+}
+
+int hang(void) {
+  while (!hangs && run_to(avr->cycle + 1)) {
+    if (!avr->sreg[S_I] || avr->interrupts.running_ptr) continue; /* in an interrupt, or under a lock */
+    hangs_at = avr->pc;
+    jumped_over = avr->flash[hangs_at] | avr->flash[hangs_at + 1] << 8;
+    put_word(hangs_at, JUMP_TO_ITSELF);
+    hangs = 1;
+  }
+  return hangs;
 }
 
 static avr_cycle_count_t stop_here(avr_t *a, avr_cycle_count_t when, void *param) {
@@ -97,6 +134,10 @@ int run_to(uint64_t end) {
   avr_cycle_timer_register(avr, end - avr->cycle, stop_here, 0);
   while (avr->cycle < end && !ended) {
     const int state = avr_run(avr);
+    if (by_watchdog) {
+      begin_anew(reset_at, "watchdog");
+      if (avr->cycle < end) avr_cycle_timer_register(avr, end - avr->cycle, stop_here, 0);
+    }
     if (state == cpu_Done || state == cpu_Crashed) {
       say("X %llu crash\n", (u64)avr->cycle);
       return 0;

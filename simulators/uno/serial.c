@@ -16,7 +16,7 @@ DEFINE_FIFO(uint16_t, uart_fifo);
 int pty = -1;
 uint64_t pty_bytes, pty_sent;
 static avr_uart_t *uart;
-static int pty_watch = -1, pty_clients;
+static int pty_watch = -1, pty_clients, dtr;
 static uint64_t line_busy;
 static uint8_t to_board[1 << 16];
 static unsigned to_head, to_tail;
@@ -96,6 +96,7 @@ int make_pty(const char *link) {
   if (openpty(&pty, &far, name, 0, 0)) return -1;
   tcgetattr(far, &t);
   cfmakeraw(&t);
+  t.c_cflag |= HUPCL; /* as a serial port has, and a pseudo terminal not */
   tcsetattr(far, TCSANOW, &t);
   close(far);
   fcntl(pty, F_SETFL, O_NONBLOCK);
@@ -106,14 +107,24 @@ int make_pty(const char *link) {
   return symlink(name, fresh) || rename(fresh, link) ? -1 : 0;
 }
 
+/* The kernel raises DTR when a serial port is opened, and lowers it at the last close unless HUPCL was taken away. */
+static void closed(void) {
+  struct termios t;
+  if (--pty_clients == 0 && !tcgetattr(pty, &t) && t.c_cflag & HUPCL) dtr = 0;
+}
+
 int pty_opened(void) {
   char events[4096] __attribute__((aligned(8)));
   int anew = 0;
   for (ssize_t n; (n = read(pty_watch, events, sizeof events)) > 0;)
     for (char *e = events; e < events + n; e += sizeof(struct inotify_event) + ((struct inotify_event *)e)->len) {
       const uint32_t what = ((struct inotify_event *)e)->mask;
-      if (what & IN_OPEN) anew |= pty_clients++ == 0;
-      if (what & IN_CLOSE) pty_clients--;
+      if (what & IN_OPEN) {
+        anew |= !dtr;
+        dtr = 1;
+        pty_clients++;
+      }
+      if (what & IN_CLOSE) closed();
     }
   return anew;
 }

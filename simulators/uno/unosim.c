@@ -11,11 +11,12 @@
  *   settle [N]   until nothing is on the serial line (with --pty: and N bytes in all were read from it)
  *   rest CYCLES  ... until no motor has stepped for 50 ms         inputs MASK  press switches (1 x, 2 y, 4 emergency)
  *   slip DX DY   lose steps                                       reset        the reset button
+ *   hang         the main program stands still until a reset; interrupts go on
  *   watch PINS   edges to report from now on                      cost         figures so far, below
  * R tells the motors' positions and how many bytes went to the pseudo terminal. What happened:
  *   T <cycle> <hex>                                     a byte from the board, at the end of its stop bit
  *   E <cycle> <pin> <0|1> <x> <left> <right> <step>     an edge; the motors' positions and the cycle of the last step
- *   X <cycle> <word>                                    reset, overrun (a byte lost in the USART), crash
+ *   X <cycle> <word>                                    reset, watchdog (its reset), overrun (a byte lost in the USART), crash
  *   C <vector> <count> <most cycles>                    per interrupt, entry to end of reti
  *   W <cycles> <cycles> <cycles>                        shortest: step pulse, direction set-up, direction hold
  * At real time standard input is not read; trigger edges and motion go to the wires (docs/spec/simulated-rig.md), in
@@ -91,6 +92,8 @@ static int command(char *s) {
     watch(s + 6);
   } else if (!strncmp(s, "reset", 5)) {
     reset();
+  } else if (!strncmp(s, "hang", 4)) {
+    return hang();
   } else if (!strncmp(s, "cost", 4)) {
     tell_interrupt_costs();
     tell_pin_costs();
@@ -138,7 +141,7 @@ static void keep_pace(double speed) {
 static int serve_real_time(double speed, uint64_t boot_cycles) {
   anchor_ns = wall_ns();
   while (!ended) {
-    if (pty_opened()) { /* DTR resets the board, and the boot loader swallows what comes meanwhile */
+    if (pty_opened()) { /* the boot loader swallows what comes meanwhile */
       reset();
       for (const uint64_t boots_at = avr->cycle + boot_cycles; avr->cycle < boots_at && !ended;) {
         avr->cycle += SLICE;

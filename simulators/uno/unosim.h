@@ -48,11 +48,12 @@ void feed(uint8_t byte);
 int line_idle(void);
 uint64_t line_idle_since(void);
 uint64_t line_backlog(void); /* time that what is on its way to the board takes */
-int pty_opened(void);        /* whether a client has opened it, however shortly it had been closed */
+int pty_opened(void);        /* whether DTR rose since the last look: that resets the board */
 void read_pty(int wait_ms);
 
 /* chip.c: the microcontroller */
 int chip_begin(const char *hex);
 void reset(void);
+int hang(void); /* until the next reset */
 int run_to(uint64_t cycle);
 void tell_interrupt_costs(void);

@@ -5,35 +5,12 @@ from __future__ import annotations
 import pytest
 
 from polysight.host.capture.earlier_records import Past
-from tests.support.capture.records import FULL, Record, is_original_or_masked, place
+from tests.support.capture.records import FULL, Card, Record, is_original_or_masked, place
 
 FRAME = 4096
 FULL_ENDS = 91 * FRAME
 SHORT_END = 62 * FRAME
 MOST_REFUSED = 8  # perfect records in a row, after anything that may have happened (docs/spec/placement.md)
-
-
-class Card:
-    """Records one behind the other; `reset` begins its counters anew."""
-
-    def __init__(self, size: int, count: int = 0, sequence: int = 1) -> None:
-        self._size, self._count, self._sequence, self._seed = size, count, sequence, 0
-
-    def reset(self) -> None:
-        self._count, self._sequence = 0, 1
-
-    def record(self, resets: tuple[int, ...] = ()) -> Record:
-        """The next record; the counters begin anew before each of the packets `resets`."""
-        self._seed += 1
-        whole = Record.make(self._size, 0, 1, self._seed)
-        packets = []
-        for k in range(len(whole.packets)):
-            if k in resets:
-                self.reset()
-            payload = whole.data[k * FULL : (k + 1) * FULL]
-            packets.append(self._sequence.to_bytes(4, "little") + self._count.to_bytes(6, "little") + payload)
-            self._sequence, self._count = self._sequence + 1, self._count + len(payload)
-        return Record(whole.data, packets)
 
 
 def rows_until_accepted(card: Card, size: int, past: Past) -> int:

@@ -1,7 +1,9 @@
 """Many scans at once: each on its own, finished ones passed over, a failing one alone, a table at the end."""
 
 import json
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from polysight.host.cli.main import main
 from polysight.host.jobs import batch as many
 from polysight.host.jobs.batch import Outcome, at_once, finished, jobs_of, memory_bytes, process_many, scans_of, table
+from polysight.host.process import cores
 from polysight.host.process.request import ProcessRequest
 from polysight.host.products.files import FINISHED
 from polysight.shared.errors import ConfigError
@@ -33,6 +36,14 @@ for name in ("image.npz", "quality.json"):
     (out / name).write_text("{}")
 (out / ".finished.json").write_text(json.dumps({"made_with": job["made_with"], "memory_gb": 0.5}))
 """
+
+KILLS_ITS_WORKER = """
+    told = out.parent / "killed"
+    if not told.exists():
+        told.write_text("")
+        os.kill(os.getppid(), 9)
+        os.read(int(os.environ["POLYSIGHT_PARENT_ALIVE"]), 1)
+        sys.exit("the worker is gone")"""
 
 
 @pytest.fixture
@@ -151,7 +162,7 @@ def test_scans_at_a_time_follow_cores_and_memory():
     assert at_once(70_000, cores=8, free_bytes=3 * need) == 2
     assert at_once(70_000, cores=8, free_bytes=0) == 1
     assert many.free_memory_bytes() > 0
-    assert many.cores() >= 1
+    assert cores() >= 1
 
 
 def test_the_table_names_every_scan_and_counts(tmp_path):
@@ -201,6 +212,74 @@ def test_a_dask_cluster_does_the_same(tmp_path):
     assert all(finished(j) == (j.name != "bad") for j in todo)
     with pytest.raises(ConfigError, match="no Dask scheduler"):
         list(many.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
+
+
+@pytest.mark.usefixtures("worker")
+def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
+    """A Dask worker that is killed behind the mark has its scan sent to another one."""
+    scans(tmp_path / "in", "a")
+    (job,) = jobs(tmp_path / "in", "a")
+    assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3
+    assert (tmp_path / "out" / "runs.txt").read_text() == "a\n"
+    again = process_many([job], tmp_path / "out", 1, again=True)
+    assert [o.status for o in again] == ["done"]
+    assert (tmp_path / "out" / "runs.txt").read_text() == "a\na\n"
+
+
+STARTER = """
+import sys
+from pathlib import Path
+from polysight.host.jobs import batch
+child = "from polysight.host.jobs import batch_worker as w, batch; import os, sys, time;" \
+    "w.end_with(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
+batch.PROGRAM = (sys.executable, "-c", child, sys.argv[2])
+batch.run_scan(batch.jobs_of([batch.ProcessRequest(data=sys.argv[1], out=sys.argv[1] + "-out")])[0])
+"""
+
+
+@pytest.mark.timeout(900)
+def test_the_program_of_a_killed_worker_ends_with_it(tmp_path):
+    scans(tmp_path / "in", "a")
+    told = tmp_path / "pid"
+    starter = subprocess.Popen([sys.executable, "-c", STARTER, str(tmp_path / "in" / "a"), str(told)])
+    try:
+        while not (told.exists() and told.read_text()):
+            assert starter.poll() is None
+            time.sleep(0.1)
+        child = Path("/proc") / told.read_text()
+        assert child.exists()
+    finally:
+        starter.kill()
+        starter.wait()
+    while child.exists() and "State:\tZ" not in (child / "status").read_text():
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_killed_dask_worker_loses_no_scan(tmp_path):
+    """One of two workers is killed while it processes; its nanny starts another one, and every scan is done."""
+    distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
+    import dask
+
+    (tmp_path / "worker.py").write_text(WORKER.replace("time.sleep(600)", KILLS_ITS_WORKER))
+    preload = tmp_path / "preload.py"
+    preload.write_text(
+        "from polysight.host.jobs import batch\n"
+        f"batch.PROGRAM = ({sys.executable!r}, {str(tmp_path / 'worker.py')!r})\n"
+    )
+    names = ("a", "b", "slow", "c")
+    scans(tmp_path / "in", *names)
+    todo = jobs(tmp_path / "in", *names)
+    with (
+        dask.config.set({"distributed.worker.preload": [str(preload)]}),
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp"
+        ) as cluster,
+    ):
+        outcomes = process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
+    assert {o.name: o.status for o in outcomes} == dict.fromkeys(names, "done")
+    assert (tmp_path / "out" / "runs.txt").read_text().split().count("slow") == 2
 
 
 @pytest.mark.timeout(900)

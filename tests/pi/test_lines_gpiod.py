@@ -31,7 +31,7 @@ def chip():
 
 @pytest.fixture
 def lines(chip, instrument):
-    return GpiodLines(instrument.pi, chip.module, chip.path, clock=chip)
+    return GpiodLines(instrument.pi, chip.module, chip.path, clock=chip, ioctl=chip.ioctl)
 
 
 def test_lines_are_requested_as_the_rig_file_says(chip, lines, instrument):
@@ -47,29 +47,31 @@ def test_lines_are_requested_as_the_rig_file_says(chip, lines, instrument):
     assert not any(chip.owner)
 
 
-def test_an_edge_and_its_burst(chip, lines):
+@pytest.mark.parametrize(("width_ns", "made_ns"), [(25, 0), (1000, 0), (1001, 1001), (4000, 4000)])
+def test_an_edge_and_its_burst(chip, lines, width_ns, made_ns):
+    """A short pulse is two calls with nothing between them: the clock stands still. A longer one is waited for."""
     chip.drive(26, 1, 5_000)
     chip.drive(26, 0, 25_000)
     edge = lines.wait_edge(0.1)
     assert edge == (5_000, 1)
-    sent = send_burst(lines, SPEC, edge.t_ns + FIRST_PULSE_DELAY_NS)
+    sent = send_burst(lines, SPEC._replace(width_ns=width_ns), edge.t_ns + FIRST_PULSE_DELAY_NS)
     starts = [edge.t_ns + FIRST_PULSE_DELAY_NS + k * SPEC.period_ns for k in range(4)]
-    assert chip.log == [x for t in starts for x in ((t, 22, 1), (t + 1000, 22, 0))]
-    assert (sent.pulses, sent.width_max_ns) == (4, 1000)
+    assert chip.log == [x for t in starts for x in ((t, 22, 1), (t + made_ns, 22, 0))]
+    assert (sent.pulses, sent.width_max_ns) == (4, made_ns)
 
 
 def test_wiring_lines_sets_all_outputs_in_one_request(chip, instrument):
     pi = msgspec.structs.replace(instrument.pi, sync_out=(22, 23, 24), wiring="lines")
-    lines = GpiodLines(pi, chip.module, chip.path, clock=chip)
+    lines = GpiodLines(pi, chip.module, chip.path, clock=chip, ioctl=chip.ioctl)
     assert len({chip.owner[n] for n in pi.sync_out}) == 1
-    lines.set_output(True)
-    assert chip.level[22:25] == [1, 1, 1]
+    lines.pulse(2000)
+    assert chip.log == [(t, n, v) for t, v in ((0, 1), (2000, 0)) for n in pi.sync_out]
     lines.close()
     assert chip.level[22:25] == [0, 0, 0]
 
 
 def test_a_buffer_that_ran_over_is_seen_in_the_numbers(chip, instrument):
-    lines = GpiodLines(instrument.pi, chip.module, chip.path, clock=chip)
+    lines = GpiodLines(instrument.pi, chip.module, chip.path, clock=chip, ioctl=chip.ioctl)
     posted = []
     loop = TriggerLoop(lines, posted.append, lambda: None)
     loop.arm(RowJob(0, 1, 5000, SPEC))
@@ -102,7 +104,7 @@ def test_a_chip_that_vanishes(chip, lines):
     with pytest.raises(DeviceError, match="gone"):
         lines.wait_edge(0.1)
     with pytest.raises(DeviceError, match="gone"):
-        lines.set_output(True)
+        lines.pulse(1000)
 
 
 def test_a_chip_that_is_not_there_lists_what_is(tmp_path):

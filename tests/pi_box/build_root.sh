@@ -83,7 +83,8 @@ customize() { # $1: the root
   for part in drivers/gpu drivers/media drivers/infiniband drivers/net/wireless drivers/net/ethernet drivers/scsi sound; do
     left_out+=(--dpkgopt="path-exclude=/lib/modules/*/kernel/$part/*")
   done
-  export -f customize
+  # As a file: a shell between here and there (dash) drops exported functions.
+  { echo 'set -euo pipefail'; declare -f customize; echo 'customize "$1"'; } >"$work/customize"
   export work
   # The card's driver and what it needs, instead of every driver there is: the RAM disk is unpacked by an emulated processor.
   mmdebstrap --arch=arm64 --variant=minbase \
@@ -92,7 +93,7 @@ customize() { # $1: the root
     --setup-hook='mkdir -p "$1/etc/initramfs-tools/conf.d" "$1/usr/share/initramfs-tools/modules.d"' \
     --setup-hook='echo MODULES=list >"$1/etc/initramfs-tools/conf.d/box"' \
     --setup-hook='printf "%s\n" bcm2835 bcm2835_dma sdhci_iproc mmc_block ext4 >"$1/usr/share/initramfs-tools/modules.d/box"' \
-    --customize-hook='bash -euc "customize \"\$1\"" customize "$1"' \
+    --customize-hook='bash "$work/customize" "$1"' \
     bookworm "$work/root" http://deb.debian.org/debian
   truncate -s 2G "$work/box/root.img"
   mke2fs -q -t ext4 -E root_owner=0:0 -d "$work/root" "$work/box/root.img"

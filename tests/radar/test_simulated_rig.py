@@ -21,7 +21,7 @@ from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import RadarBoard as Simulated
 from polysight.simulators.radars import RadarSocket, make_image
 from polysight.simulators.rig import derive
-from polysight.simulators.scene import SimulatedRig, decode_scene
+from polysight.simulators.scene import SimulatedRig, decode_scene, without_offset
 from tests.support.rigs import published_rig
 
 EMPTY = decode_scene({"name": "the direct path alone"}, "test")
@@ -36,12 +36,15 @@ def test_the_derived_rig_breaks_no_constraint_and_reaches_every_board(tmp_path: 
 
 
 def test_programmed_offsets_make_the_signals_that_the_scene_s_offset_made(tmp_path: Path):
-    """The same start frequencies by either way: the same samples."""
-    plain = derive(published_rig(), EMPTY, tmp_path)
+    """The same start frequencies, told by the scene, by the rig file or programmed: the same samples."""
+    told = derive(published_rig(), EMPTY, tmp_path)
     native = derive(published_rig(), EMPTY, tmp_path, native=True)
     at = np.zeros(2)
-    a, b = (SimulatedRig(rig, EMPTY, 5).signals("RH", at, at) for rig in (plain, native))
+    a = SimulatedRig(published_rig(), EMPTY, 5).signals("RH", at, at)
+    b = SimulatedRig(told, without_offset(EMPTY), 5).signals("RH", at, at)
     np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(a, SimulatedRig(native, EMPTY, 5).signals("RH", at, at))
+    assert {b.start_offset_hz for b in told.recorded} == {EMPTY.disturbances.if_offset_hz}
     moved = tuple(
         msgspec.structs.replace(x, start_offset_hz=x.start_offset_hz + 1e5) if x.name == "RH" else x
         for x in native.boards

@@ -40,7 +40,7 @@ def rows_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
     found: dict[str, list[np.ndarray]] = {"RH": [], "RV": []}
     a, b = pipeline.source.instrument.chirp.linear_samples
     for index in pipeline.source.rows():
-        for board, row in pipeline.add_row(index).items():
+        for board, row in pipeline.synchronise_row(index).items():
             assert row.valid.all()
             samples = row.samples[:, ::-1] if index % 2 else row.samples
             found[board].append(samples[..., a:b])

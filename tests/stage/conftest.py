@@ -79,11 +79,11 @@ def uno_programs() -> tuple[Path, Path]:
 
 @pytest.fixture
 def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., EmulatedUno]]:
-    """Makes emulated boards; takes the further arguments of EmulatedUno."""
+    """Makes emulated boards; takes the further arguments of EmulatedUno, and another image."""
     made: list[EmulatedUno] = []
 
-    def make(**arguments: object) -> EmulatedUno:
-        made.append(EmulatedUno(*uno_programs, **arguments))
+    def make(image: Path = uno_programs[1], **arguments: object) -> EmulatedUno:
+        made.append(EmulatedUno(uno_programs[0], image, **arguments))
         return made[-1]
 
     yield make

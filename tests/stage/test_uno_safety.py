@@ -11,7 +11,8 @@ from polysight.shared.stage_line import Immediate, Parameter
 from polysight.simulators.uno import HZ
 
 US, MS = HZ // 1_000_000, HZ // 1000
-TRIGGER, X_PUL = 2, 5
+TRIGGER, X_PUL, DRIVERS_OFF = 2, 5, 7
+WATCHDOG_MS = 250 * 1.1  # its oscillator is one of 10 %
 TOP_RATE = 20_000  # steps/s
 CHATTER = {
     "yes": lambda _: b"y\n" * 6,
@@ -49,6 +50,49 @@ def test_chatter_is_no_heartbeat(host, kind: str):
     host.uno.received.clear()
     status = host.status()
     assert (status.integer("alarm"), status.integer("homed")) == (11, 0)
+
+
+@pytest.mark.parametrize("verb", ["MOVE", "ROW", "HOME"])
+def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
+    """It hangs in motion while the step interrupt goes on: the motors rest, and the board knows no position."""
+    arguments = {"MOVE": (100_000, 0, TOP_RATE), "ROW": (9000, 400, 100, 0, 4000), "HOME": ()}[verb]
+    if verb == "HOME":
+        host.motion("MOVE", 20_000, 20_000, TOP_RATE)
+    host.uno.watch(X_PUL, TRIGGER, DRIVERS_OFF)
+    host.obeyed(verb, *arguments)
+    host.uno.run_ms(800)
+    host.uno.edges.clear()
+    host.uno.hang()
+    hung = host.uno.cycle
+    for _ in range(20):  # a host that notices nothing
+        host.uno.feed(bytes([Immediate.STATUS]))
+        host.uno.run_ms(25)
+    assert host.uno.troubles == ["watchdog"]
+    assert [e.cycle for e in host.uno.edges if e.pin == X_PUL and e.value][-1] <= hung + WATCHDOG_MS * MS
+    assert [(e.pin, e.value) for e in host.uno.edges][-1] == (DRIVERS_OFF, 1)
+    replies = host.replies()
+    assert replies[0].kind == "banner"
+    assert replies[-1].integer("homed") == 0
+    assert host.command("MOVE", 0, 0, 4000).number == 18
+    host.obeyed("HELLO")
+    assert host.command("MOVE", 0, 0, 4000).number == 19
+    host.obeyed("ENABLE", 1)
+    assert host.command("MOVE", 0, 0, 4000).number == 8
+    host.set(Parameter.HEARTBEAT, 60_000)
+    host.motion("HOME")
+
+
+def test_a_program_that_works_is_never_reset(host):
+    """Ten seconds of rows and of everything that takes the main program's time."""
+    for turn in range(10):
+        host.obeyed("ROW", 6000, 40, 150, 400 * (turn % 2), TOP_RATE)
+        for _ in range(40):
+            host.uno.feed(b"N1 SET 0 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9*0000\n" * 4)
+            host.uno.feed(bytes([Immediate.STATUS]))
+            host.uno.run_ms(25)
+        host.uno.rest()
+        host.replies()
+    assert host.uno.troubles == []
 
 
 @pytest.mark.parametrize("mask", [1, 2, 4, 7])

@@ -1,4 +1,4 @@
-import dataclasses
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -113,6 +113,22 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     assert done.stages["averaged"][2] == pytest.approx(done.direct_amplitude.std() / 800, rel=0.3)
 
 
+def test_a_sample_of_positions_tells_what_all_of_them_tell(rig, paths, noise, setup):
+    signal, rng = paths(rig.receivers[1], 300, 1.0, np.random.default_rng(8))[0], np.random.default_rng(3)
+    turn = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
+    frames = 800 * (signal.swapaxes(0, 1)[:, :, None] * turn)
+    frames = (frames + 800 * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)
+    some, every = (synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=n)) for n in (64, 300))
+    assert {name: values.shape[1] for name, values in some.errors.items() if name != "referenced"} == {
+        "received": 64 * PULSES,
+        "aligned": 64 * PULSES,
+        "averaged": 64,
+    }
+    assert every.errors["averaged"].shape[1] == 300
+    for stage, spread in every.stages.items():
+        np.testing.assert_allclose(some.stages[stage], spread, rtol=0.35)
+
+
 def test_clipped_and_missing_chirps_are_left_out(row, setup):
     frames, valid, ideal = row()
     frames[2, 3 * PULSES + 1, 40] = 32767
@@ -130,7 +146,7 @@ def test_clipped_and_missing_chirps_are_left_out(row, setup):
 def test_bursts_of_one_chirp(row, setup):
     """Nothing to align with: the direct path alone synchronises, and what needs two chirps is not told."""
     frames, valid, ideal = row(snr_db=20)
-    one = dataclasses.replace(setup, pulses=1)
+    one = replace(setup, pulses=1)
     done = synchronise_row(frames[:, ::PULSES], valid[::PULSES], one)
     assert done.valid.all()
     assert (done.chirps == 1).all()

@@ -10,7 +10,7 @@ from polysight.host.store.source import Source
 from polysight.host.store.sources.published import SYNCED, PublishedCubes, PublishedScan
 from polysight.host.store.sources.published_settings import COLLECTION
 from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.errors import DataError
+from polysight.shared.errors import DataError, no_such
 
 
 def is_source(path: Path) -> bool:
@@ -19,7 +19,7 @@ def is_source(path: Path) -> bool:
     return path.is_dir() and (any((path / name).exists() for name in known) or any(path.glob("*" + SYNCED)))
 
 
-def open_source(path: Path, base: Instrument | Path | None = None) -> Source:
+def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool = False) -> Source:
     """Open a recorded scan.
 
     Parameters
@@ -29,6 +29,8 @@ def open_source(path: Path, base: Instrument | Path | None = None) -> Source:
     base
         Rig whose geometry, stage and limits an authors' scan takes over, since their files do not tell them; a rig
         file is read only where it is needed.
+    dropped
+        Also a scan whose raw rows were dropped, for what is made from its kept samples.
 
     Raises
     ------
@@ -39,8 +41,11 @@ def open_source(path: Path, base: Instrument | Path | None = None) -> Source:
     """
     if (path / MANIFEST).exists():
         scan = ScanFolder.load(path)
-        require_raw(scan)
+        if not dropped:
+            require_raw(scan)
         return scan
+    if not path.exists():
+        raise no_such(path)
     if not is_source(path):
         raise DataError(
             f"{path}: not a scan: neither {MANIFEST} nor {COLLECTION} nor *{SYNCED} is in it",

@@ -30,6 +30,29 @@ class Record:
         return k * FULL, min((k + 1) * FULL, len(self.data))
 
 
+class Card:
+    """Records one behind the other; `reset` begins its counters anew."""
+
+    def __init__(self, size: int, count: int = 0, sequence: int = 1) -> None:
+        self._size, self._count, self._sequence, self._seed = size, count, sequence, 0
+
+    def reset(self) -> None:
+        self._count, self._sequence = 0, 1
+
+    def record(self, resets: tuple[int, ...] = ()) -> Record:
+        """The next record; the counters begin anew before each of the packets `resets`."""
+        self._seed += 1
+        whole = Record.make(self._size, 0, 1, self._seed)
+        packets = []
+        for k in range(len(whole.packets)):
+            if k in resets:
+                self.reset()
+            payload = whole.data[k * FULL : (k + 1) * FULL]
+            packets.append(encode_packet(self._sequence, self._count, payload))
+            self._sequence, self._count = self._sequence + 1, self._count + len(payload)
+        return Record(whole.data, packets)
+
+
 def log_of(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> PacketLog:
     """The packets of a row as a receiver logs them, a batch every nanosecond."""
     log = PacketLog(size)

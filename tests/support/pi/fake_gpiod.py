@@ -5,6 +5,7 @@ Enums and LineSettings are the real ones, so that a misspelt or impossible setti
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from typing import Any
 
 import gpiod as real
 from gpiod import line
+
+SET_VALUES = 3 << 30 | 16 << 16 | 0xB4 << 8 | 0x0F  # <linux/gpio.h>: _IOWR(0xB4, 0x0F, two 64-bit words)
 
 
 class FakeChip:
@@ -30,6 +33,14 @@ class FakeChip:
 
     def sleep_until(self, t_ns: int) -> None:
         self.t = max(self.t, t_ns)
+
+    def ioctl(self, fd: int, what: int, values: bytes) -> None:
+        """Set or clear lines of the request with this descriptor: bit n is its n-th line."""
+        assert what == SET_VALUES
+        bits, mask = struct.unpack("=QQ", values)
+        (request,) = {r for r in self.owner if r and r.fd == fd}
+        assert mask == (1 << len(request.settings)) - 1
+        request.set_values({n: line.Value(bits >> i & 1) for i, n in enumerate(request.settings)})
 
     def drive(self, n: int, value: int, t_ns: int) -> None:
         """The outside world drives an input."""
@@ -62,6 +73,7 @@ class FakeChip:
 
 class FakeRequest:
     def __init__(self, chip: FakeChip, config: dict[Any, real.LineSettings], buffer: int | None) -> None:
+        self.fd = id(self)
         self.chip, self.settings = chip, {n: s for key, s in config.items() for n in key}
         self.events: deque[Any] = deque()
         self.capacity, self.seq = buffer or 16 * len(self.settings), 0

@@ -40,6 +40,13 @@ class FakeLines:
         self.t = max(self.t, edge.t_ns)
         return edge
 
+    def pulse(self, width_ns: int) -> tuple[int, int]:
+        rise = self.t
+        self.set_output(True)
+        self.sleep_until(rise + width_ns)
+        self.set_output(False)
+        return rise, self.t
+
     def set_output(self, active: bool) -> None:
         self.t += self.long(len(self.changes))
         self.changes.append((self.t, active))

@@ -1,0 +1,304 @@
+"""The reduced samples of a scan on disk (docs/spec/samples.md): images are made again from them, without raw data.
+
+`KeptSamples` belongs to one pipeline. It gives a row back where the row on disk was made from the same bytes in the
+same way, and writes it where it was not. Nothing depends on it: what is absent, torn or damaged is synchronised anew.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import threading
+import weakref
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypedDict, Unpack
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.host.imaging import (
+    AS_IN_RIG_FILE,
+    PLANE_REACH_M,
+    ImageBuilder,
+    ImagedWith,
+    ReducedRow,
+    SubBandImages,
+    View,
+    needed_gate_m,
+)
+from polysight.host.process.quality import Quality
+from polysight.host.store import ScanFolder, Source, crc32, manifest
+from polysight.host.sync import HighPass
+from polysight.shared.config import Instrument
+
+FOLDER, HEAD, ROWS = "samples", "samples.json", "rows.jsonl"
+FORMAT = 1
+MAKING = 1
+"""Counts changes of how samples are made from raw data."""
+Use = Literal["none", "read", "keep"]
+Filters = Mapping[str, HighPass | None]
+Gate = tuple[float, float]
+_FIGURES = ("direct_hz", "direct_snr")  # of a row's quality figures: one number a position
+_log = logging.getLogger(__name__)
+
+
+class Choices(TypedDict, total=False):
+    """How a scan is imaged.
+
+    Attributes
+    ----------
+    live
+        The images so far can be looked at after every row.
+    depth_m
+        What lies so much nearer or farther than the rig file says is kept (default: 15 mm).
+    bands
+        Sub-bands to image; 1 (the default): none.
+    view
+        Another plane, other pixels.
+    samples
+        "none" (the default): nothing is read or written; "read": rows are read; "keep": those that are not there are
+        written too.
+    """
+
+    live: bool
+    depth_m: float
+    bands: int
+    view: View
+    samples: Use
+
+
+def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
+    """What reduced samples depend on beside raw data and gate: the calibrated rig and its filters, as plain numbers."""
+    imaged = msgspec.to_builtins(ImagedWith.of(rig, filters))
+    imaged.pop("apodisation")
+    parts = {name: msgspec.to_builtins(getattr(rig, name)) for name in ("chirp", "burst", "grid")}
+    return json.loads(json.dumps({"making": MAKING, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
+
+
+class KeptSamples:
+    """Reduced rows of a scan folder; of another source none.
+
+    Parameters
+    ----------
+    source
+        The scan.
+    rig, filters
+        Its rig, calibrated, and its receivers' filters by name; None: as the chirp profile programs them.
+    quality
+        Where the rows' figures are put and taken from.
+    choices
+        See :class:`Choices`.
+
+    Attributes
+    ----------
+    images, sub_bands
+        What rows are put into and taken from. They reduce by the gate of the samples on disk, where it holds what they
+        need. Rows of a wider gate than usual are not written.
+    """
+
+    def __init__(
+        self, source: Source, rig: Instrument, filters: Filters, quality: Quality, **choices: Unpack[Choices]
+    ) -> None:
+        use, depth_m = choices.get("samples", "none"), choices.get("depth_m", PLANE_REACH_M)
+        self._scan = source if isinstance(source, ScanFolder) and use != "none" else None
+        self._folder = Path() if self._scan is None else self._scan.path / FOLDER
+        self._plan, self._made, self._quality = source.plan, made_with(rig, filters), quality
+        self._bands, self._keep = choices.get("bands", 1), use == "keep"
+        self._lines: dict[int, dict[str, Any]] = {}
+        self._read_bytes = 0
+        self._rows: int | None = None  # file descriptor of rows.jsonl, locked, while rows are written
+        self._arrays: dict[str, NDArray[Any]] = {}
+        self._lock = threading.Lock()
+        self._head = self._read_head()
+        viewed = choices.get("view", AS_IN_RIG_FILE).of(rig, source.mirrored)
+        gate = self._gate_m(needed_gate_m(viewed, depth_m), needed_gate_m(rig, PLANE_REACH_M))
+        self.images = ImageBuilder(viewed, live=choices.get("live", False), gate_m=gate)
+        self.sub_bands = SubBandImages(viewed, self._bands, gate)
+        self._builders = {"samples": self.images}
+        self._builders |= {f"band_{k}": builder for k, builder in enumerate(self.sub_bands.builders)}
+        self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
+
+    def _gate_m(self, needed: Gate, usual: Gate) -> Gate:
+        """The gate on disk, else the usual one, where it holds what is needed."""
+        kept = tuple(self._head.get("gate_m", usual))
+        if kept[0] <= needed[0] and needed[1] <= kept[1]:
+            return kept
+        self._head, self._keep = {}, False
+        return needed
+
+    def holds(self, rows: Sequence[int]) -> bool:
+        """Whether every one of these rows is there, made from the bytes that are committed."""
+        return all(self._line(row) is not None for row in rows)
+
+    def restore(self, row: int) -> bool:
+        """Put a row into the images; False when it has to be synchronised."""
+        line = self._line(row)
+        if line is None:
+            return False
+        arrays = {board: self._array(board) for board in line["boards"]}
+        records = {board: array[row] for board, array in arrays.items() if array is not None}
+        for board, told in line["boards"].items():
+            if board not in records or _digest(records[board]) != told["crc32"]:
+                return False
+        for board, record in records.items():
+            self._put(board, row, record, line["boards"][board]["figures"])
+        return True
+
+    def save(self, row: int) -> None:
+        """Write a row that was just put into the images. What cannot be written is left out."""
+        digests = self._digests(row)
+        if digests is not None:
+            with self._lock:
+                self._save(row, digests)
+
+    def _save(self, row: int, digests: dict[str, str]) -> None:
+        if not self._keep:
+            return
+        try:
+            rows = self._open() if self._rows is None else self._rows
+            if rows is None:
+                return
+            boards = {}
+            for board, digest in digests.items():
+                record, figures = self._record(board, row)
+                with (self._folder / f"{board}.npy").open("r+b") as file:
+                    file.seek(-(self._plan.rows - row) * record.nbytes, 2)
+                    file.write(record.tobytes())
+                boards[board] = {"crc32": _digest(record), "raw": digest, "figures": figures}
+            os.write(rows, manifest.encode_line({"fact": "row", "row": row, "boards": boards}))
+        except (OSError, ValueError) as e:
+            self._keep = False
+            _log.warning("samples are not kept in %s: %s", self._folder, e)
+
+    def _digests(self, row: int) -> dict[str, str] | None:
+        """What a committed row's bytes are, by receiver; None where nothing is kept of this source."""
+        committed = self._scan.committed().get(row) if self._scan is not None else None
+        if committed is None or any(name not in committed.boards for name in self._quality.boards):
+            return None
+        boards = {name: committed.boards[name] for name in self._quality.boards}
+        return {name: f"{b.crc32} {b.index_crc32} {b.missing_bytes}" for name, b in boards.items()}
+
+    def _line(self, row: int) -> dict[str, Any] | None:
+        """What rows.jsonl says of a row, if it was made from the bytes that are committed."""
+        digests = self._digests(row)
+        if digests is None or not self._head:
+            return None
+        with self._lock:
+            if row not in self._lines or self._told(row) != digests:
+                self._read_lines()
+        return self._lines[row] if row in self._lines and self._told(row) == digests else None
+
+    def _told(self, row: int) -> dict[str, str]:
+        return {name: board["raw"] for name, board in self._lines[row]["boards"].items()}
+
+    def _read_head(self) -> dict[str, Any]:
+        """samples.json, where these samples can be used; else empty."""
+        if self._scan is None:
+            return {}
+        try:
+            head = json.loads((self._folder / HEAD).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        same = isinstance(head, dict) and (head.get("format"), head.get("scan_id")) == (FORMAT, self._scan.scan_id)
+        return head if same and head["made_with"] == self._made and self._bands in (1, head["bands"]) else {}
+
+    def _read_lines(self) -> None:
+        """Lines that have come since; a torn or damaged one is no line."""
+        try:
+            raw = (self._folder / ROWS).read_bytes()
+        except OSError:
+            return
+        end = raw.rfind(b"\n") + 1
+        for text in raw[self._read_bytes : end].splitlines():
+            line = manifest.decode_line(text)
+            if line is not None:
+                self._lines[line["row"]] = line
+        self._read_bytes = end
+
+    def _array(self, board: str) -> NDArray[Any] | None:
+        """A board's records, mapped; None where the file is not what the head says."""
+        if board not in self._arrays:
+            try:
+                found = np.load(self._folder / f"{board}.npy", mmap_mode="r", allow_pickle=False)
+            except (OSError, ValueError, EOFError):
+                return None
+            if found.dtype != self._type(board) or found.shape != (self._plan.rows,):
+                return None
+            self._arrays[board] = found
+        return self._arrays[board]
+
+    def _type(self, board: str) -> np.dtype[Any]:
+        """One row of a board."""
+        columns, rx = self._plan.columns, len(self._builders["samples"].boards[board].aperture.antennas.rx_m)
+        parts: list[Any] = []
+        for name, frequencies in self._head["frequencies_hz"].items():
+            parts += [(name, "<c8", (rx, len(frequencies), columns)), (f"{name}_direct", "<c8", (rx, columns))]
+        parts += [("echo", "<c8", (rx, columns)), *((name, "<f8", (columns,)) for name in _FIGURES)]
+        return np.dtype([*parts, ("valid", "?", (columns,))])
+
+    def _record(self, board: str, row: int) -> tuple[NDArray[Any], dict[str, Any]]:
+        """A row of the images as it is written, and its other figures."""
+        out, forward = np.zeros((), self._type(board)), slice(None, None, self._plan.row(row).direction)
+        for name, builder in self._builders.items():
+            out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].reduced(row)
+        quality = self._quality.boards[board]
+        out["echo"] = quality.echoes[row][:, forward]
+        for name in _FIGURES:
+            out[name] = quality.rows[row][name][forward]
+        figures = {name: value for name, value in quality.rows[row].items() if name not in _FIGURES}
+        return out, {**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]}
+
+    def _put(self, board: str, row: int, record: Any, figures: dict[str, Any]) -> None:
+        forward = slice(None, None, self._plan.row(row).direction)
+        for name, builder in self._builders.items():
+            builder.boards[board].put(row, ReducedRow(record[name], record[f"{name}_direct"], record["valid"]))
+        values: dict[str, Any] = {name: np.array(record[name][forward]) for name in _FIGURES}
+        values["stages"] = {name: tuple(spread) for name, *spread in figures["stages"]}
+        self._quality.boards[board].put(row, {**figures, **values}, np.array(record["echo"][:, forward]))
+
+    def _open(self) -> int | None:
+        """The file of lines, locked; begun anew where those on disk are others. None: another program writes."""
+        self._folder.mkdir(exist_ok=True)
+        rows = os.open(self._folder / ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        weakref.finalize(self, os.close, rows)
+        try:
+            fcntl.flock(rows, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._keep = False
+            return None
+        if not self._head or any(self._array(board) is None for board in self._quality.boards):
+            self._begin(rows)
+        self._read_lines()
+        os.truncate(rows, self._read_bytes)  # a line that a kill has cut
+        self._rows = rows
+        return rows
+
+    def _begin(self, rows: int) -> None:
+        """The head, and empty files for all rows."""
+        (self._folder / HEAD).unlink(missing_ok=True)
+        os.truncate(rows, 0)
+        self._lines, self._read_bytes, self._arrays = {}, 0, {}
+        scan, first = self._scan, next(iter(self._quality.boards))
+        self._head = {
+            "format": FORMAT,
+            "scan_id": "" if scan is None else scan.scan_id,
+            "simulated": scan is not None and scan.simulated,
+            "bands": self._bands,
+            "gate_m": self._builders["samples"].gate_m,
+            "frequencies_hz": {n: b.boards[first].aperture.frequencies_hz.tolist() for n, b in self._builders.items()},
+            "made_with": self._made,
+        }
+        for board in self._quality.boards:
+            (self._folder / f"{board}.npy").unlink(missing_ok=True)  # who has it mapped keeps it
+            np.lib.format.open_memmap(self._folder / f"{board}.npy", "w+", self._type(board), (self._plan.rows,))
+        part = self._folder / f"{HEAD}.part"
+        part.write_text(json.dumps(self._head, indent=1) + "\n", encoding="utf-8")
+        part.replace(self._folder / HEAD)
+
+
+def _digest(record: Any) -> str:
+    return f"{crc32(record.tobytes()):08x}"

@@ -1,0 +1,81 @@
+"""Folders and files from elsewhere: no path leads out of a scan, and no small archive takes much memory."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polysight.host.capture import kind_of
+from polysight.shared.errors import DataError
+
+MOST_BYTES = 2 << 30
+"""Of arrays in one archive: a hundred times the images of the published scan."""
+
+
+def inside(folder: Path, name: str, within: str = "") -> Path:
+    """The path of a file that a scan's manifest names, relative to the scan folder.
+
+    Parameters
+    ----------
+    folder
+        The scan folder.
+    name
+        What the manifest says.
+    within
+        Folder in the scan in which it has to lie; "" for anywhere.
+
+    Raises
+    ------
+    DataError
+        when it lies elsewhere, links followed.
+    """
+    path, root = folder / name, (folder / within).resolve()
+    try:
+        there = ".." not in path.parts and path.resolve().is_relative_to(folder.resolve() / within)
+        there = there and path.resolve() != root and root.is_relative_to(folder.resolve())
+    except (OSError, ValueError):  # a name that no file can have
+        there = False
+    if not there:
+        raise DataError(
+            f"{folder}: its manifest names {name!r}, which lies outside {folder / within}",
+            "the manifest was made by another program or changed, or a link leads out of the scan",
+            "nothing there is read, written or removed; `polysight validate` a copy of the scan as it was recorded",
+        )
+    return path
+
+
+@contextmanager
+def open_npz(path: Path) -> Iterator[Any]:
+    """Open an archive of arrays, without pickled objects, once what it says of its size is believable.
+
+    Raises
+    ------
+    DataError
+        when its arrays would take more than :data:`MOST_BYTES`.
+    OSError, ValueError, KeyError, EOFError
+        when it is no such archive, as numpy does.
+    """
+    with path.open("rb") as f:
+        try:
+            with zipfile.ZipFile(f) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+        except zipfile.BadZipFile as e:
+            f.seek(0)
+            raise ValueError(f"it is {kind_of(f.read(512))}, not an archive of arrays ({e})") from None
+        if size > MOST_BYTES:
+            raise DataError(
+                f"{path}: its arrays take {size} bytes, more than the {MOST_BYTES} bytes that are read",
+                "it was not made by this program, or is damaged",
+                "process the scan again, or cut the image area ([image] of the rig file)",
+            )
+        f.seek(0)
+        try:
+            with np.load(f, allow_pickle=False) as arrays:
+                yield arrays
+        except MemoryError as e:
+            raise ValueError(f"an array in it is larger than the file says: {e}") from None

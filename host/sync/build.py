@@ -1,0 +1,125 @@
+"""Compile the loops of `burst.c` and `direct_path.c` into `kernels.so`: `python -m polysight.host.sync.build`.
+
+`setup.py` does it when the package is installed. It takes the system's C compiler, else the one of the package
+`ziglang`. Only the standard library is used here, since at installation there is nothing else.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+LIBRARY = "kernels.so"
+SOURCES = ("burst.c", "direct_path.c")
+"""Compiled once for each vector width."""
+
+_FLAGS = "-std=c99 -O3 -fPIC -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
+_FLAGS += " -fassociative-math -fvisibility=default"  # not -ffast-math, which would change how other libraries round
+_WIDTHS = {
+    128: "",
+    256: "-mavx2 -mfma",
+    512: "-mavx512f -mavx512bw -mavx512dq -mavx512vl -mfma -mprefer-vector-width=512",
+}
+TARGETS = {
+    "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
+    "manylinux_2_17_aarch64": "aarch64-linux-gnu.2.17",
+}
+"""Platforms of wheels for other machines, and what `zig cc` calls them."""
+
+
+class BuildError(Exception):
+    """There is no compiler, or it failed."""
+
+
+def source_digest() -> str:
+    """Digest of what the library is made of, which it carries: tells a library of other sources."""
+    digest = hashlib.sha256()
+    for path in sorted([*HERE.glob("*.c"), *HERE.glob("*.h")]):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def find_compiler(environment: Mapping[str, str] = os.environ) -> list[str] | None:
+    """The command of a C compiler: $CC, the system's, else ziglang's; None without any."""
+    if environment.get("CC"):
+        return shlex.split(environment["CC"])
+    for name in ("cc", "gcc", "clang"):
+        path = shutil.which(name, path=environment.get("PATH"))
+        if path:
+            return [path]
+    return _zig()
+
+
+def build(folder: Path = HERE, target: str = "") -> Path:
+    """Compile into a folder; returns the library.
+
+    `target` is a key of `TARGETS`, for another machine; "": for this one.
+
+    Raises
+    ------
+    BuildError
+        without a compiler, or when it fails.
+    """
+    from concurrent.futures import ThreadPoolExecutor  # here: `compiled.py` needs this file, and no threads
+
+    compiler = _zig() if target else find_compiler()
+    if compiler is None:
+        raise BuildError("no C compiler was found")
+    if target:
+        compiler = [*compiler, "-target", TARGETS[target]]
+    machine = target or platform.machine().lower()
+    widths = _WIDTHS if machine.endswith(("x86_64", "amd64")) else {128: ""}
+    with tempfile.TemporaryDirectory(prefix="polysight-build-") as made:
+        jobs = [
+            ([source, f"-DWIDTH={bits}", *flags.split()], f"{source}-{bits}.o")
+            for bits, flags in widths.items()
+            for source in SOURCES
+        ]
+        jobs.append((["width.c", f'-DSOURCES="{source_digest()}"'], "width.o"))
+        with ThreadPoolExecutor(os.cpu_count()) as workers:
+            commands = [[*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{made}/{name}"] for words, name in jobs]
+            list(workers.map(_run, commands))
+        library = f"{made}/{LIBRARY}"
+        _run([*compiler, "-shared", "-o", library, *(f"{made}/{name}" for _, name in jobs), "-lm"])
+        new = folder / f".{LIBRARY}-{os.getpid()}"
+        shutil.copyfile(library, new)
+        new.replace(folder / LIBRARY)  # at once: a program that uses the old one keeps it
+    return folder / LIBRARY
+
+
+def _zig() -> list[str] | None:
+    return [sys.executable, "-m", "ziglang", "cc"] if importlib.util.find_spec("ziglang") else None
+
+
+def _run(command: Sequence[str]) -> None:
+    try:
+        done = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
+        message, failed = done.stderr.strip(), done.returncode != 0
+    except OSError as e:
+        message, failed = str(e), True
+    if failed:
+        raise BuildError(f"{shlex.join(command)}\n{message}")
+
+
+def main() -> int:
+    """Compile for this machine, beside this file."""
+    try:
+        sys.stdout.write(f"{build()}\n")
+    except (BuildError, OSError) as e:
+        sys.stderr.write(f"{e}\ninstall a C compiler (apt install gcc, or pip install ziglang) and run this again\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

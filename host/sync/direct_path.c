@@ -1,0 +1,211 @@
+/* The direct path of every position: `numpy_direct_path.py` in C, with its names. Complex arrays are handed over as real
+   and imaginary part side by side. */
+#include "signal.h"
+
+#define STEPS 3 /* `numpy_direct_path.STEPS` */
+
+/* Sum of a position's two halves, [rx][block], times weights, into parts x and y. */
+static inline void weighted(const float *restrict halves, const float *restrict weights, int count, float *restrict x,
+                            float *restrict y)
+{
+    const float *restrict second = halves + 2 * count;
+    VECTOR
+    for (int i = 0; i < count; i++) {
+        float a = halves[2 * i] + second[2 * i], b = halves[2 * i + 1] + second[2 * i + 1];
+        x[i] = a * weights[2 * i] - b * weights[2 * i + 1];
+        y[i] = a * weights[2 * i + 1] + b * weights[2 * i];
+    }
+}
+
+/* The middle two of `count` values in order, by quickselect; reorders them. */
+static void middle_two(float *values, int count, float *lower, float *upper)
+{
+    int low = 0, high = count - 1, wanted = count / 2;
+    while (low < high) {
+        float pivot = values[(low + high) / 2];
+        int i = low, j = high;
+        while (i <= j) {
+            for (; values[i] < pivot; i++)
+                ;
+            for (; values[j] > pivot; j--)
+                ;
+            if (i <= j) {
+                float other = values[i];
+                values[i++] = values[j];
+                values[j--] = other;
+            }
+        }
+        if (wanted <= j)
+            high = j;
+        else if (wanted >= i)
+            low = i;
+        else
+            break;
+    }
+    *upper = *lower = values[wanted];
+    *lower = values[0];
+    for (int i = 1; i < wanted; i++)
+        *lower = values[i] > *lower ? values[i] : *lower;
+}
+
+/* `numpy_direct_path.search` of one spectrum: power [size]. */
+static void choose_peaks(const float *power, int size, int nearest, int farthest, float comparable, int32_t *first,
+                         int32_t *second)
+{
+    int top = 0, lower = -1;
+    float best = 0;
+    for (int i = 1; i < size; i++)
+        top = power[i] > power[top] ? i : top;
+    for (int d = nearest; d <= farthest; d++) {
+        int i = (top - d) & (size - 1);
+        float value = power[i];
+        if (value > best && value >= power[(i + size - 1) & (size - 1)] && value >= power[(i + 1) & (size - 1)]) {
+            best = value;
+            lower = i;
+        }
+    }
+    lower = lower < 0 ? top : lower;
+    int is_object = best > comparable * comparable * power[top];
+    *first = is_object ? lower : top;
+    *second = is_object ? top : lower;
+}
+
+/* halves: [position][2][rx][block]; weights [rx][block]: beam, steering and window; bins of the object beyond the direct
+   path: nearest..farthest. Gives the bins [2][position] and the median magnitude of a spectrum. Returns 0, or 1 when there
+   is no memory. */
+int NAME(search)(const float *halves, const float *weights, int positions, int blocks, int size, int nearest,
+                 int farthest, const double *comparable, int32_t *bins, double *median)
+{
+    int count = RX * blocks;
+    float *memory = reserve((size_t)(2 * LANES + 5) * size + 2 * (size_t)count + 64);
+    if (!memory)
+        return 1;
+    float *re = memory, *im = re + LANES * size, *c = im + LANES * size, *s = c + size, *power = s + size;
+    float *spare = power + size, *x = spare + size, *y = x + count;
+    int *bin = (int *)(y + count);
+    roots_of_unity(size, c, s);
+    for (int i = 0; i < size; i++)
+        bin[i] = bin_at(i, size);
+    for (int first = 0; first < positions; first += LANES) {
+        int lanes = positions - first < LANES ? positions - first : LANES;
+        memset(re, 0, sizeof *re * 2 * LANES * size);
+        for (int k = 0; k < lanes; k++) {
+            weighted(halves + 4 * (size_t)(first + k) * count, weights, count, x, y);
+            for (int m = 0; m < blocks; m++) {
+                re[LANES * m + k] = (x[m] + x[blocks + m]) + (x[2 * blocks + m] + x[3 * blocks + m]);
+                im[LANES * m + k] = (y[m] + y[blocks + m]) + (y[2 * blocks + m] + y[3 * blocks + m]);
+            }
+        }
+        transform(re, im, size, c, s);
+        for (int i = 0; i < LANES * size; i++)
+            re[i] = re[i] * re[i] + im[i] * im[i];
+        for (int k = 0; k < lanes; k++) {
+            float lower, upper;
+            int p = first + k;
+            for (int i = 0; i < size; i++)
+                power[bin[i]] = spare[i] = re[LANES * i + k];
+            choose_peaks(power, size, nearest, farthest, (float)*comparable, bins + p, bins + positions + p);
+            middle_two(spare, size, &lower, &upper);
+            median[p] = (sqrt(lower) + sqrt(upper)) / 2;
+        }
+    }
+    release(memory);
+    return 0;
+}
+
+/* A, A w and with a third row A q at a frequency: sums over the blocks of g [row][block], demodulated. */
+static void estimate_at(const float *g_re, const float *g_im, int rows, int blocks, double frequency, float *c, float *s,
+                        Complex *estimate)
+{
+    ramp(frequency, 0, FOLD, FOLD * (blocks - 1) / 2.0, blocks, c, s);
+    for (int k = 0; k < rows; k++) {
+        const float *re = g_re + k * blocks, *im = g_im + k * blocks;
+        float x = 0, y = 0;
+        for (int m = 0; m < blocks; m++) {
+            x += re[m] * c[m] - im[m] * s[m];
+            y += re[m] * s[m] + im[m] * c[m];
+        }
+        estimate[k] = (Complex){x, y};
+    }
+}
+
+/* `numpy_direct_path.refine`: steering [rx][block], estimator [row][rx][block]; frequency [position] is changed. */
+int NAME(refine)(const float *halves, const float *steering, const float *estimator, int positions, int blocks, int rows,
+                 double *frequency, double *estimates, double *steps)
+{
+    int count = RX * blocks;
+    double reach = 1.0 / (blocks * FOLD);
+    float *memory = reserve((size_t)2 * count + (size_t)(2 * rows + 2) * blocks + 64);
+    if (!memory)
+        return 1;
+    float *x = memory, *y = x + count, *re = y + count, *im = re + rows * blocks, *c = im + rows * blocks;
+    float *s = c + blocks + 16;
+    for (int p = 0; p < positions; p++) {
+        Complex *estimate = (Complex *)(estimates + 2 * (size_t)p * rows);
+        weighted(halves + 4 * (size_t)p * count, steering, count, x, y);
+        memset(re, 0, sizeof *re * 2 * rows * blocks);
+        for (int k = 0; k < rows; k++)
+            for (int r = 0; r < RX; r++) {
+                const float *e = estimator + 2 * (k * count + r * blocks), *u = x + r * blocks, *v = y + r * blocks;
+                float *to_re = re + k * blocks, *to_im = im + k * blocks;
+                VECTOR
+                for (int m = 0; m < blocks; m++) {
+                    to_re[m] += e[2 * m] * u[m] - e[2 * m + 1] * v[m];
+                    to_im[m] += e[2 * m] * v[m] + e[2 * m + 1] * u[m];
+                }
+            }
+        steps[p] = 0;
+        estimate_at(re, im, rows, blocks, frequency[p], c, s, estimate);
+        for (int i = 0; i < STEPS; i++) {
+            Complex a = estimate[0], aw = estimate[1];
+            double size = a.re * a.re + a.im * a.im;
+            double step = size > 0 ? (aw.re * a.re + aw.im * a.im) / size / TURN : 0;
+            steps[p] = step < -reach ? -reach : step > reach ? reach : step;
+            frequency[p] += steps[p];
+            estimate_at(re, im, rows, blocks, frequency[p], c, s, estimate);
+        }
+    }
+    release(memory);
+    return 0;
+}
+
+/* Complex values times complex weights times c + j s. */
+static inline void turned(const float *restrict values, const float *restrict weights, const float *restrict c,
+                          const float *restrict s, int count, float *restrict out)
+{
+    VECTOR
+    for (int n = 0; n < count; n++) {
+        float a = weights[2 * n] * c[n] - weights[2 * n + 1] * s[n], b = weights[2 * n] * s[n] + weights[2 * n + 1] * c[n];
+        out[2 * n] = values[2 * n] * a - values[2 * n + 1] * b;
+        out[2 * n + 1] = values[2 * n] * b + values[2 * n + 1] * a;
+    }
+}
+
+/* `numpy_direct_path.turn`: mean [position][rx][sample] into out [rx][position][sample], zero where not found, and halves
+   into halves_out; phase in turns, origin: the sample whose phase it is. */
+int NAME(turn)(const float *mean, const float *halves, const float *steering, const float *folded_steering,
+               int positions, int samples, int blocks, const double *origin, const double *frequency,
+               const double *phase, const uint8_t *found, float *out, float *halves_out)
+{
+    float *memory = reserve((size_t)2 * samples + 64);
+    if (!memory)
+        return 1;
+    float *c = memory, *s = c + samples + 16;
+    for (int p = 0; p < positions; p++) {
+        size_t at = 4 * (size_t)p * RX * blocks;
+        ramp(frequency[p], phase[p], FOLD, FOLD * (blocks - 1) / 2.0, blocks, c, s);
+        for (int i = 0; i < 2 * RX; i++)
+            turned(halves + at + 2 * i * blocks, folded_steering + 2 * (i % RX) * blocks, c, s, blocks,
+                   halves_out + at + 2 * i * blocks);
+        ramp(frequency[p], phase[p], 1, *origin, samples, c, s);
+        for (int r = 0; r < RX; r++) {
+            float *to = out + 2 * ((size_t)r * positions + p) * samples;
+            if (found[p])
+                turned(mean + 2 * ((size_t)p * RX + r) * samples, steering + 2 * r * samples, c, s, samples, to);
+            else
+                memset(to, 0, sizeof *to * 2 * samples);
+        }
+    }
+    release(memory);
+    return 0;
+}

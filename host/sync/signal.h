@@ -1,0 +1,197 @@
+/* Small loops over one chirp of four RX, or over sixteen records at a time, for burst.c and direct_path.c.
+
+   A chirp's samples of all RX lie in line, as the card sends them: value 4 n + r is sample n of RX r. Records that are
+   transformed together lie across: value 16 n + k is sample n of record k. So every inner loop runs over values that lie
+   next to each other, and the compiler makes vector instructions of it, as wide as the processor has them: these files
+   are compiled once for each width (`build.py`), with WIDTH in bits at the end of the functions' names (`width.c`).
+
+   Complex values are pairs of arrays `re`, `im`; a turn is 2 pi. */
+#ifndef SIGNAL_H
+#define SIGNAL_H
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define RX 4    /* of an AWR2243 */
+#define FOLD 4  /* samples that are averaged before fine estimates, `numpy_passes.FOLD` */
+#define LANES 16  /* samples averaged x RX; also records that are transformed at once */
+
+#define JOIN(name, width) name##_##width
+#define NAMED(name, width) JOIN(name, width)
+#define NAME(name) NAMED(name, WIDTH)
+
+/* Before a loop whose rounds do not depend on each other. */
+#define VECTOR _Pragma("omp simd")
+
+#define TURN 6.283185307179586476925
+
+typedef struct { double re, im; } Complex;
+
+/* Cosine and sine of a number of turns, within 1e-9: polynomials of half the angle, so that loops of it become vector
+   instructions. */
+static inline Complex cis(double turns)
+{
+    double x = TURN / 2 * (turns - floor(turns + 0.5)), q = x * x, s, c;
+    s = -1 / 5040.0 + q * (1 / 362880.0 + q * (-1 / 39916800.0 + q / 6227020800.0));
+    s = x * (1 + q * (-1 / 6.0 + q * (1 / 120.0 + q * s)));
+    c = 1 / 40320.0 + q * (-1 / 3628800.0 + q / 479001600.0);
+    c = 1 + q * (-1 / 2.0 + q * (1 / 24.0 + q * (-1 / 720.0 + q * c)));
+    return (Complex){1 - 2 * s * s, 2 * s * c};
+}
+
+static inline Complex times(Complex a, Complex b)
+{
+    return (Complex){a.re * b.re - a.im * b.im, a.re * b.im + a.im * b.re};
+}
+
+static inline Complex conjugate(Complex a) { return (Complex){a.re, -a.im}; }
+static inline double magnitude(Complex a) { return sqrt(a.re * a.re + a.im * a.im); }
+static inline double angle(Complex a) { return atan2(a.im, a.re); }
+
+/* Zeroed memory for `count` floats, on its own cache lines; free with `release`. */
+static inline float *reserve(size_t count)
+{
+    char *block = calloc(count * sizeof(float) + 128, 1);
+    if (!block)
+        return NULL;
+    char *aligned = block + 64 + (64 - (uintptr_t)block % 64);
+    memcpy(aligned - sizeof block, &block, sizeof block);
+    return (float *)aligned;
+}
+
+static inline void release(float *memory)
+{
+    char *block;
+    if (!memory)
+        return;
+    memcpy(&block, (char *)memory - sizeof block, sizeof block);
+    free(block);
+}
+
+/* The words of some samples, I of four RX then Q of four RX, with I and Q apart: x + j y. */
+static inline void part_iq(const int16_t *restrict words, int samples, int16_t *restrict x, int16_t *restrict y)
+{
+    for (int n = 0; n < samples; n++) {
+        memcpy(x + RX * n, words + 2 * RX * n, RX * sizeof *x);
+        memcpy(y + RX * n, words + 2 * RX * n + RX, RX * sizeof *y);
+    }
+}
+
+/* Largest magnitude of words. */
+static inline int32_t largest(const int16_t *restrict words, int count)
+{
+    int16_t low = 0, high = 0;
+    for (int i = 0; i < count; i++) {
+        low = words[i] < low ? words[i] : low;
+        high = words[i] > high ? words[i] : high;
+    }
+    return high > -(int32_t)low ? high : -(int32_t)low;
+}
+
+/* exp(-j 2 pi (frequency (step m - origin) + turns)) for m < count: an outer product of coarse and fine steps, as in
+   `tone.phasor`. Up to seven values more are written. */
+static inline void ramp(double frequency, double turns, int step, double origin, int count, float *restrict c,
+                        float *restrict s)
+{
+    enum { FINE = 8 };
+    float fine_c[FINE], fine_s[FINE], coarse_c[FINE], coarse_s[FINE];
+    for (int m = 0; m < FINE; m++) {
+        Complex z = cis(-frequency * step * m);
+        fine_c[m] = (float)z.re;
+        fine_s[m] = (float)z.im;
+    }
+    for (int first = 0; first < count; first += FINE * FINE) {
+        for (int i = 0; i < FINE; i++) {
+            Complex z = cis(-frequency * (step * (first + i * FINE) - origin) - turns);
+            coarse_c[i] = (float)z.re;
+            coarse_s[i] = (float)z.im;
+        }
+        for (int i = 0; i < FINE && first + i * FINE < count; i++) {
+            float *restrict to_c = c + first + i * FINE, *restrict to_s = s + first + i * FINE;
+            VECTOR
+            for (int m = 0; m < FINE; m++) {
+                to_c[m] = coarse_c[i] * fine_c[m] - coarse_s[i] * fine_s[m];
+                to_s[m] = coarse_c[i] * fine_s[m] + coarse_s[i] * fine_c[m];
+            }
+        }
+    }
+}
+
+/* scale exp(-j 2 pi frequency q) for the samples q of a block, of all RX. */
+static inline void phases_within(double frequency, double scale, float *restrict c, float *restrict s)
+{
+    for (int i = 0; i < LANES; i++) {
+        Complex z = cis(-frequency * (i / RX));
+        c[i] = (float)(z.re * scale);
+        s[i] = (float)(z.im * scale);
+    }
+}
+
+/* exp(-j 2 pi k / size), k < size. */
+static inline void roots_of_unity(int size, float *c, float *s)
+{
+    for (int k = 0; k < size; k++) {
+        Complex z = cis(-(double)k / size);
+        c[k] = (float)z.re;
+        s[k] = (float)z.im;
+    }
+}
+
+/* The bin that `transform` leaves at a place. */
+static inline int bin_at(int place, int size)
+{
+    int bin = 0, scale = 1;
+    for (; size >= 4; size /= 4, scale *= 4) {
+        bin += scale * (place / (size / 4));
+        place %= size / 4;
+    }
+    return bin + scale * place;
+}
+
+/* Four rows of sixteen values: Fourier transform of length four across them, then times powers one to three of w. */
+static inline void butterfly(float *restrict re, float *restrict im, int row, const float w[6])
+{
+    float *restrict re1 = re + row, *restrict re2 = re + 2 * row, *restrict re3 = re + 3 * row;
+    float *restrict im1 = im + row, *restrict im2 = im + 2 * row, *restrict im3 = im + 3 * row;
+    VECTOR
+    for (int k = 0; k < LANES; k++) {
+        float a = re[k] + re2[k], b = im[k] + im2[k], d = re[k] - re2[k], e = im[k] - im2[k];
+        float f = re1[k] + re3[k], g = im1[k] + im3[k], h = im1[k] - im3[k], l = re3[k] - re1[k];
+        re[k] = a + f;
+        im[k] = b + g;
+        re1[k] = (d + h) * w[0] - (e + l) * w[1];
+        im1[k] = (d + h) * w[1] + (e + l) * w[0];
+        re2[k] = (a - f) * w[2] - (b - g) * w[3];
+        im2[k] = (a - f) * w[3] + (b - g) * w[2];
+        re3[k] = (d - h) * w[4] - (e - l) * w[5];
+        im3[k] = (d - h) * w[5] + (e - l) * w[4];
+    }
+}
+
+/* Fourier transforms of sixteen records [size][LANES] in place, by decimation in frequency; bins as of `bin_at`. */
+static inline void transform(float *restrict re, float *restrict im, int size, const float *c, const float *s)
+{
+    int n = size;
+    for (; n >= 4; n /= 4) {
+        int q = n / 4, turn = size / n;
+        for (int first = 0; first < size; first += n)
+            for (int j = 0; j < q; j++) {
+                int i = (first + j) * LANES, k = j * turn;
+                const float w[6] = {c[k], s[k], c[2 * k], s[2 * k], c[3 * k], s[3 * k]};
+                butterfly(re + i, im + i, q * LANES, w);
+            }
+    }
+    if (n == 2)
+        for (int i = 0; i < size * LANES; i += 2 * LANES)
+            for (int k = 0; k < LANES; k++) {
+                float a = re[i + k], b = im[i + k], d = re[i + LANES + k], e = im[i + LANES + k];
+                re[i + k] = a + d;
+                im[i + k] = b + e;
+                re[i + LANES + k] = a - d;
+                im[i + LANES + k] = b - e;
+            }
+}
+
+#endif

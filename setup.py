@@ -1,0 +1,58 @@
+"""What pyproject.toml cannot say: installing compiles `host/sync/*.c`, and a wheel is for one platform, any Python.
+
+With POLYSIGHT_WHEEL set to a platform of `host/sync/build.py`, wheels are made for that one.
+"""
+
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+from setuptools import Distribution, setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_py import build_py
+
+spec = importlib.util.spec_from_file_location("build_kernels", Path("host", "sync", "build.py"))
+kernels = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(kernels)
+TARGET = os.environ.get("POLYSIGHT_WHEEL", "")
+
+
+class PlatformDistribution(Distribution):
+    """A distribution with compiled code."""
+
+    def has_ext_modules(self):
+        """Yes: not through Python's own headers, so setuptools cannot know."""
+        return True
+
+
+class BuildWithKernels(build_py):
+    """Copies the package, and compiles the kernels into it; into the sources where these are used in place."""
+
+    def run(self):
+        """Without a compiler that works the same runs in NumPy, more slowly: say so, and go on."""
+        super().run()
+        sources = Path("host", "sync")
+        folder = sources if self.editable_mode else Path(self.build_lib, "polysight") / sources
+        try:
+            kernels.build(folder.resolve(), TARGET)
+        except kernels.BuildError as error:
+            if TARGET:
+                raise
+            sys.stderr.write(f"polysight: synchronisation was not compiled and will be slow: {error}\n")
+
+
+class PlatformWheel(bdist_wheel):
+    """The kernels need no Python: one wheel serves all versions on a platform."""
+
+    def get_tag(self):
+        """Such as py3-none-linux_x86_64."""
+        return "py3", "none", TARGET or super().get_tag()[2]
+
+
+setup(
+    distclass=PlatformDistribution,
+    cmdclass={"build_py": BuildWithKernels, "bdist_wheel": PlatformWheel},
+    # Asked for at building, and only where it is needed: 100 MB.
+    setup_requires=["ziglang"] if TARGET or kernels.find_compiler() is None else [],
+)

@@ -1,0 +1,123 @@
+"""Every anomaly of a row is counted under its own name, and under no other."""
+
+from __future__ import annotations
+
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from polysight.host.capture.dca1000 import decode_packet_header, encode_packet
+from polysight.host.capture.packet_counts import PacketCounts
+from tests.support.capture.records import FULL, Card, is_original_or_masked, place
+
+GRIDS = [(4096, 62), (4096, 91), (64, 910), (512, 30), (1456, 7)]  # bytes of a frame, frames of a row
+STARTS = [(0, 1), (145_600_000, 100_001), (5_000, 5), (2**48 - 20_000, 2**32 - 7)]  # counters of the first record
+OWN_NAMES = ("duplicates", "conflicting", "leftover", "restarted", "outside", "disagreeing", "malformed")
+
+
+def others_than(counts: PacketCounts, *names: str) -> dict[str, int]:
+    """Anomalies that were counted and are none of these."""
+    return {name: n for name in OWN_NAMES if name not in names and (n := getattr(counts, name))}
+
+
+@given(
+    grid=st.sampled_from(GRIDS),
+    start=st.sampled_from(STARTS),
+    rows=st.integers(0, 6),
+    cut=st.floats(0, 1),
+    batch=st.sampled_from([1, 7, 64]),
+)
+def test_what_comes_after_a_reset_within_a_row_is_counted_as_restarted(grid, start, rows, cut, batch):
+    frame, frames = grid
+    size = frame * frames
+    many = -(-size // FULL)
+    assume(many > 2)
+    at = 1 + int(cut * (many - 2))
+    assume(rows or at > 1)  # one packet alone says nothing of a scan's first row
+    card, past = Card(size, *start), None
+    for _ in range(rows):
+        placed, _ = place(size, card.record().packets, past, frame, batch)
+        assert not others_than(placed.counts)
+        past = placed.past
+    record = card.record(resets=(at,))
+    placed, out = place(size, record.packets, past, frame, batch)
+    assert is_original_or_masked(record, placed, out)
+    assert (placed.counts.placed, placed.counts.restarted) == (at, many - at), placed.reason
+    assert not others_than(placed.counts, "restarted")
+    assert placed.located or "began anew" in placed.reason
+
+
+@given(at=st.integers(2, 85), lost=st.sampled_from([1, 2, 5]))
+def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_arrival(at, lost):
+    """Its counters began anew twice: nothing tells which bytes follow which."""
+    size = 91 * 4096
+    record = Card(size).record(resets=(at,))
+    placed, _ = place(size, record.packets[: len(record.packets) - lost], None, 4096)
+    assert not placed.located
+    assert not placed.slipped
+
+
+def test_bytes_in_conflict_are_holes_of_a_row_whose_frames_are_placed_by_their_arrival():
+    """A row that missed triggers is written anew with what is in no hole."""
+    size, frame = 62 * 4096, 4096
+    first, _ = place(size, [*Card(size - frame).record().packets], None, frame)
+    assert first.slipped
+    assert not first.holes
+    fresh = Card(size - frame).record().packets
+    twice, _ = place(size, [*fresh, fresh[9][:10] + fresh[8][10:]], None, frame)
+    assert twice.slipped
+    assert twice.holes == [(9 * FULL, 10 * FULL)]
+
+
+def spoilt(packets: list[bytes], kind: str, k: int) -> list[bytes]:
+    """A perfect row's packets with one anomaly at packet k."""
+    head, payload = packets[k][:10], packets[k][10:]
+    extra = {
+        "duplicates": packets[k],
+        "conflicting": head + payload[::-1],
+        "outside": encode_packet(*after(packets[-1]), bytes(FULL)),
+        "disagreeing": head[:4] + bytes(x ^ 0x55 for x in head[4:10]) + payload,
+        "malformed": head,
+    }[kind]
+    return [*packets[: k + 1], extra, *packets[k + 1 :]]
+
+
+def after(packet: bytes) -> tuple[int, int]:
+    sequence, count = decode_packet_header(packet)
+    return sequence + 1, count + len(packet) - 10
+
+
+@given(
+    grid=st.sampled_from(GRIDS),
+    kind=st.sampled_from(["duplicates", "conflicting", "outside", "disagreeing", "malformed"]),
+    where=st.floats(0, 1),
+    batch=st.sampled_from([1, 7, 64]),
+)
+def test_one_anomaly_is_counted_once_and_by_its_name(grid, kind, where, batch):
+    frame, frames = grid
+    size = frame * frames
+    card = Card(size, 145_600_123, 100_001)
+    past = place(size, card.record().packets, None, frame, batch)[0].past
+    record = card.record()
+    k = int(where * (len(record.packets) - 1))
+    placed, out = place(size, spoilt(record.packets, kind, k), past, frame, batch)
+    assert is_original_or_masked(record, placed, out)
+    assert getattr(placed.counts, kind) == 1
+    assert not others_than(placed.counts, kind)
+    assert placed.counts.placed == len(record.packets)
+
+
+@given(grid=st.sampled_from(GRIDS), lost=st.integers(1, 5), batch=st.sampled_from([1, 7, 64]))
+def test_late_packets_of_the_record_before_are_left_over(grid, lost, batch):
+    frame, frames = grid
+    size = frame * frames
+    card = Card(size, 145_600_123, 100_001)
+    past = place(size, card.record().packets, None, frame, batch)[0].past
+    before = card.record()
+    lost = min(lost, len(before.packets) - 1)
+    past = place(size, before.packets[lost:], past, frame, batch)[0].past
+    record = card.record()
+    mixed = [*record.packets[:2], *before.packets[:lost], *record.packets[2:]]
+    placed, _ = place(size, mixed, past, frame, batch)
+    assert placed.complete
+    assert placed.counts.leftover == lost
+    assert not others_than(placed.counts, "leftover")

@@ -1,0 +1,187 @@
+"""The kept samples of a scan: images made from them are those made from raw data, and they are never taken on trust."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from polysight.host.imaging import PLANE_REACH_M, ChannelImages, View
+from polysight.host.pipeline import Pipeline
+from polysight.host.process import each_row
+from polysight.host.store import ScanFolder
+from polysight.shared.errors import DataError
+
+pytestmark = pytest.mark.xdist_group("samples")
+PIXELS = ("h", "v", "h_raw", "v_raw", "h_footprint", "v_footprint", "valid")
+
+
+def processed(folder: Path, samples: str = "keep", **more: object) -> Pipeline:
+    pipeline = Pipeline(ScanFolder.load(folder), samples=samples, **more)  # type: ignore[arg-type]
+    for row in pipeline.source.rows():
+        pipeline.add_row(row)
+    return pipeline
+
+
+def same(one: ChannelImages, other: ChannelImages) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in PIXELS)
+
+
+@pytest.fixture
+def scan(two_plates: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(two_plates, tmp_path / "scan"))
+
+
+@pytest.fixture
+def kept(scan: Path) -> Path:
+    processed(scan)
+    return scan
+
+
+def without_raw(folder: Path) -> Path:
+    shutil.rmtree(folder / "raw")
+    return folder
+
+
+def test_images_from_samples_are_bit_for_bit_those_from_raw_data(two_plates: Path, kept: Path) -> None:
+    expected, found = processed(two_plates, "none"), processed(without_raw(kept))
+    assert same(found.form_images(), expected.form_images())
+
+
+def test_rows_on_several_threads_make_the_same_products(two_plates: Path, scan: Path) -> None:
+    serial, threaded = processed(two_plates, "none"), Pipeline(ScanFolder.load(scan), samples="keep")
+    rows = list(threaded.source.rows())
+    assert list(each_row(threaded.add_row, rows, threads=4)) == rows
+    assert same(threaded.form_images(), serial.form_images())
+    assert json.dumps(threaded.quality.to_dict()["boards"]) == json.dumps(serial.quality.to_dict()["boards"])
+    assert same(processed(without_raw(scan)).form_images(), serial.form_images())
+
+
+def test_the_first_error_of_several_threads_ends_them() -> None:
+    begun: list[int] = []
+
+    def add(row: int) -> None:
+        begun.append(row)
+        raise DataError(f"row {row}")
+
+    with pytest.raises(DataError, match="row 0"):
+        list(each_row(add, range(1000), threads=2))
+    assert len(begun) < 1000
+
+
+def test_quality_says_the_same_from_samples(two_plates: Path, kept: Path) -> None:
+    expected, found = processed(two_plates, "none"), processed(without_raw(kept))
+    for key in ("boards", "coverage"):
+        assert json.dumps(found.quality.to_dict()[key]) == json.dumps(expected.quality.to_dict()[key])
+
+
+def test_sub_bands_are_kept_and_serve_those_who_want_none(two_plates: Path, scan: Path) -> None:
+    processed(scan, bands=3)
+    expected, found = processed(two_plates, "none", bands=3), processed(without_raw(scan), bands=3)
+    for one, other in zip(found.sub_bands.finish(), expected.sub_bands.finish(), strict=True):
+        assert same(one, other)
+    assert same(processed(scan).form_images(), processed(two_plates, "none").form_images())
+
+
+def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> None:
+    again = processed(kept, bands=2)
+    assert len(again.sub_bands.finish()) == 2
+    assert processed(without_raw(kept), bands=2).sub_bands.bands == again.sub_bands.bands
+
+
+@pytest.mark.parametrize(
+    "view", [View(depth_mm=8.0), View(depth_mm=-12.0), View(columns=31, rows=24, pixel_mm=5.0), View(pixel_mm=2.0)]
+)
+def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kept: Path, view: View) -> None:
+    expected = processed(two_plates, "none", depth_m=0.0, view=view).form_images()
+    found = processed(without_raw(kept), depth_m=0.0, view=view).form_images()
+    np.testing.assert_array_equal(found.x_m, expected.x_m)
+    for name in ("h_raw", "v_raw", "h_footprint", "v_footprint"):
+        one, other = getattr(found, name), getattr(expected, name)
+        assert np.abs(one - other).max() < 2e-3 * np.abs(other).max(), name  # the gates differ, and with them the noise
+
+
+def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
+    beyond = View(depth_mm=1e3 * PLANE_REACH_M + 200)
+    processed(kept, depth_m=0.0, view=beyond)
+    with pytest.raises(DataError, match="cannot be read"):
+        processed(without_raw(kept), depth_m=0.0, view=beyond)
+
+
+def test_looking_elsewhere_leaves_the_kept_samples_alone(kept: Path) -> None:
+    before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
+    processed(kept, depth_m=0.0, view=View(depth_mm=300.0))
+    processed(kept, depth_m=0.05)
+    assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == before
+
+
+@pytest.mark.parametrize("what", ["record", "torn line", "line", "head", "array gone", "array short"])
+def test_damaged_samples_are_made_again(two_plates: Path, kept: Path, what: str) -> None:
+    folder = kept / "samples"
+    rows, array = folder / "rows.jsonl", folder / "RH.npy"
+    if what == "record":
+        data = bytearray(array.read_bytes())
+        data[-5000] ^= 1
+        array.write_bytes(data)
+    elif what == "torn line":
+        rows.write_bytes(rows.read_bytes()[:-7])
+    elif what == "line":
+        rows.write_bytes(rows.read_bytes().replace(b'"row":3', b'"row":4', 1))
+    elif what == "head":
+        (folder / "samples.json").write_text("{", encoding="utf-8")
+    elif what == "array gone":
+        array.unlink()
+    else:
+        array.write_bytes(array.read_bytes()[:-3000])
+    expected = processed(two_plates, "none").form_images()
+    assert same(processed(kept).form_images(), expected)
+    assert same(processed(without_raw(kept)).form_images(), expected)
+
+
+def test_rows_whose_bytes_are_others_now_are_synchronised_again(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after a row that was taken or placed again: the digest that is committed is another."""
+    committed = ScanFolder.committed
+
+    def changed(self: ScanFolder) -> dict:
+        rows = committed(self)
+        rows[2].boards["RV"] = msgspec.structs.replace(rows[2].boards["RV"], index_crc32="00000000")
+        return rows
+
+    monkeypatch.setattr(ScanFolder, "committed", changed)
+    pipeline = Pipeline(ScanFolder.load(kept), samples="read")
+    assert [row for row in pipeline.source.rows() if not pipeline.samples.restore(row)] == [2]
+
+
+def test_samples_of_another_calibration_are_not_used(kept: Path) -> None:
+    head = json.loads((kept / "samples" / "samples.json").read_text())
+    head["made_with"]["object_distance_mm"] += 1.0
+    (kept / "samples" / "samples.json").write_text(json.dumps(head))
+    pipeline = Pipeline(ScanFolder.load(kept), samples="read")
+    assert not any(pipeline.samples.restore(row) for row in pipeline.source.rows())
+
+
+def test_a_folder_that_cannot_be_written_is_processed_all_the_same(
+    two_plates: Path, scan: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (scan / "samples").write_text("a file is in the way")
+    found = processed(scan).form_images()
+    assert same(found, processed(two_plates, "none").form_images())
+    assert "samples are not kept" in caplog.text
+
+
+def test_samples_are_read_without_this_program(kept: Path) -> None:
+    """The lines of docs/spec/samples.md."""
+    folder = kept / "samples"
+    head = json.loads((folder / "samples.json").read_text())
+    records = np.load(folder / "RH.npy", mmap_mode="r")
+    lines = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
+    cube = records["samples"]  # complex64 [row, rx, frequency, column]
+    assert cube.shape[:2] == (17, 4)
+    assert cube.shape[2] == len(head["frequencies_hz"]["samples"])
+    assert [line["row"] for line in lines] == list(range(17))
+    expected = processed(kept, "none").images.boards["RH"]._cube
+    np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), expected)

@@ -1,0 +1,226 @@
+"""The compiled loops and their NumPy form give the same results, at every width of vectors that the processor has."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from polysight.host.sync import build, compiled, direct_path, numpy_direct_path
+from polysight.host.sync.align import AlignedRow, align_in_numpy, align_row, whole_blocks
+from polysight.host.sync.high_pass_filter import Equaliser, HighPass, high_pass
+
+WIDTHS = (128, 256, 512)
+
+
+@pytest.fixture(scope="module")
+def library_file(tmp_path_factory):
+    """The one beside the sources, where it is of these; else compiled for this test."""
+    with suppress(compiled.LoadError):
+        compiled.Library()
+        return build.HERE / build.LIBRARY
+    if build.find_compiler() is None:
+        pytest.skip("no C compiler: apt install gcc, or pip install ziglang")
+    return build.build(tmp_path_factory.mktemp("kernels"))
+
+
+@pytest.fixture(scope="module", params=WIDTHS)
+def loops(library_file, request):
+    if request.param > compiled.Library(library_file).bits:
+        pytest.skip(f"this processor has no vectors of {request.param} bits")
+    return compiled.Library(library_file, request.param)
+
+
+def bursts(positions=5, chirps=6, samples=256, seed=4):
+    """Tones of every chirp's own frequency and phase, in noise: int16 [position, chirp, sample, 2, rx]."""
+    rng, n = np.random.default_rng(seed), np.arange(samples)[:, None]
+    f = 0.2 + 0.02 * rng.standard_normal((positions, chirps, 1, 1))
+    tones = np.exp(2j * np.pi * (f * n + rng.uniform(size=(positions, chirps, 1, 1)))) * np.exp(1j * np.arange(4))
+    tones = tones * (1 + 0.6 * np.exp(0.12j * n)) + 0.2 * rng.standard_normal((positions, chirps, samples, 4))
+    return np.rint(1000 * np.stack([tones.real, tones.imag], axis=3)).astype(np.int16)
+
+
+def align(loops, words, valid, linear, equaliser=None, full_scale=32767):
+    return AlignedRow(*loops.align(words, valid, whole_blocks(linear), equaliser, full_scale))
+
+
+def same(one: AlignedRow, other: AlignedRow):
+    """Equal within float32 rounding; phases may wrap."""
+    np.testing.assert_array_equal(one.good, other.good)
+    np.testing.assert_array_equal(one.peak, other.peak)
+    some = other.good.any(axis=1)  # silence has no band
+    np.testing.assert_array_equal(one.centre[some], other.centre[some])
+    usable = (other.coherence > 0.1) & some[:, None]  # the tone of a chirp that matches nothing is any
+    for name in ("mean", "halves"):
+        a, b = getattr(one, name), getattr(other, name)
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=0, atol=3e-6 * max(1.0, float(np.abs(b).max())))
+    np.testing.assert_allclose(one.frequency[usable], other.frequency[usable], rtol=0, atol=1e-8)
+    for name in ("amplitude", "gain", "coherence"):
+        np.testing.assert_allclose(getattr(one, name)[usable], getattr(other, name)[usable], rtol=0, atol=1e-5)
+    turn = np.exp(1j * one.phase) - np.exp(1j * other.phase.astype(np.float64))
+    np.testing.assert_allclose(turn[usable], 0, atol=1e-5)
+    np.testing.assert_allclose(one.error, other.error, rtol=0, atol=1e-5)
+
+
+def equaliser_of(rig):
+    return Equaliser.of(high_pass(rig.chirp), rig.chirp, 4)
+
+
+@pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 44)])
+@pytest.mark.parametrize("filtered", [True, False])
+def test_any_linear_part(loops, rig, linear, filtered):
+    words, valid = bursts(), np.ones((5, 6), bool)
+    equaliser = equaliser_of(rig) if filtered else None
+    same(align(loops, words, valid, linear, equaliser), align_in_numpy(words, valid, linear, equaliser))
+
+
+@pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
+def test_any_number_of_samples(loops, rig, samples, linear):
+    """Nothing depends on whole vectors, or on blocks that fill a chirp."""
+    words, valid = bursts(samples=samples), np.ones((5, 6), bool)
+    equaliser = equaliser_of(rig)
+    same(align(loops, words, valid, linear, equaliser), align_in_numpy(words, valid, linear, equaliser))
+
+
+@pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
+def test_any_number_of_chirps(loops, rig, chirps):
+    """Sixteen are transformed at once; one alone has nothing to be compared with."""
+    words, valid = bursts(positions=3, chirps=chirps), np.ones((3, chirps), bool)
+    equaliser = equaliser_of(rig)
+    same(align(loops, words, valid, (0, 192), equaliser), align_in_numpy(words, valid, (0, 192), equaliser))
+
+
+def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
+    words, valid = bursts(positions=7, chirps=8), np.ones((7, 8), bool)
+    valid[0, :3] = False
+    valid[1] = False
+    words[2, 4] = 0
+    words[3, 2, 100, 1, 3], words[3, 5, 7, 0, 0] = 32767, -32768
+    rng = np.random.default_rng(3)
+    words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other: another reference is taken
+    words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
+    words[6] = 0
+    done = align(loops, words, valid, (0, 192), equaliser_of(rig))
+    same(done, align_in_numpy(words, valid, (0, 192), equaliser_of(rig)))
+    assert not done.good[1].any()
+    assert not done.good[6].any()
+    assert not done.good[3, [2, 5]].any()
+    assert not done.good[4, 0]
+    for values in done:
+        assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("mode", ["complex1x", "complex2x"])
+def test_any_filter(loops, mode):
+    words, valid = bursts(), np.ones((5, 6), bool)
+    for corners in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
+        equaliser = Equaliser(HighPass(corners), 10e6, mode == "complex2x", 4, 3 / 192)
+        same(align(loops, words, valid, (0, 192), equaliser), align_in_numpy(words, valid, (0, 192), equaliser))
+
+
+def test_words_in_another_order_in_memory(loops):
+    words, valid = bursts()[:, :, :, ::-1], np.ones((5, 6), bool)
+    assert not words.flags.c_contiguous
+    same(align(loops, words, valid, (0, 192)), align_in_numpy(words, valid, (0, 192)))
+
+
+def test_any_number_of_positions_and_none(loops):
+    for positions in (0, 1, 17):
+        words, valid = bursts(positions=positions), np.ones((positions, 6), bool)
+        got = align(loops, words, valid, (0, 192))
+        assert got.mean.shape == (positions, 4, 256)
+        if positions:
+            same(got, align_in_numpy(words, valid, (0, 192)))
+
+
+def test_the_direct_path(loops, rig, paths, noise, counts):
+    """Of a row with positions that are absent, that hold noise only, and where the other peak is the direct path."""
+    board, rng = rig.receivers[0], np.random.default_rng(5)
+    ideal, _ = paths(board, 37, 1.5, rng)
+    ideal[7] = 0
+    frames = (ideal + noise(ideal.shape, -20, rng))[:, None] * np.exp(2j * np.pi * rng.uniform(size=(37, 4, 1, 1)))
+    words, valid = counts(frames.transpose(2, 0, 1, 3)), np.ones((37, 4), bool)
+    valid[11] = False
+    aligned = align_in_numpy(words, valid, rig.chirp.linear_samples, equaliser_of(rig))
+    path = direct_path.prepare(rig, board)
+    expected = direct_path.reference(aligned, path, rig.chirp, numpy_direct_path)
+    got = direct_path.reference(aligned, path, rig.chirp, loops)
+    np.testing.assert_array_equal(got.found, expected.found)
+    assert 30 < got.found.sum() < 37
+    found = got.found
+    largest = np.abs(expected.samples).max()
+    np.testing.assert_allclose(got.samples, expected.samples, rtol=0, atol=1e-5 * largest)
+    np.testing.assert_allclose(got.halves[found], expected.halves[found], rtol=0, atol=1e-5 * largest)
+    np.testing.assert_allclose(got.frequency[found], expected.frequency[found], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(got.amplitude[found], expected.amplitude[found], rtol=1e-5)
+    assert got.drift == pytest.approx(expected.drift, rel=1e-3, abs=1e-10)
+
+
+@pytest.mark.parametrize("size", [64, 256, 512])
+def test_peaks_and_medians_of_any_spectrum(loops, size):
+    rng = np.random.default_rng(size)
+    halves = (rng.standard_normal((35, 2, 4, 16)) + 1j * rng.standard_normal((35, 2, 4, 16))).astype(np.complex64)
+    halves[3] = 0
+    weights = (rng.standard_normal((4, 16)) + 1j * rng.standard_normal((4, 16))).astype(np.complex64)
+    got, expected = (by.search(halves, weights, size, (3, 9), 0.35) for by in (loops, numpy_direct_path))
+    np.testing.assert_array_equal(got[0], expected[0])
+    np.testing.assert_allclose(got[1], expected[1], rtol=1e-4, atol=1e-5)
+
+
+def test_three_receivers_are_aligned_in_numpy():
+    words = bursts()[..., :3]
+    assert align_row(words, np.ones(words.shape[:2], bool), (0, 192)).good.all()
+
+
+def test_the_compiled_loops_are_used_where_they_are(library_file, monkeypatch):
+    found = compiled.Library(library_file)
+    monkeypatch.setattr(compiled, "library", lambda: found)
+    monkeypatch.setattr("polysight.host.sync.align.align_in_numpy", None)
+    assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
+
+
+@pytest.fixture
+def fresh_library():
+    compiled.library.cache_clear()
+    yield
+    compiled.library.cache_clear()
+
+
+@pytest.mark.usefixtures("fresh_library")
+@pytest.mark.parametrize("broken", ["absent", "of other sources", "no library"])
+def test_without_them_a_warning_says_once_what_why_and_what_to_do(library_file, tmp_path, monkeypatch, caplog, broken):
+    file = tmp_path / build.LIBRARY
+    if broken == "of other sources":
+        shutil.copyfile(library_file, file)
+        monkeypatch.setattr(build, "source_digest", lambda: "another")
+    elif broken == "no library":
+        file.write_text("text", encoding="utf-8")
+    real = compiled.Library
+    monkeypatch.setattr(compiled, "Library", lambda: real(file))
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
+    assert len(caplog.records) == 1
+    said = caplog.records[0].getMessage()
+    assert "in NumPy" in said
+    assert "python -m polysight.host.sync.build" in said
+
+
+def test_a_compiler_that_fails_is_an_error_that_shows_what_it_said(tmp_path, monkeypatch):
+    monkeypatch.setenv("CC", "false")
+    with pytest.raises(build.BuildError, match="false"):
+        build.build(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_system_s_compiler_comes_first_and_ziglang_last(monkeypatch, tmp_path):
+    (tmp_path / "cc").write_text("#!/bin/sh\n", encoding="utf-8")
+    (tmp_path / "cc").chmod(0o755)
+    assert build.find_compiler({"PATH": str(tmp_path)}) == [str(tmp_path / "cc")]
+    assert build.find_compiler({"PATH": str(tmp_path), "CC": "ccache gcc"}) == ["ccache", "gcc"]
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    assert build.find_compiler({"PATH": str(tmp_path / "nothing")}) is None

@@ -12,6 +12,7 @@ import pytest
 from polysight.host.cli.main import main
 from polysight.shared.config import load_instrument
 from polysight.simulators.scene import decode_scene, simulate
+from tests.support.products import unrendered
 
 REPO = Path(__file__).resolve().parents[2]
 COPPER = {"name": "copper", "centre_mm": [-45.0, 0.0], "size_mm": [45.0, 45.0], "metal": True}
@@ -33,8 +34,8 @@ def simulated(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
 
 
 def command(*words: object) -> None:
-    """Run a command of the host, which must succeed."""
-    with redirect_stdout(StringIO()):
+    """Run a command of the host, which must succeed; its report is not rendered."""
+    with redirect_stdout(StringIO()), unrendered():
         assert main([str(word) for word in words]) == 0
 
 

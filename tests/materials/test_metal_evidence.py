@@ -33,17 +33,23 @@ def scene(rng, plates, metal, patterns_db=1.0):
     return seen, metal and best == plates, complex(v[best] / h[best])
 
 
+@pytest.fixture
+def scenes(request):
+    """How many random scenes of each kind; `--long` takes as many as the stated shares are known from."""
+    return 25 if request.config.getoption("--long") else 10
+
+
 @pytest.mark.parametrize("plates", [1, 2, 3, 4, 6, 9])
-def test_no_dielectric_is_taken_for_metal(plates):
-    for seed in range(25):
+def test_no_dielectric_is_taken_for_metal(plates, scenes):
+    for seed in range(scenes):
         seen, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
         assert not metal_evidence(seen, Uncertain(3e-3), channel).enough
 
 
 @pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.9)])
-def test_metal_among_dielectrics_is_mostly_recognised(plates, least):
+def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
     found = []
-    for seed in range(20):
+    for seed in range(scenes):
         seen, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
         assert metal
         found.append(metal_evidence(seen, Uncertain(3e-3), channel).enough)

@@ -30,7 +30,7 @@ __all__ = ["add_arguments", "run"]
 REPEATS = 5
 ROUNDS = 3  # of what takes seconds
 PEERS = (
-    peers.Peer("the best time-domain sum", "numba", peers.time_domain_image, every=10, limits=(50.0, 150.0)),
+    peers.Peer("the best time-domain sum", "numba", peers.time_domain_image, every=10, limits=(150.0, 250.0)),
     peers.Peer("FastSAR", "fastsar", peers.fastsar_image, every=40),
 )
 
@@ -124,7 +124,7 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
     theirs, tuned = took["published"].median, took["published, tuned"].median
     finer = (f"{n} points {s['cpu_s']:.1f} s, {100 * s['rms_error']:.2g} %" for n, s in settings.items())
     lines = []
-    for name, at_least, aim in (("warm", 30, 50), ("cold", 15, 22)):
+    for name, at_least, aim in (("warm", 18, 30), ("cold", 9, 13)):
         ours = took[name].median
         lines.append(
             Line(

@@ -23,7 +23,7 @@ __all__ = ["add_arguments", "run"]
 REPEATS = 5
 POSITIONS = 70  # of a row's 350, evenly spaced: the published method is timed on these
 STAGES = ("decode and align", "direct path")
-LIMITS = {"decode and align": (25.0, 100.0), "direct path": (25.0, 45.0)}
+LIMITS = {"decode and align": (80.0, 120.0), "direct path": (60.0, 80.0)}
 
 
 @contextmanager

@@ -93,7 +93,7 @@ def _time_line(seconds: float, published_s: float, tuned_s: float, part: str) ->
         f"{seconds:.1f} s",
         f"{published_s:.0f} s",
         published_s / seconds,
-        60,
+        80,
         120,
         note=f"ours from {part}; published method from 70 positions and one board's image, scaled;"
         f" in single precision {tuned_s:.0f} s: {tuned_s / seconds:.0f}x",
@@ -108,7 +108,7 @@ def _last_row_line(live: dict[str, list[float]]) -> Line:
         f"{last:.2f} s",
         "",
         last,
-        1.0,
+        0.1,
         0.1,
         higher_is_better=False,
         note=f"median of {len(live['last_row_wall_s'])}, wall seconds ({last_cpu:.2f} s of CPU): reading,"
@@ -122,7 +122,7 @@ def _memory_line(memory: int, part: str) -> Line:
         f"{memory / 1e9:.2f} GB",
         "",
         memory / 1e9,
-        1.0,
+        0.4,
         0.4,
         higher_is_better=False,
         note=f"highest RssAnon of the processing process, at once and row by row; {part}",

@@ -41,7 +41,15 @@ from polysight.host.process import (
     save_images,
     untold,
 )
-from polysight.host.products import IMAGE, QUALITY, check_products_folder, making_products, write_json
+from polysight.host.products import (
+    IMAGE,
+    QUALITY,
+    RAW_DROPPED,
+    SavedProducts,
+    check_products_folder,
+    making_products,
+    write_json,
+)
 from polysight.host.store import ScanFolder, Source, open_source, raw_source, require_raw
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError, advice
@@ -248,6 +256,8 @@ def image(data: Path, out: Path, config: Path | None, view: View = AS_IN_RIG_FIL
     """image.npz and quality.json only; returns the exit status. Raises PolysightError."""
     source = open_source(data, config, dropped=True)
     check_products_folder(out, source.scan_id)
+    if isinstance(source, ScanFolder) and SavedProducts(out).quality.get(RAW_DROPPED):
+        require_raw(source)  # products in `out` may be all that is left of it
     pipeline = all_rows(source, data, depth_m=PLANE_REACH_M if view == AS_IN_RIG_FILE else 0.0, view=view)
     images = pipeline.form_images()
     with making_products(out, source.scan_id) as new:

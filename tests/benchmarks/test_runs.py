@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, image, sync, table, whole
+from benchmarks import accuracy, image, sync, table, waits, whole
 from benchmarks.__main__ import main
 from benchmarks.measure import THREADS
 
-MODULES = {"sync": sync, "image": image, "whole": whole, "accuracy": accuracy}
+MODULES = {"sync": sync, "image": image, "whole": whole, "waits": waits, "accuracy": accuracy}
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def test_a_scan_passes_the_stops_in_their_order(tmp_path):
     names = {name for _, name in wanted}
     sys.setprofile(look)
     try:
-        assert process(ProcessRequest(data=str(scan), out=str(tmp_path / "out"))) == 0
+        assert process(ProcessRequest(data=str(scan), out=str(tmp_path / "out")), threads=1) == 0
     finally:
         sys.setprofile(None)
     assert passed == sorted(wanted.values())

@@ -86,6 +86,9 @@ class Bursts(NamedTuple):
 def read_log(path: Path) -> PacketLog | None:
     """A row's packet log; None when there is none. A header line is skipped.
 
+    The last packet, when it is not full, counts as come with the one before it: the card holds it back for 2 s, and it
+    would look like one more position.
+
     Raises
     ------
     DataError
@@ -104,7 +107,10 @@ def read_log(path: Path) -> PacketLog | None:
     if not table.size:
         return None
     sequence, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
-    return PacketLog(sequence, table[first, 1].astype(np.int64), table[first, 2])
+    size, at_s = table[first, 1].astype(np.int64), table[first, 2]
+    if size[-1] < size.max():
+        at_s[-1] = at_s[-2]
+    return PacketLog(sequence, size, at_s)
 
 
 def _numbers(lines: list[str]) -> NDArray[np.float64]:

@@ -1,0 +1,123 @@
+"""What somebody waits for: last row to image and report, another plane from kept samples, commands to their output."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from benchmarks.data import ROOT, SCENE, published, recorded_rows, temporary, write_scan
+from benchmarks.measure import Seconds
+from benchmarks.table import Line, add_arguments, show, write
+from benchmarks.whole import rows_that_fit
+from polysight.host.imaging import View
+from polysight.host.jobs.process import make_products, publish_images
+from polysight.host.pipeline import Pipeline
+from polysight.host.process import Options
+from polysight.host.store import ScanFolder
+
+__all__ = ["add_arguments", "run"]
+REPEATS = 3
+COMMANDS = {  # at most so many CPU seconds; {made} is a folder of products
+    "--help": 0.2,
+    "materials {made}": 0.6,
+    "report {made}": 0.6,
+    "permittivity {made}": 0.6,
+    "plan": 1.0,
+}
+
+
+def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
+    """Wall seconds behind a scan's last row, as beside a running scan: to the written images, to the report."""
+    source = ScanFolder.load(scan)
+    pipeline, rows = Pipeline(source, live=True, samples="keep"), list(source.rows())
+    for row in rows[:-1]:
+        pipeline.add_row(row)
+    began = time.perf_counter()
+    pipeline.synchronise_row(rows[-1])  # from raw data, also where its samples are there
+    pipeline.samples.save(rows[-1])
+    publish_images(pipeline, out)
+    image_s = time.perf_counter() - began
+    make_products(pipeline, out, Options(), ())
+    return {"image": image_s, "report": time.perf_counter() - began}
+
+
+def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
+    """All rows read back and both images made: of the rig file's plane, and of another, each in a new pipeline."""
+    same, other = Seconds(), Seconds()
+    for _ in range(repeats + 1):
+        for took, view in ((same, View()), (other, View(depth_mm=5.0))):
+            source = ScanFolder.load(scan)
+            pipeline, rows = Pipeline(source, samples="read", view=view, depth_m=0.0), list(source.rows())
+            if not pipeline.samples.holds(rows):
+                raise RuntimeError("samples were not kept")
+            with took.timed():
+                for row in rows:
+                    pipeline.add_row(row)
+                pipeline.form_images()
+    for took in (same, other):  # the first round makes kernels
+        del took.cpu[0], took.wall[0]
+    return same, other
+
+
+def command(words: list[str]) -> tuple[float, float]:
+    """CPU and wall seconds of a command in a process of its own. Raises RuntimeError when it fails."""
+    before, began = os.times(), time.perf_counter()
+    done = subprocess.run([sys.executable, "-m", "polysight.host", *words], cwd=ROOT, capture_output=True, check=False)
+    wall, after = time.perf_counter() - began, os.times()
+    if done.returncode:
+        raise RuntimeError(f"polysight {' '.join(words)}: {done.stderr.decode()}")
+    return after.children_user + after.children_system - before.children_user - before.children_system, wall
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print."""
+    rig, scene = published(args.quick)
+    repeats = 1 if args.quick else REPEATS
+    with temporary(args.folder) as folder:
+        count = rows_that_fit(rig, 20 if args.quick else rig.grid.rows, folder)
+        write_scan(folder / "scan", rig, recorded_rows(rig, scene, min(4, count)), count)
+        behind = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
+        same, other = from_samples(folder / "scan", repeats)
+        made = small_products(folder)
+        typed = {name: [command(name.format(made=made).split()) for _ in range(repeats)] for name in COMMANDS}
+    boards = len(rig.receivers)
+    lines = []
+    for what, limit in (("image", 0.1), ("report", 4.0)):
+        waited = [found[what] for found in behind]
+        note = ", ".join(f"{seconds:.2f}" for seconds in waited)
+        lines.append(_least(f"last committed row to {what}, wall s", statistics.median(waited), limit, limit, note))
+    for name, took in (("its own plane", same), ("another plane", other)):
+        lines.append(_least(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1))
+    for name, times in typed.items():
+        cpu, wall = (statistics.median(t[k] for t in times) for k in (0, 1))
+        note = f"{wall:.2f} s wall"
+        lines.append(_least(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
+    show("what is waited for, simulated rows", lines, args.quick)
+    write(args.json, "waits", lines, behind=behind, commands=typed)
+    return 0
+
+
+def small_products(folder: Path) -> Path:
+    """Products of a small scan, to ask commands about."""
+    scan, made = folder / "small", folder / "made"
+    rig = ["--config", str(ROOT / "instrument.toml")]
+    small = (SCENE.parent / "own-scene.toml") if (SCENE.parent / "own-scene.toml").exists() else SCENE
+    subprocess.run(
+        [sys.executable, "-m", "polysight.simulators", "simulate", str(small), *rig, "--out", str(scan)],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
+    command(["process", str(scan), "--out", str(made)])
+    shutil.rmtree(scan)
+    return made
+
+
+def _least(name: str, value: float, at_least: float, aim: float, note: str = "") -> Line:
+    return Line(name, f"{value:.3f} s", "", value, at_least, aim, higher_is_better=False, note=note)

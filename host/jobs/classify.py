@@ -16,6 +16,7 @@ from polysight.host.jobs.print_verdict import print_verdict
 from polysight.host.materials import (
     PATCHES,
     SIMULATED_LIBRARY,
+    UNKNOWN,
     Classifier,
     Library,
     MatchedPatch,
@@ -55,6 +56,12 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     """
     scans = [find_products(folder, PATCHES) for folder in data]
     found = [s for s in scans if s is not None]
+    if len({s.folder.resolve() for s in found}) < len(found):
+        raise ConfigError(
+            f"{' '.join(map(str, data))}: one scan is given twice",
+            "it tells nothing more the second time",
+            "give scans of the same patches under different angles",
+        )
     if len(found) == len(scans):
         return _name(found, library or SIMULATED_LIBRARY, model, as_json)
     if len(data) > 1:
@@ -147,11 +154,16 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
     for row in rows:
         votes = ", ".join(f"{name} {share:.0%}" for name, share in list(row["votes"].items())[:2])
         truth = f"   truly {row['truth']}" if row["truth"] else ""
-        sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {row['confidence']:6.1%}   pixels: {votes}{truth}\n")
+        sure = f"{row['confidence']:6.1%}" if row["pixels"] else "no pixel of it can be used"
+        sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {sure}   pixels: {votes}{truth}\n")
     for p, found in zip(products, refused, strict=True):
         where = f" in {p.folder}" if len(products) > 1 else ""
         sys.stdout.write("".join(f"{n:>3}  not judged{where}: {refused_text(s)}\n" for n, s in found.items()))
-    known = [r for r in rows if r["truth"]]
+    strange = [r for r in rows if r["truth"] and r["truth"] not in library.names]
+    known = [r for r in rows if r["truth"] and not (r in strange and r["name"] == UNKNOWN)]
+    if strange:
+        told = sum(r["name"] == UNKNOWN for r in strange)
+        sys.stdout.write(f"{len(strange)} patches of materials that the library lacks, {told} of them told so\n")
     if known:
         right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
         sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")

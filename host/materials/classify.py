@@ -186,6 +186,12 @@ class Classifier:
                 "say which angle the scan has",
             )
         parts = [library.at(a) for a in angles_deg or library.angles_deg]
+        if len({p.angles_deg[0] for p in parts}) < len(parts):
+            raise DataError(
+                f"scans under {' and '.join(f'{a:.1f}' for a in angles_deg or ())} degrees",
+                "the library has learnt one set of features of that angle, whose errors would count twice",
+                "give scans of the same patches under different angles, or one at a time",
+            )
         fit = parts[0].fit if len(parts) == 1 else library.fit_of([p.angles_deg[0] for p in parts])
         self.library, self.fit, self.angles_deg = library, fit, tuple(p.angles_deg[0] for p in parts)
         self.model = PAPER if weights else _model_name(model or fit.get("model", PAPER))

@@ -171,7 +171,8 @@ class ErrorDiscriminant(Model):
             scene = self._scene(mean, own + mine[:, None], scene, tells, none)
         none = self._none(x, patch, placed, scene)
         q, cost = _costs(mean - scene.shift[:, None], own + (mine + scene.spread)[:, None])
-        probability, far = _probabilities(cost, none), np.sqrt(q / self.patch_level)
+        probability = _doubted(_probabilities(cost, none), q - self.patch_level)
+        far = np.sqrt(q / self.patch_level)
         at = np.arange(ids.size), cost.argmin(axis=1)
         alone = self._patch_covariances(1.0)[None] + (mine + scene.spread)[:, None]
         pixel_q, pixel_cost = _costs(d - scene.shift[patch][:, None], alone[patch])
@@ -376,6 +377,17 @@ def _positive(a: Real) -> Real:
     """The nearest matrix without negative eigenvalues."""
     values, vectors = np.linalg.eigh((a + a.T) / 2)
     return (vectors * np.maximum(values, 0)) @ vectors.T
+
+
+def _doubted(probability: Real, beyond: Real) -> Real:
+    """Probabilities [n, materials + 1] where a patch may be what no model here describes: gain, edges, damage.
+
+    `beyond` [n, materials] is how much farther in chi-square a patch lies from a material than its patches do but for
+    2 in 100. There half of its probability goes to none of them, and farther out soon all: what is called unknown for
+    its distance has no likelier name.
+    """
+    known = probability[:, :-1] * scipy.special.expit(-beyond)
+    return np.concatenate([known, 1 - known.sum(axis=1, keepdims=True)], axis=1)
 
 
 def _probabilities(cost: Real, none: Real) -> Real:

@@ -23,7 +23,7 @@ LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these")
 """Words that the classifier uses itself."""
 _TOLERANCE_MM = 0.01  # files hold three decimals
-_HIDDEN = re.compile("[\u200e\u200f\u202a-\u202e\u2066-\u2069\ufeff]")  # marks of writing direction: they show nothing
+_HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")  # they show nothing
 
 
 def clean_name(text: str, kind: str = "name") -> str:

@@ -35,6 +35,7 @@ LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
 INDEX_STEPS = 60
 STARTS = 24
 RIVAL = 9.0
+MOST_THICKNESS_M = 30e-3
 """A second solution is a rival when its chi-square is within this of the best: three standard deviations, as wide as
 the error bars are where the model misses the data."""
 UNLIKELY = 1e-3
@@ -93,7 +94,7 @@ class LayerFit:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether another solution explains the data as well, or a fitted thickness leaves either open beyond 5 %."""
+        """Whether the data do not exclude another solution, or a fitted thickness leaves either open beyond 5 %."""
         return bool(self.rivals) or (self.std_thickness_m > 0 and 2 * self.relative_std > DETERMINED)
 
     def warnings(self) -> list[str]:
@@ -102,7 +103,8 @@ class LayerFit:
         for r in self.rivals:
             size = "" if r.thickness_m is None or not self.std_thickness_m else f" at {1e3 * r.thickness_m:.3g} mm"
             out.append(
-                f"{format_permittivity(r.permittivity)}{size} explains the data as well (chi-square {r.chi2:.1f})"
+                f"{format_permittivity(r.permittivity)}{size} is not excluded: chi-square {r.chi2:.1f}, the best has"
+                f" {self.chi2:.1f} for {self.freedom} degrees"
             )
         if not self.rivals and self.ambiguous:
             out.append(
@@ -152,6 +154,7 @@ def fit_layer(
         raise PolysightError(
             f"{len(at)} layers of unknown permittivity", "one can be fitted", "give the permittivity of the others"
         )
+    check_range(thickness_range_m or stack[at[0]].thickness_range_m)
     model = _Model(bands, tuple(stack), at[0], theta_rad, thickness_range_m or stack[at[0]].thickness_range_m)
     if model.freedom < 0:
         raise DataError(
@@ -169,6 +172,16 @@ def fit_layer(
         if all(_differ(other, known) for known in (best, *rivals)):
             rivals.append(other)
     return replace(best, rivals=tuple(rivals))
+
+
+def check_range(thickness_range_m: tuple[float, float] | None) -> None:
+    """Raise PolysightError where a thickness is looked for beyond what a sweep of a few GHz can tell apart."""
+    if thickness_range_m is not None and thickness_range_m[1] > MOST_THICKNESS_M:
+        raise PolysightError(
+            f"a thickness of up to {1e3 * thickness_range_m[1]:g} mm",
+            f"beyond {1e3 * MOST_THICKNESS_M:g} mm a layer holds too many half waves to tell two of them apart",
+            "narrow the range, or measure the thickness; a thick lossy layer is a half space",
+        )
 
 
 def _differ(a: LayerFit, b: LayerFit) -> bool:

@@ -129,6 +129,10 @@ class Bands:
         )
 
 
+MOST_PERMITTIVITY = 1000.0
+"""Of a layer that is given as known."""
+
+
 @dataclass(frozen=True)
 class Layer:
     """One layer.
@@ -203,3 +207,13 @@ def check_stack(stack: Sequence[Layer]) -> None:
             "only the last layer may be a half space",
             "give each layer its thickness",
         )
+    for layer in stack:
+        eps = layer.permittivity
+        if eps is None or np.isinf(eps):
+            continue
+        if not (1.0 <= eps.real <= MOST_PERMITTIVITY and 0.0 <= -eps.imag <= MOST_PERMITTIVITY):
+            raise PolysightError(
+                f"{layer.name}: permittivity {eps.real:g}, loss {-eps.imag:g}",
+                f"no passive material has less than 1 or a negative loss; more than {MOST_PERMITTIVITY:g} is a metal",
+                "eps' - j eps'' is given as two numbers from 1 and from 0 on; metal as the word metal",
+            )

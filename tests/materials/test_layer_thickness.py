@@ -93,7 +93,7 @@ def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
     for true in (SHEET.thickness_m, again):
         assert min(abs(size / true - 1) for size in sizes) < 0.05
     assert fit.ambiguous
-    assert any("mm explains the data as well" in words for words in fit.warnings())
+    assert any("mm is not excluded" in words for words in fit.warnings())
 
 
 def test_a_thickness_that_is_not_determined_is_told_ambiguous():

@@ -129,7 +129,8 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
             "the object was moved between the scans, or these are scans of other objects",
             "scan the same patches in the same places",
         )
-    named = classifier.scan([m.features for m in matched])
+    errors = scans[0].errors_of([m.label for m in matched]) if len(scans) == 1 else None
+    named = classifier.scan([m.features for m in matched], errors)
     rows = [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)]
     simulated = any(s.simulated for s in scans)
     once = sum(len(s.patches) for s in scans) - len(scans) * len(matched)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, features_of
 from polysight.host.materials.explain import explained
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
-from polysight.host.materials.inversion import Inversion, Seen, Uncertain, invert
+from polysight.host.materials.inversion import Inversion, invert
 from polysight.host.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
@@ -27,6 +27,7 @@ from polysight.host.materials.metal import MetalReference, find_metal, metal_by_
 from polysight.host.materials.metal_evidence import metal_evidence
 from polysight.host.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
 from polysight.host.materials.result import MaterialsResult, PatchResult
+from polysight.host.materials.samples import SceneErrors
 from polysight.host.materials.scene_errors import scene_errors
 from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
 from polysight.host.materials.tilts import level
@@ -99,7 +100,8 @@ def analyse(
         for p in found.patches
     }
     refused |= {label: why for label, e in patches.items() if (why := _no_material(e)) is not None}
-    named = _names(classifier, (sh, sv, sp), (inversion, prior), judged, measured, float(np.mean(theta)))
+    errors = scene_errors(inversion, prior, measured) if judged else None
+    named = _names(classifier, (sh, sv, sp), inversion, judged, errors, float(np.mean(theta)))
     truth = match_truth(found.patches, known.plates)
     results = tuple(
         PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
@@ -109,15 +111,16 @@ def analyse(
     return MaterialsResult(
         calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, library=library, tilts=tilts,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
+        errors=None if errors is None else (tuple(p.label for p in judged), errors),
     )  # fmt: skip
 
 
 def _names(
     classifier: Classifier | None,
     channels: tuple[Image, Image, Image],
-    errors: tuple[Inversion, Uncertain],
+    inversion: Inversion,
     judged: list[Patch],
-    measured: list[Seen],
+    errors: SceneErrors | None,
     theta_rad: float,
 ) -> dict[int, NamedPatch]:
     """Patch number to its name, with the error budget's share in it; the metal reference is not named by itself."""
@@ -125,13 +128,13 @@ def _names(
         return {}
     h, v, p = channels
     features = []
-    for patch, estimate in zip(judged, errors[0].patches, strict=True):
+    for patch, estimate in zip(judged, inversion.patches, strict=True):
         at = patch.interior
-        by_h, by_q = _to_angle(estimate.permittivity, theta_rad + errors[0].theta_error_rad, classifier.angles_deg)
+        by_h, by_q = _to_angle(estimate.permittivity, theta_rad + inversion.theta_error_rad, classifier.angles_deg)
         features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
-    named = classifier.scan(features, scene_errors(*errors, measured))
+    named = classifier.scan(features, errors)
     told = (
-        explained(n, e.permittivity, e.covariance, classifier) for n, e in zip(named, errors[0].patches, strict=True)
+        explained(n, e.permittivity, e.covariance, classifier) for n, e in zip(named, inversion.patches, strict=True)
     )
     return dict(zip((patch.label for patch in judged), told, strict=True))
 

@@ -20,7 +20,7 @@ import scipy
 
 from polysight.host.materials.classify import features_of
 from polysight.host.materials.result import MaterialsResult
-from polysight.host.materials.samples import Real
+from polysight.host.materials.samples import Real, SceneErrors
 from polysight.host.materials.segment import axis_mm
 from polysight.host.store import open_npz
 from polysight.shared.errors import DataError
@@ -31,6 +31,7 @@ APART_MM = 20.0
 """Middles of one patch in two scans lie no farther apart."""
 NEAR_MM = 4.0
 """Two pixels of two scans that lie no farther apart show the same spot: about the resolution."""
+_BUDGET = ("own", "design", "covariance")  # of `SceneErrors`
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,19 @@ class SeenPatch:
 
 @dataclass(frozen=True)
 class SeenPatches:
-    """The patches of one scan."""
+    """The patches of one scan; `errors`: what its error budget leaves uncertain of those numbered `judged`."""
 
     angle_deg: float
     simulated: bool
     patches: tuple[SeenPatch, ...]
+    judged: tuple[int, ...] = ()
+    errors: SceneErrors | None = None
+
+    def errors_of(self, labels: Sequence[int]) -> SceneErrors | None:
+        """The same of these patches, in this order; None where it is not known of all."""
+        if self.errors is None or not set(labels) <= set(self.judged):
+            return None
+        return self.errors.of(np.array([self.judged.index(label) for label in labels], np.intp))
 
 
 @dataclass(frozen=True)
@@ -78,12 +87,17 @@ def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike,
         rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
     angle = float(np.degrees(np.mean(found.theta_rad)))
     meta = {"format": FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows}
+    budget: dict[str, Any] = {}
+    if found.errors is not None:
+        meta["judged"], errors = found.errors
+        budget = {f"errors_{name}": getattr(errors, name) for name in _BUDGET}
     out = io.BytesIO()
     np.savez_compressed(
         out,
         meta=np.frombuffer(json.dumps(meta).encode("utf-8"), np.uint8),
         places_mm=np.concatenate(places).astype(np.float32),
         features=np.concatenate(features).astype(np.float32),
+        **budget,
     )
     return out.getvalue()
 
@@ -94,6 +108,7 @@ def read_patches(path: Path) -> SeenPatches:
         with open_npz(path) as z:
             meta = json.loads(z["meta"].tobytes().decode("utf-8"))
             places, features = z["places_mm"].astype(np.float64), z["features"].astype(np.float64)
+            budget = [z[f"errors_{name}"].astype(np.float64) for name in _BUDGET] if "judged" in meta else []
         if meta["format"] != FORMAT:
             raise ValueError(f"its format is {meta['format']!r}, this program reads {FORMAT!r}")
         ends = np.cumsum([0, *(int(r["pixels"]) for r in meta["patches"])])
@@ -102,7 +117,11 @@ def read_patches(path: Path) -> SeenPatches:
         patches = tuple(
             _seen(r, places[a:b], features[a:b]) for r, a, b in zip(meta["patches"], ends, ends[1:], strict=False)
         )
-        return SeenPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches)
+        judged = tuple(int(label) for label in meta.get("judged", ()))
+        errors = SceneErrors(*budget) if budget else None
+        if errors is not None and (len(errors.own), len(errors.design)) != (len(judged), len(judged)):
+            raise ValueError(f"an error budget of {len(errors.own)} patches for {len(judged)}")
+        return SeenPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, judged, errors)
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(
             f"{path}: the patches cannot be read: {type(e).__name__}: {e}",

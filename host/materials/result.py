@@ -15,6 +15,7 @@ from polysight.host.materials.inversion import Inversion, Uncertain, ratio_error
 from polysight.host.materials.measure import Refused, background, ratio_sigma
 from polysight.host.materials.metal import MetalReference
 from polysight.host.materials.permittivity import NOTHING, Permittivity
+from polysight.host.materials.samples import SceneErrors
 from polysight.host.materials.segment import Patch, Segmentation
 from polysight.host.materials.tilts import Tilts
 from polysight.host.materials.truth import TruthPlate
@@ -97,6 +98,9 @@ class MaterialsResult:
         Whether the verdict is `no result`: rows hold no name, no ratio and no permittivity then.
     tilts
         How the plates lie beside the image's plane; already taken out of `h` and `v`.
+    errors
+        What the error budget leaves uncertain of the judged patches, for naming them, and their numbers in its order;
+        None where nothing was judged.
     brightness_off
         Patch number to ln of |H| beside that of a half space of its permittivity; absent where it does not tell.
     """
@@ -117,6 +121,7 @@ class MaterialsResult:
     withheld: bool = False
     tilts: Tilts = LEVEL
     brightness_off: Mapping[int, float] = field(default_factory=dict)
+    errors: tuple[tuple[int, ...], SceneErrors] | None = None
 
     def rows(self) -> list[dict[str, Any]]:
         """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""

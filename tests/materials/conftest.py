@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polysight.host.materials import TruthPlate
+from polysight.host.materials import Library, TrainingScan, TruthPlate, make_library
 from polysight.host.materials.analyse import FOUND, ImagePair, KnownScene, Optics, analyse
 
 THETA = np.radians(55.0)
@@ -112,3 +112,12 @@ def synthetic():
 @pytest.fixture(scope="session")
 def nine():
     return NINE
+
+
+@pytest.fixture(scope="session")
+def library(synthetic) -> Library:
+    """Six placements that no test scene repeats."""
+    return make_library(
+        [TrainingScan(f"train-{s}", synthetic(s).analyse(), True, s, {"made by": "test"}) for s in range(1000, 1006)],
+        note="synthetic images",
+    )

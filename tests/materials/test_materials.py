@@ -12,7 +12,6 @@ from polysight.host.materials import (
     UNKNOWN,
     Classifier,
     Library,
-    TrainingScan,
     Weights,
     analyse,
     estimate_permittivity,
@@ -31,15 +30,6 @@ from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.errors import DataError
 
 THETA = np.radians(55.0)
-
-
-@pytest.fixture(scope="session")
-def library(synthetic):
-    """Six placements that no test scene repeats."""
-    return make_library(
-        [TrainingScan(f"train-{s}", synthetic(s).analyse(), True, s, {"made by": "test"}) for s in range(1000, 1006)],
-        note="synthetic images",
-    )
 
 
 def test_library_round_trips(tmp_path, library):

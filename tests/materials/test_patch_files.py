@@ -1,0 +1,78 @@
+"""`patches.npz`: what names a scan again later knows of its errors what naming it at once did."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pytest
+
+from polysight.host.materials import UNKNOWN, Classifier, ImagePair, match_patches, pack_patches, read_patches
+from polysight.shared.errors import DataError
+
+
+def named_again(found, scene, classifier, path):
+    """Names of a result's patches, by number, from its file alone."""
+    path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
+    seen = read_patches(path)
+    matched = [m for m in match_patches([seen]) if m.label in seen.judged]
+    again = classifier.scan([m.features for m in matched], seen.errors_of([m.label for m in matched]))
+    return {m.label: n.verdict for m, n in zip(matched, again, strict=True)}
+
+
+def test_a_scan_is_named_again_as_it_was_named(synthetic, library, tmp_path):
+    scene, classifier = synthetic(3), Classifier(library)
+    found = scene.analyse(classifier=classifier)
+    again = named_again(found, scene, classifier, tmp_path / "patches.npz")
+    for r in found.patches:
+        if r.named is not None:
+            assert again[r.patch.label].name == r.named.verdict.name
+            assert again[r.patch.label].confidence == pytest.approx(r.named.verdict.confidence, abs=0.02)
+
+
+@pytest.mark.parametrize("gain", [0.8, 0.9, 1.1, 1.25])
+def test_brightness_that_all_plates_share_does_not_change_their_names(gain, synthetic, library, tmp_path):
+    """A low or tilted metal plate makes all others brighter or darker in both channels: V / H stays."""
+    scene, classifier = synthetic(3), Classifier(library)
+    plain = scene.analyse(classifier=classifier)
+    metal = plain.segmentation.labels == plain.metal.label
+    factor = np.where(metal, 1.0, gain)
+    pair = ImagePair(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m)
+    found = scene.analyse(classifier=classifier, pair=pair)
+    again = named_again(found, scene, classifier, tmp_path / "patches.npz")
+    names = {r.patch.label: r.named.verdict.name for r in plain.patches if r.named is not None}
+    wrong = {n: (names[n], v.name) for n, v in again.items() if n in names and v.name not in (names[n], UNKNOWN)}
+    assert not wrong
+    assert sum(v.name == names.get(n) for n, v in again.items()) >= 0.7 * len(names)
+
+
+def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, tmp_path):
+    scene = synthetic(3)
+    found = scene.analyse(classifier=Classifier(library))
+    path = tmp_path / "patches.npz"
+    path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
+    with np.load(path) as z:
+        kept = {k: z[k] for k in z if not k.startswith("errors_")}
+    meta = json.loads(kept["meta"].tobytes())
+    del meta["judged"]
+    out = io.BytesIO()
+    np.savez(out, **{**kept, "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)})
+    path.write_bytes(out.getvalue())
+    seen = read_patches(path)
+    assert seen.errors is None
+    assert seen.errors_of([1]) is None
+    assert len(seen.patches) == len(found.patches)
+
+
+def test_a_budget_of_other_patches_is_refused(synthetic, library, tmp_path):
+    scene = synthetic(3)
+    path = tmp_path / "patches.npz"
+    path.write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))
+    with np.load(path) as z:
+        kept = {k: z[k] for k in z}
+    out = io.BytesIO()
+    np.savez(out, **{**kept, "errors_own": kept["errors_own"][:-1]})
+    path.write_bytes(out.getvalue())
+    with pytest.raises(DataError, match="budget"):
+        read_patches(path)

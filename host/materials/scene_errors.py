@@ -12,13 +12,15 @@ from polysight.host.materials.samples import SceneErrors
 from polysight.host.materials.specimens import features, relative, softened
 
 Real = npt.NDArray[np.float64]
+REFERENCE_BRIGHTNESS_STD = 0.1
+"""Of ln|H| and ln|V| of all patches: how much a metal plate that lies a millimetre high, or a degree askew, is off."""
 
 
 def scene_errors(found: Inversion, prior: Uncertain, seen: Sequence[Seen]) -> SceneErrors:
     """What the budget leaves uncertain of ln|H|, ln|V| and arg P of the patches, for naming them together.
 
     In common are leakage of p into H (da) and of s into V (db), the metal reference (rho) and the angle, as the
-    inversion left them; each patch has the error of its own V / H and its brightness, common to both channels.
+    inversion left them, and the reference's brightness, of which V / H tells nothing; each patch has the error of its own V / H and its brightness, common to both channels.
     To first order about the solution, for the patches' true features with t = r_p / r_s and fixed permittivity:
     d ln|H| = Re((1 - t) da), d t = -(1 - t) (t da + db) - t rho - (dt / dtheta) dtheta.
     """
@@ -29,8 +31,11 @@ def scene_errors(found: Inversion, prior: Uncertain, seen: Sequence[Seen]) -> Sc
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
     columns = [relative((unit * scale * by_h).real, unit * scale * by_t, t[:, None]) for unit in (1.0, 1j)]
     design = np.stack(columns, axis=2).reshape(len(t), 6, 3)
-    design = np.concatenate([design, _by_angle(found, prior, seen)[:, None]], axis=1).swapaxes(1, 2)
-    covariance = found.nuisance_covariance[:7, :7]
+    bright = np.tile([1.0, 1.0, 0.0], (len(t), 1, 1))
+    design = np.concatenate([design, _by_angle(found, prior, seen)[:, None], bright], axis=1).swapaxes(1, 2)
+    covariance = np.zeros((8, 8))
+    covariance[:7, :7] = found.nuisance_covariance[:7, :7]
+    covariance[7, 7] = REFERENCE_BRIGHTNESS_STD**2
     own_h = np.zeros((len(t), 3, 3))
     own_h[:, :2, :2] = found.brightness_std**2
     noise = np.array([s.std for s in seen]) / softened(t)

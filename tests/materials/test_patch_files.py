@@ -65,7 +65,7 @@ def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, tm
     assert len(seen.patches) == len(found.patches)
 
 
-def test_a_budget_of_other_patches_is_refused(synthetic, library, tmp_path):
+def test_a_budget_of_other_patches_is_refused(synthetic, tmp_path):
     scene = synthetic(3)
     path = tmp_path / "patches.npz"
     path.write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))

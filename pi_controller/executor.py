@@ -28,10 +28,13 @@ from polysight.shared.faults import PiFault, explain
 from polysight.shared.stage_line import Reply
 from polysight.shared.units import us_to_ns
 
-EVENTS_PER_TURN = 256
+TURN_LIMIT_S = 0.2  # what still waits then is for the next turn: a queue that never empties is no executor that hangs
 TURN_S = 1.0  # the executor turns at least so often: whoever sees it stand still for HUNG_S knows that it hangs
 HUNG_S = 10.0
 WAITING = 64  # commands that may wait for the executor
+REPLAYS = 4  # of them
+LINES_WAITING = 64  # of the stage: one that talks without end keeps nobody waiting and fills no memory
+REPLAYED_AT_REST = 1000  # events a reply: half a second of a Pi
 REPLAYED_IN_A_ROW = 20  # events a reply while a row runs: many are long calls that keep the trigger thread waiting
 OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # name the run: its host lives
 OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # refused to whom the run does not belong
@@ -86,6 +89,8 @@ class Executor:
         self._after_row: Request | None = None
         self._replies: list[tuple[Request, m.AnyReply]] = []
         self._pulsing: list[Request] = []
+        self._asked = self._replays_asked = 0  # counted by the server's thread, those taken by the executor's
+        self._taken = self._replays_taken = 0
         self._ending = self._ended = False
         self.crash: BaseException | None = None
         self._commands: dict[type, Callable[[Any], m.AnyReply | None]] = {
@@ -103,12 +108,19 @@ class Executor:
     # --- for other threads ------------------------------------------------------------------------------------------
 
     def post(self, item: Request | StageNews | BurstSent | BenchBurst | LoopFault | Callable[[], object]) -> None:
-        """Hand something over; returns at once."""
+        """Hand something over; returns at once. Lines of the stage that find too many waiting are lost."""
+        if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
+            return  # what a row or homing waits for is asked again
         self._inbox.put(item)
 
-    def full(self) -> bool:
-        """Whether so many commands wait that another one is not taken."""
-        return self._inbox.qsize() > WAITING
+    def full(self, command: m.AnyCommand) -> bool:
+        """Whether so many commands wait that this one is not taken. Asked by the thread that posts commands."""
+        replay = isinstance(command, m.Replay)
+        if self._asked - self._taken >= WAITING or (replay and self._replays_asked - self._replays_taken >= REPLAYS):
+            return True
+        self._asked += 1
+        self._replays_asked += replay
+        return False
 
     @property
     def stands_still_s(self) -> float:
@@ -149,10 +161,10 @@ class Executor:
         try:
             left_s = self._machine.seconds_left()
             item = self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S))
-            for _ in range(EVENTS_PER_TURN):
-                self._take(item)
-                item = self._inbox.get_nowait()
             self._take(item)
+            until_s = time.monotonic() + TURN_LIMIT_S
+            while time.monotonic() < until_s:
+                self._take(self._inbox.get_nowait())
         except queue.Empty:
             pass
         self._machine.check_limits()
@@ -185,6 +197,7 @@ class Executor:
             machine.take_loop_fault(item)
             self._answer_pulses(refused(item.number, item.detail))  # every request gets a reply
         elif isinstance(item, Request):
+            self._taken += 1
             reply = self._reply_to(item)
             self._hear(item.command)  # before the limits are looked at: it may have taken long
             if reply is not None:
@@ -233,7 +246,8 @@ class Executor:
         return self._commands[type(command)](command)
 
     def _replay(self, command: m.Replay) -> m.ReplayReply:
-        limit = command.limit
+        self._replays_taken += 1
+        limit = min(command.limit, REPLAYED_AT_REST)
         if self._machine.row is not None:
             if command.scan_id != self._ledger.scan_id:  # its whole file is read, however few events are wanted
                 raise RefusedError(

@@ -15,7 +15,7 @@ from polysight.pi_controller.ledger import Ledger
 from polysight.pi_controller.lines import BurstSpec
 from polysight.pi_controller.machine import END_LIMIT_S, Machine
 from polysight.pi_controller.rows import RefusedError, row_duration_s, stage_row
-from polysight.pi_controller.stage import StageDriver
+from polysight.pi_controller.stage import MOST_MM, StageDriver
 from polysight.pi_controller.stage_link import StageLostError, StageRefusedError
 from polysight.pi_controller.trigger import BurstSent, Counts, LoopFault, RowJob, TriggerLoop, TriggerWatch
 from polysight.shared import messages as m
@@ -153,7 +153,7 @@ class RowMachine(Machine):
         self._status_told_s = now
         self.emit(
             m.StageStatus, state=reply.fields.get("state", ""), x_mm=self.stage.x_mm, y_mm=self.stage.y_mm,
-            points=max(0, _number(reply, "points")), alarm=_number(reply, "alarm"),
+            points=max(0, _number(reply, "points")), alarm=max(0, min(_number(reply, "alarm"), 999)),
         )  # fmt: skip
 
     # --- actions: homing and rows -----------------------------------------------------------------------------------
@@ -180,7 +180,8 @@ class RowMachine(Machine):
     def _note_homed(self, reply: Reply) -> str:
         self.stage.at_rest()
         k = self.stage.config.steps_per_mm
-        self.lost_mm = (_number(reply, "lostx") / k, _number(reply, "losty") / k)
+        lost_x_mm, lost_y_mm = (_number(reply, key) / k for key in ("lostx", "losty"))
+        self.lost_mm = (max(-MOST_MM, min(lost_x_mm, MOST_MM)), max(-MOST_MM, min(lost_y_mm, MOST_MM)))
         self.homed = True
         return "ready" if self.in_run else "homed"
 

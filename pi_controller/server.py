@@ -50,6 +50,7 @@ class Server:
             raise
         self.command_address = self._commands.getsockopt_string(zmq.LAST_ENDPOINT)
         self.event_address = self._events.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.ports = {int(a.rpartition(":")[2]) for a in (self.command_address, self.event_address)}
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._out: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._stop = False
@@ -150,7 +151,7 @@ class Server:
             return executor.snapshot.status
         if isinstance(command, m.Alive):
             return executor.host_alive(command.scan_id, command.owner)
-        if executor.full():
+        if executor.full(command):
             return refused(PiFault.NOT_READY, "too many commands wait to be carried out", "", "wait for replies")
         executor.post(Request(command, lambda reply: self._answer(envelope, reply)))
         return None

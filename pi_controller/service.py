@@ -14,6 +14,7 @@ from polysight.pi_controller.executor import Executor
 from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, JournalFullError
 from polysight.pi_controller.ledger import Ledger
 from polysight.pi_controller.lines import TriggerLines
+from polysight.pi_controller.memory import MemoryWatch
 from polysight.pi_controller.server import Server
 from polysight.pi_controller.stage import StageDriver
 from polysight.pi_controller.stage_link import StageNews
@@ -87,7 +88,10 @@ class Service:
         """Serve until :meth:`stop`; then stop the stage and end the row. Raises DeviceError when a part failed."""
         self._loop.start()
         self.executor.start()
+        memory = MemoryWatch(self.server.ports, log)
+        memory.start()
         self.server.run(self.executor)
+        memory.stop()
         self.executor.stop(END_LIMIT_S)
         self.server.drain()
         if self.executor.crash is not None:

@@ -22,6 +22,7 @@ ASK_AGAIN_S = 0.05
 # A status unanswered for so much of a heartbeat: the stage is lost. With the time to the next question and a look at
 # the port, a stage that falls silent is noticed before its own heartbeat stops it.
 SILENT_HEARTBEATS = 0.5
+MOST_MM = 1e6  # of a place on the wire
 MOTION_LIMIT_S = HOMING_LIMIT_S  # no motion takes longer than homing
 
 
@@ -131,12 +132,13 @@ class StageDriver:
             self._link.ask_status_every(IDLE_STATUS_S)
 
     def note_position(self, reply: Reply) -> None:
-        """Take x and y out of a status or done reply, when they are there."""
+        """Take x and y out of a status or done reply, when they are there, and possible."""
         try:
-            self.x_mm = reply.integer("x") / self.config.steps_per_mm
-            self.y_mm = reply.integer("y") / self.config.steps_per_mm
+            x_mm, y_mm = (reply.integer(axis) / self.config.steps_per_mm for axis in "xy")
         except ProtocolError:
             return
+        if max(abs(x_mm), abs(y_mm)) <= MOST_MM:
+            self.x_mm, self.y_mm = x_mm, y_mm
 
     def close(self) -> None:
         """Close the port."""

@@ -19,6 +19,7 @@ PI_KEYS = ("pi.key_secret",)
 EVENT_TOPIC = b"event"
 MAX_SUBSCRIPTION_BYTES = 1024
 SEND_LIMIT_MS = 200
+HANDSHAKE_LIMIT_MS = 5000  # who connects and says nothing holds a descriptor for so long
 
 
 def host_of(address: str) -> str:
@@ -110,6 +111,7 @@ def _make(
 def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """PUB socket of the Pi, bound."""
     options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_LIMIT_MS}
     return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
 
 
@@ -133,6 +135,7 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """ROUTER socket of the Pi, bound: it answers REQ sockets. Who sends a longer message than a command is cut off."""
     options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_LIMIT_MS}
     return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
 
 

@@ -129,21 +129,30 @@ def test_home_brings_the_motors_to_zero(pi: InstalledPi):
 
 
 def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi, homed: HostSide):
-    """What the kernel's driver writes to the chip's registers, seen from outside the Pi."""
+    """What the kernel's driver writes to the chip's registers, seen from outside the Pi: as many pulses as are told.
+
+    Clearing a line that is low is no edge: the program does so to be quick. An emulated processor may be so late that a
+    pulse would come too early for a radar: the burst ends there, and says so.
+    """
     assert (pi.box.function(SYNC_OUT), pi.box.level(SYNC_OUT)) == (OUTPUT, 0)
-    replies: list[m.Pulsed] = []
     i = pi.rig.burst
     pulse = m.Pulse(pulses=i.pulses, period_us=i.period_us, width_us=i.width_us)
-    writes = pi.box.writes_during(lambda: replies.append(homed.ask(pulse)))
-    assert isinstance(replies[0], m.Pulsed), replies
-    assert [w.lines for w in writes] == [1 << SYNC_OUT] * len(writes), "no other line is touched"
-    pulses = list(itertools.pairwise(writes))[::2]
-    assert [(rise.high, fall.high) for rise, fall in pulses] == [(True, False)] * i.pulses
-    assert replies[0].pulses == i.pulses
-    assert pi.box.level(SYNC_OUT) == 0
-    spacings_ms = [(b.t_s - a.t_s) * 1e3 for (a, _), (b, _) in itertools.pairwise(pulses)]
-    widths_us = [(fall.t_s - rise.t_s) * 1e6 for rise, fall in pulses]
-    tell(f"bench burst: {len(pulses)} pulses, {min(widths_us):.0f} .. {max(widths_us):.0f} us wide and"
+    for _ in range(TRIES):
+        replies: list[m.Pulsed] = []
+        writes = pi.box.writes_during(lambda: replies.append(homed.ask(pulse)))  # noqa: B023
+        assert isinstance(replies[0], m.Pulsed), replies
+        assert [w.lines for w in writes] == [1 << SYNC_OUT] * len(writes), "no other line is touched"
+        before = [False, *(w.high for w in writes)]
+        edges = [w for w, was in zip(writes, before, strict=False) if w.high != was]
+        rises, falls = edges[::2], edges[1::2]
+        assert len(rises) == len(falls) == replies[0].pulses > 0
+        assert (replies[0].pulses == i.pulses) == (replies[0].fault == 0)
+        assert pi.box.level(SYNC_OUT) == 0
+        if replies[0].fault == 0:
+            break
+    spacings_ms = [(b.t_s - a.t_s) * 1e3 for a, b in itertools.pairwise(rises)] or [0.0]
+    widths_us = [(fall.t_s - rise.t_s) * 1e6 for rise, fall in zip(rises, falls, strict=True)]
+    tell(f"bench burst: {len(rises)} of {i.pulses} pulses, {min(widths_us):.0f} .. {max(widths_us):.0f} us wide and"
          f" {min(spacings_ms):.2f} .. {max(spacings_ms):.2f} ms apart, on this computer's clock")  # fmt: skip
 
 
@@ -181,7 +190,7 @@ def test_a_jog_by_hand_moves_the_motors_by_its_distance(bench: InstalledPi):
 
 def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
     """What `check` cannot learn from Debian's driver: no pulse stays high when the program dies inside it."""
-    held = f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 & echo $!"
+    held = f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 >/dev/null & echo $!"  # its end is not waited for
     number = bench.box.run(f"sudo sh -c '{held}' </dev/null 2>/dev/null").strip()
     bench.box.wait(lambda: bench.box.level(SYNC_OUT) == 1, "the line is high")
     assert bench.box.function(SYNC_OUT) == OUTPUT

@@ -1,0 +1,114 @@
+"""What ZeroMQ takes in for a client that does not play by the rules: cut before it fills the memory.
+
+The client speaks ZMTP 3.0 (RFC 23) by hand, byte by byte.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from polysight.shared import messages as m
+from tests.support.pi.host_side import HostSide
+from tests.support.pi.program import Process
+
+MORE, LONG, COMMAND = 1, 2, 4
+ENOUGH_BYTES = 2 << 30  # a client that could send so much was not stopped
+BOUND_MB = 400  # the unit's MemoryMax is 512
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
+
+
+def frame(body: bytes, flags: int = 0) -> bytes:
+    if len(body) < 256:
+        return bytes([flags, len(body)]) + body
+    return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body
+
+
+def connected(address: str, kind: bytes) -> socket.socket:
+    """A connection after its handshake, as a socket of this kind."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    peer = socket.create_connection((host, int(port)), timeout=60)
+    peer.sendall(GREETING)
+    peer.recv(len(GREETING), socket.MSG_WAITALL)
+    peer.sendall(frame(b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind, COMMAND))
+    return peer
+
+
+def resident_mb(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 >> 20
+
+
+ATTACKS = {
+    "a message of many frames": (0, b"DEALER", lambda: frame(b"", MORE) + frame(bytes(60_000), MORE) * 10),
+    "subscriptions": (1, b"SUB", lambda: b"".join(frame(b"\x01" + os.urandom(1000)) for _ in range(50))),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_client_without_end_is_cut_off(instrument, write_config, stage, hub, attack):
+    """And the next one is served, by the same process with the same run."""
+    which, kind, more = ATTACKS[attack]
+    with Process(write_config(instrument), "--wires", hub, "--stage-port", stage.port) as p:
+        assert p.ready, p.popen.communicate()
+        host = HostSide(p.ready[1], p.events[1], instrument)
+        host.accepted(host.begin())
+        host.home()
+        highest, ended = [0], threading.Event()
+
+        def watch() -> None:
+            while not ended.wait(0.02):
+                highest[0] = max(highest[0], resident_mb(p.popen.pid))
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        with connected((p.ready[1], p.events[1])[which], kind) as peer:
+            sent, part = 0, b""
+            try:
+                while sent < ENOUGH_BYTES:
+                    part = more()
+                    peer.sendall(part)
+                    sent += len(part)
+            except OSError:
+                pass  # cut off
+        ended.set()
+        watcher.join()
+        assert 0 < sent < ENOUGH_BYTES
+        assert highest[0] < BOUND_MB
+        assert host.row(0).status == "done"
+        deadline = time.monotonic() + 60
+        while resident_mb(p.popen.pid) >= BOUND_MB and time.monotonic() < deadline:
+            time.sleep(0.1)
+        status, _, err = p.end()
+        assert status == 0
+        assert "connections were cut" in err
+        host.close()
+
+
+def test_a_queue_that_never_empties_is_no_executor_that_hangs(pi):
+    """It turns all the while, however much waits: the watchdog and `Alive` go by its turns."""
+    longest = 0.0
+    done = threading.Event()
+    for _ in range(40):
+        pi.service.executor.post(lambda: time.sleep(0.25))
+    pi.service.executor.post(done.set)
+    while not done.wait(0.05):
+        longest = max(longest, pi.service.executor.stands_still_s)
+    assert longest < 5.0
+    assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
+
+
+def test_replays_do_not_keep_other_commands_waiting(pi):
+    """Few of them wait at a time; who asks for more is told to wait."""
+    slow = threading.Event()
+    pi.service.executor.post(lambda: slow.wait(60))
+    replay = m.Replay(scan_id="scan", from_seq=1)
+    full = [pi.service.executor.full(replay) for _ in range(10)]
+    assert full == [False] * full.index(True) + [True] * (10 - full.index(True))
+    assert not pi.service.executor.full(m.Abort())
+    slow.set()

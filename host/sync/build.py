@@ -90,7 +90,19 @@ def build(folder: Path = HERE, target: str = "") -> Path:
             commands = [[*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{made}/{name}"] for words, name in jobs]
             list(workers.map(_run, commands))
         library = f"{made}/{LIBRARY}"
-        _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *(f"{made}/{name}" for _, name in jobs), "-lm"])
+        _run(
+            [
+                *compiler,
+                "-O3",
+                "-fno-sanitize=undefined",
+                "-s",
+                "-shared",
+                "-o",
+                library,
+                *(f"{made}/{name}" for _, name in jobs),
+                "-lm",
+            ]
+        )
         new = folder / f".{LIBRARY}-{os.getpid()}"
         shutil.copyfile(library, new)
         new.replace(folder / LIBRARY)  # at once: a program that uses the old one keeps it

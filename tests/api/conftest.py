@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -47,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def products(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `polysight process` makes of it."""
-    out = tmp_path_factory.mktemp("processed") / "products"
-    command("process", folder, "--out", out)
-    return out
+    """What `polysight process` makes of a copy of it, in which it keeps the samples."""
+    made = tmp_path_factory.mktemp("processed")
+    command("process", shutil.copytree(folder, made / "scan"), "--out", made / "products")
+    return made / "products"

@@ -136,7 +136,7 @@ def test_the_image_is_what_process_writes(scan, products):
 
 
 def test_the_unreferenced_image_is_what_image_writes(scan, folder, tmp_path):
-    command("image", folder, "--out", tmp_path / "out")
+    command("image", shutil.copytree(folder, tmp_path / "scan"), "--out", tmp_path / "out")
     same_image(scan.image(metal_referenced=False), tmp_path / "out" / "image.npz")
     saved = open_scan(tmp_path / "out")
     xarray.testing.assert_allclose(saved.image(metal_referenced=False), scan.image(metal_referenced=False))

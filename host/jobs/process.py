@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -150,7 +150,8 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
     images = pipeline.form_images()
     with making_products(out, pipeline.source.scan_id) as new:
         save_images(new, pipeline.source, pipeline.rig, images, pipeline.quality)
-    sys.stderr.write(f"image: {out / IMAGE}\n")
+    with suppress(OSError):  # that nobody reads it is no reason not to make the rest
+        sys.stderr.write(f"image: {out / IMAGE}\n")
 
 
 def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:

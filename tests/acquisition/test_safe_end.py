@@ -229,6 +229,7 @@ def test_scan_whose_messages_nobody_reads_is_made_and_processed(rig, tmp_path, m
     monkeypatch.setattr(
         live, "make_products", lambda *given: made.append(given) or SimpleNamespace(summary=str, exit_status=0)
     )
+    monkeypatch.setattr(live, "publish_images", lambda *_: None)
     update = progress.ScanBar.update
 
     def updated(bar, p) -> None:

@@ -20,7 +20,8 @@ def scene_errors(found: Inversion, prior: Uncertain, seen: Sequence[Seen]) -> Sc
     """What the budget leaves uncertain of ln|H|, ln|V| and arg P of the patches, for naming them together.
 
     In common are leakage of p into H (da) and of s into V (db), the metal reference (rho) and the angle, as the
-    inversion left them, and the reference's brightness, of which V / H tells nothing; each patch has the error of its own V / H and its brightness, common to both channels.
+    inversion left them, and the reference's brightness, of which V / H tells nothing. Each patch has the error of its
+    own V / H and its brightness, common to both channels.
     To first order about the solution, for the patches' true features with t = r_p / r_s and fixed permittivity:
     d ln|H| = Re((1 - t) da), d t = -(1 - t) (t da + db) - t rho - (dt / dtheta) dtheta.
     """

@@ -162,6 +162,7 @@ def test_saved_products_of_a_scan_folder_are_used_while_they_hold_its_rows(folde
     scan = shutil.copytree(folder, tmp_path / "scan")
     saved = shutil.copytree(products, scan / "products")
     shutil.rmtree(scan / "raw")  # only the products can answer
+    shutil.rmtree(scan / "samples", ignore_errors=True)
     assert "saved products" in repr(open_scan(scan))
     same_image(open_scan(scan).image(), saved / "image.npz")
     for asked in (open_scan(scan, fresh=True), open_scan(scan, model="none")):
@@ -212,7 +213,8 @@ def test_repr_is_one_line_and_says_simulated(scan, products):
         assert "\n" not in repr(one)
 
 
-def test_rows_are_read_once_and_only_when_asked_for(folder, monkeypatch):
+def test_rows_are_read_once_and_only_when_asked_for(folder, tmp_path, monkeypatch):
+    folder = shutil.copytree(folder, tmp_path / "scan", ignore=shutil.ignore_patterns("samples"))
     read: list[tuple[str, int]] = []
     true_read = ScanFolder.read_row
 

@@ -75,7 +75,7 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
         bursts[p] = signal * turn[:, None] + _noise(rng, bursts.shape[1:], snr_db)
     aligned = align_row(_words(bursts), np.ones(truth.shape, bool), chirp.linear_samples)
     method = Synchroniser(rig, board)
-    divided = np.array([[f for f, _ in method.offsets(burst)] for burst in bursts])
+    divided = np.array([method.offsets(np.swapaxes(burst, 0, 1))[0] for burst in bursts])
     half_bin = 0.5 / (b - a)
 
     def errors(found: NDArray[np.float64]) -> tuple[float, int]:

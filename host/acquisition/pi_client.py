@@ -22,6 +22,7 @@ import zmq
 from polysight.host.capture import take_priority
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError, ProtocolError, ScanError
+from polysight.shared.faults import PiFault
 from polysight.shared.messages import (
     JOURNALLED,
     Abort,
@@ -56,6 +57,7 @@ from polysight.shared.sockets import Refusals, requester, subscriber
 
 ATTEMPTS = 3  # to ask a question
 REAL_TIME = 1  # of the heartbeat: below the receiving processes
+_SILENT_BEATS = 10  # more than the Pi waits before it takes a host for dead
 _REPLY_LIMIT_S = 1.0  # then the question was lost, and another one is asked
 AT_WORK: tuple[State, ...] = ("homing", "running", "held", "done")  # which change by themselves
 _REST_LIMIT_S = 10.0
@@ -173,10 +175,21 @@ class PiClient:
     def begin_run(self, run: BeginRun) -> None:
         """Begin a run, or take it up again; twice is once. Keeps the promise of `run.heartbeat_ms` until its end.
 
+        A program of the same scan that was killed a moment ago counts as alive for some beats: that is waited for.
+
         Raises RefusedError, DeviceError.
         """
         run = msgspec.structs.replace(run, owner=self._owner)
-        self._ask(run, Accepted)
+        deadline = time.monotonic() + _SILENT_BEATS * run.heartbeat_ms / 1e3
+        while True:
+            try:
+                self._ask(run, Accepted)
+                break
+            except RefusedError as e:
+                its_own = e.number == PiFault.NOT_READY and self.status().scan_id == run.scan_id
+                if not its_own or time.monotonic() > deadline:
+                    raise
+                time.sleep(_LOOK_S)
         self._fall_silent()
         if run.heartbeat_ms:
             interval_s = run.heartbeat_ms / 1e3

@@ -160,7 +160,16 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
     for p, found in zip(products, refused, strict=True):
         where = f" in {p.folder}" if len(products) > 1 else ""
         sys.stdout.write("".join(f"{n:>3}  not judged{where}: {refused_text(s)}\n" for n, s in found.items()))
-    strange = [r for r in rows if r["truth"] and r["truth"] not in library.names]
+    _print_right(rows, library.names)
+    if once:
+        sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
+    sys.stdout.write(classifier_sentence(classifier) + "\n")
+    return 0
+
+
+def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
+    """How many were named right; unknown ones of a material that the library lacks are neither right nor wrong."""
+    strange = [r for r in rows if r["truth"] and r["truth"] not in names]
     known = [r for r in rows if r["truth"] and not (r in strange and r["name"] == UNKNOWN)]
     if strange:
         told = sum(r["name"] == UNKNOWN for r in strange)
@@ -168,10 +177,6 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
     if known:
         right, share = sum(r["name"] == r["truth"] for r in known), np.mean([r["pixels_right"] for r in known])
         sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
-    if once:
-        sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
-    sys.stdout.write(classifier_sentence(classifier) + "\n")
-    return 0
 
 
 def _without(scan: SeenPatches, refused: Container[int]) -> SeenPatches:

@@ -107,11 +107,11 @@ def analyse(
         PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
         for p in found.patches
     )
-    library = () if classifier is None else classifier.library.names
     return MaterialsResult(
-        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, library=library, tilts=tilts,
+        calibrated, sh, sv, sp, reference, found, results, theta, inversion, prior, tilts=tilts,
+        library=() if classifier is None else classifier.library.names,
         brightness_off={label: ln for label, ln in off.items() if np.isfinite(ln)},
-        errors=None if errors is None else (tuple(p.label for p in judged), errors),
+        errors=None if errors is None else (tuple(labels), errors),
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from polysight.host import report
 from polysight.host.cli.main import main
 from polysight.host.imaging.focus import Focus
 from polysight.host.jobs import process as offline
@@ -45,7 +46,7 @@ def test_x_and_y_are_the_rigs_whichever_way_the_scan_was_taken(tmp_path, capsys,
     swept = Focus(np.linspace(-6, 6, 3), np.array([0.1, 1.0, 0.1]), 0.0, found_by_the_builder, 1.0)
     drawn = []
     monkeypatch.setattr(offline, "focus_sweep", lambda *_, **__: swept)
-    monkeypatch.setattr(offline, "focus_figure", lambda *given: drawn.append(given) or b"")
+    monkeypatch.setattr(report, "focus_figure", lambda *given: drawn.append(given) or b"")
     assert main(["focus", str(data), "--out", str(tmp_path / "focus")]) == 0
     said = capsys.readouterr().out
     assert "tilt: +2.00 degrees along x, -1.00 along y" in said

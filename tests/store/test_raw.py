@@ -96,7 +96,7 @@ def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, 
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
         with pytest.raises(ConfigError, match="nothing dropped"):
             drop_raw(scan, None, yes=False)
-    with pytest.raises(DataError, match=r"image\.npz"):
+    with pytest.raises(DataError, match=r"does not exist"):
         drop_raw(scan, tmp_path / "none", yes=True)
     quality = scan / "products" / "quality.json"
     said = json.loads(quality.read_text())

@@ -224,7 +224,7 @@ def test_read_row_refuses_damage(whole):
 
 
 def test_what_is_no_scan_is_refused(whole, tmp_path):
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="does not exist"):
         validate(tmp_path / "nothing")
     (whole / "manifest.jsonl").write_bytes(b"")
     with pytest.raises(DataError, match="scan_started"):

@@ -43,7 +43,7 @@ if_offset_hz = 0.0
 
 def impatient_rig() -> Instrument:
     """A rig with the direct path mid-band, and little patience."""
-    return programmed_rig(limits={"command_timeout_s": 1.5, "end_of_record_s": 1.0, "free_disk_bytes": 1 << 20})
+    return programmed_rig(limits={"command_timeout_s": 6.0, "end_of_record_s": 1.0, "free_disk_bytes": 1 << 20})
 
 
 @dataclass

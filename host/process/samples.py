@@ -9,6 +9,7 @@ from __future__ import annotations
 import fcntl
 import json
 import logging
+import math
 import os
 import threading
 import weakref
@@ -31,9 +32,10 @@ from polysight.host.imaging import (
     needed_gate_m,
 )
 from polysight.host.process.quality import Quality
-from polysight.host.store import ScanFolder, Source, crc32, manifest
+from polysight.host.store import ScanFolder, Source, crc32, inside, manifest
 from polysight.host.sync import HighPass
 from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
 
 FOLDER, HEAD, ROWS = "samples", "samples.json", "rows.jsonl"
 FORMAT = 1
@@ -170,7 +172,7 @@ class KeptSamples:
                     file.write(record.tobytes())
                 boards[board] = {"crc32": _digest(record), "raw": digest, "figures": figures}
             os.write(rows, manifest.encode_line({"fact": "row", "row": row, "boards": boards}))
-        except (OSError, ValueError) as e:
+        except (OSError, ValueError, DataError) as e:
             self._keep = False
             _log.warning("samples are not kept in %s: %s", self._folder, e)
 
@@ -203,8 +205,12 @@ class KeptSamples:
             head = json.loads((self._folder / HEAD).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return {}
-        same = isinstance(head, dict) and (head.get("format"), head.get("scan_id")) == (FORMAT, self._scan.scan_id)
-        return head if same and head["made_with"] == self._made and self._bands in (1, head["bands"]) else {}
+        wanted = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
+        if not isinstance(head, dict) or any(head.get(key) != value for key, value in wanted.items()):
+            return {}
+        if self._bands not in (1, head.get("bands")) or not _is_whole(head):
+            return {}
+        return head
 
     def _read_lines(self) -> None:
         """Lines that have come since; a torn or damaged one is no line."""
@@ -215,7 +221,7 @@ class KeptSamples:
         end = raw.rfind(b"\n") + 1
         for text in raw[self._read_bytes : end].splitlines():
             line = manifest.decode_line(text)
-            if line is not None:
+            if line is not None and _is_row(line):
                 self._lines[line["row"]] = line
         self._read_bytes = end
 
@@ -263,6 +269,9 @@ class KeptSamples:
     def _open(self) -> int | None:
         """The file of lines, locked; begun anew where those on disk are others. None: another program writes."""
         self._folder.mkdir(exist_ok=True)
+        if self._scan is not None:
+            for name in (HEAD, ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
+                inside(self._scan.path, f"{FOLDER}/{name}", FOLDER)  # a link would have another file written over
         rows = os.open(self._folder / ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         weakref.finalize(self, os.close, rows)
         try:
@@ -302,3 +311,26 @@ class KeptSamples:
 
 def _digest(record: Any) -> str:
     return f"{crc32(record.tobytes()):08x}"
+
+
+def _is_whole(head: Mapping[str, Any]) -> bool:
+    """Whether samples.json holds what is read from it: two finite numbers of the gate, and lists of frequencies."""
+    gate, frequencies = head.get("gate_m"), head.get("frequencies_hz")
+    if not (isinstance(gate, list) and isinstance(frequencies, dict) and "samples" in frequencies):
+        return False
+    numbers = [gate, *frequencies.values()]
+    good = all(isinstance(part, list) and part and all(_is_finite(v) for v in part) for part in numbers)
+    return good and len(gate) == 2
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _is_row(line: Mapping[str, Any]) -> bool:
+    """Whether a line of rows.jsonl is of a row and its boards."""
+    boards = line.get("boards")
+    told = isinstance(boards, dict) and all(
+        isinstance(b, dict) and {"crc32", "raw", "figures"} <= b.keys() for b in boards.values()
+    )
+    return told and isinstance(line.get("row"), int)

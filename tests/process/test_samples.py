@@ -185,3 +185,39 @@ def test_samples_are_read_without_this_program(kept: Path) -> None:
     assert [line["row"] for line in lines] == list(range(17))
     expected = processed(kept, "none").images.boards["RH"]._cube
     np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), expected)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        lambda h: {k: v for k, v in h.items() if k != "made_with"},
+        lambda h: {k: v for k, v in h.items() if k != "frequencies_hz"},
+        lambda h: {**h, "frequencies_hz": {"samples": "many"}},
+        lambda h: {**h, "gate_m": [0.1]},
+        lambda h: {**h, "gate_m": [None, 1.0]},
+        lambda h: [h],
+    ],
+)
+def test_a_head_that_is_not_whole_is_none(two_plates: Path, kept: Path, head) -> None:
+    path = kept / "samples" / "samples.json"
+    path.write_text(json.dumps(head(json.loads(path.read_text()))))
+    expected, found = processed(two_plates, "none"), processed(kept, "read")
+    assert same(found.form_images(), expected.form_images())
+
+
+@pytest.mark.parametrize("name", ["rows.jsonl", "RH.npy", "samples.json"])
+def test_a_link_out_of_the_scan_is_not_written_through(two_plates: Path, scan: Path, tmp_path: Path, name: str) -> None:
+    mine = tmp_path / "mine.txt"
+    mine.write_text("not to be lost")
+    (scan / "samples").mkdir()
+    (scan / "samples" / name).symlink_to(mine)
+    expected, found = processed(two_plates, "none"), processed(scan)
+    assert mine.read_text() == "not to be lost"
+    assert same(found.form_images(), expected.form_images())
+
+
+def test_a_folder_of_samples_elsewhere_is_not_written_to(scan: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (scan / "samples").symlink_to(tmp_path / "elsewhere")
+    processed(scan)
+    assert not list((tmp_path / "elsewhere").iterdir())

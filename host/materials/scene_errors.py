@@ -13,7 +13,7 @@ from polysight.host.materials.specimens import features, relative, softened
 
 Real = npt.NDArray[np.float64]
 REFERENCE_BRIGHTNESS_STD = 0.1
-"""Of ln|H| and ln|V| of all patches: a stated prior for a metal plate that lies somewhat high or askew; not measured."""
+"""Of ln|H| and ln|V| of all patches: a stated prior for a metal plate that lies high or askew; not measured."""
 
 
 def scene_errors(found: Inversion, prior: Uncertain, seen: Sequence[Seen]) -> SceneErrors:

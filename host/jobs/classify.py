@@ -20,6 +20,7 @@ from polysight.host.materials import (
     Classifier,
     Library,
     MatchedPatch,
+    NamedPatch,
     PatchName,
     SeenPatches,
     match_patches,
@@ -131,6 +132,7 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
         )
     errors = scans[0].errors_of([m.label for m in matched]) if len(scans) == 1 else None
     named = classifier.scan([m.features for m in matched], errors)
+    contradictions = _contradictions(library, model, classifier.angles_deg, matched, named)
     rows = [_row(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)]
     simulated = any(s.simulated for s in scans)
     once = sum(len(s.patches) for s in scans) - len(scans) * len(matched)
@@ -141,6 +143,7 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
             "model": classifier.model,
             "library": classifier_sentence(classifier),
             "patches": rows,
+            "contradictions": contradictions,
             "patches_not_in_every_scan": once,
             "refused": [
                 {"products": str(p.folder), "label": label, **s["refused"]}
@@ -157,6 +160,7 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
         truth = f"   truly {row['truth']}" if row["truth"] else ""
         sure = f"{row['confidence']:6.1%}" if row["pixels"] else "no pixel of it can be used"
         sys.stdout.write(f"{row['label']:>3}  {row['name']:28s} {sure}   pixels: {votes}{truth}\n")
+    sys.stdout.write("".join(f"note: {line}\n" for line in contradictions))
     for p, found in zip(products, refused, strict=True):
         where = f" in {p.folder}" if len(products) > 1 else ""
         sys.stdout.write("".join(f"{n:>3}  not judged{where}: {refused_text(s)}\n" for n, s in found.items()))
@@ -165,6 +169,31 @@ def _name(products: Sequence[SavedProducts], library_path: Path, model: str | No
         sys.stdout.write(f"{once} patches were not seen in every scan and are not named\n")
     sys.stdout.write(classifier_sentence(classifier) + "\n")
     return 0
+
+
+def _contradictions(
+    library: Library,
+    model: str | None,
+    angles_deg: Sequence[float],
+    matched: Sequence[MatchedPatch],
+    named: Sequence[NamedPatch],
+) -> list[str]:
+    """A line for each unknown patch that is one material under one angle and another under the next."""
+    if len(angles_deg) < 2 or all(n.verdict.name != UNKNOWN for n in named):
+        return []
+    alone = [
+        Classifier(library, model=model, angles_deg=[a]).scan(
+            [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
+        )
+        for i, a in enumerate(angles_deg)
+    ]
+    out = []
+    for m, together, *each in zip(matched, named, *alone, strict=True):
+        names = [n.verdict.name for n in each]
+        if together.verdict.name == UNKNOWN and len(set(names) - {UNKNOWN}) > 1:
+            told = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
+            out.append(f"patch {m.label} contradicts itself: {told}; was it moved or exchanged between the scans?")
+    return out
 
 
 def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:

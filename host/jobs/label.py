@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 from rich.cells import cell_len
 
 from polysight.host.materials import (
@@ -154,10 +156,22 @@ def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequen
     few = [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]
     if few:
         sys.stdout.write(f"note: fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few\n")
+    if dark := _dark(products, masks):
+        sys.stdout.write(f"note: dark, as where nothing lies: {', '.join(dark)}; look at the picture\n")
     if checked.metal is None:
         sys.stdout.write("note: no box is metal; train then needs a rig with `polysight calibrate metal`\n")
     sys.stdout.write(f"labels:   {place / LABELS}\npicture:  {place / LABELS_PICTURE}\n")
     return 0
+
+
+def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:
+    """Names of boxes that are darker in both channels together than any plate that would be found by itself."""
+    power = np.where(products.valid, np.abs(products.h) ** 2 + np.abs(products.v) ** 2, np.nan)
+    if not np.isfinite(power).any():
+        return []
+    least = np.nanpercentile(power, 99) * 10 ** (SegmentSettings().dimmest_db / 10)
+    inside = {name: power[mask & products.valid] for name, mask in masks.items()}
+    return [name for name, p in inside.items() if p.size and np.nanmedian(p) < least]
 
 
 def found_patches(products: SavedProducts) -> list[FoundPatch]:

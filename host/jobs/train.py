@@ -291,6 +291,11 @@ def _summary(out: Path, library: Library) -> list[str]:
         scans = len({e.scan for e in mine})
         patches = "1 patch" if len(mine) == 1 else f"{len(mine)} patches"
         lines.append(f"  {name}: {patches} in {scans} scan{'s' * (scans > 1)}{told}")
+    if all(e.specimen is None for e in library.entries):
+        lines.append(
+            "note: no box says which piece lies in it, so how pieces differ is mixed with how they lie, and"
+            " probabilities will be more careful than they need be; polysight label SCAN --specimen NAME=WHICH"
+        )
     for one, other in combinations(library.names, 2):
         if one.casefold() == other.casefold():
             lines.append(f"note: {one} and {other} are two materials here; if they are one: polysight label --rename")

@@ -22,12 +22,12 @@ The result is a probability of each material and of none of them (`none_of_these
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import scipy
 
+from polysight.host.materials.common_error import CommonError, Patches, costs, explanations, probabilities
 from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle
 from polysight.host.materials.specimens import apparent_permittivity, effect, fit_spread, relative, without
@@ -39,33 +39,8 @@ NONE = 0.02
 METAL_LIKE = 0.25
 """|1/P - 1| of a patch below this: the reference or another metal. It has no error of its own, so it tells of none."""
 _ROUNDS = 30
-_TURNS = 2  # of what the scene has in common, and of what it makes of patches that are none
 _BEYOND = 1.001  # the least distance of what is unknown
 _LN_2PI = float(np.log(2 * np.pi))
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """What a scan's patches have in common: an error, its covariance, and what it does to each patch.
-
-    `design` [patch, d, q] turns the error's q numbers into deviations; `value` [q]; `covariance` [q, q]; `precision`
-    [q, q] is what was known before any patch was seen.
-    """
-
-    design: Real
-    value: Real
-    covariance: Real
-    precision: Real
-
-    @property
-    def shift(self) -> Real:
-        """Deviations that the error makes, [patch, d]."""
-        return np.asarray(self.design @ self.value, np.float64)
-
-    @property
-    def spread(self) -> Real:
-        """Their covariances, [patch, d, d]."""
-        return np.asarray(self.design @ self.covariance @ self.design.mT, np.float64)
 
 
 class ErrorDiscriminant(Model):
@@ -136,13 +111,13 @@ class ErrorDiscriminant(Model):
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Name of each pixel on its own, and its distance over the threshold."""
-        q, cost = _costs(self._deviations(x) - self.level, self._pixel_covariances())
+        q, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())
         best = cost.argmin(axis=1)
         return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
 
     def distance(self, x: Real, names: npt.NDArray) -> Real:
         """Distance of each pixel to the material it was named by whatever classifier, over the threshold."""
-        q, _ = _costs(self._deviations(x) - self.level, self._pixel_covariances())
+        q, _ = costs(self._deviations(x) - self.level, self._pixel_covariances())
         return np.sqrt(q[np.arange(len(x)), np.searchsorted(self.names, names)] / self.pixel_level)
 
     def by_scan(
@@ -165,17 +140,23 @@ class ErrorDiscriminant(Model):
             mine = errors.own
         else:
             errors = None
-        placed, scene = self.within / pixels + self.between + mine, self._before(ids.size, errors)
-        for _ in range(_TURNS):
-            none = self._none(x, patch, placed, scene)
-            scene = self._scene(mean, own + mine[:, None], scene, tells, none)
-        none = self._none(x, patch, placed, scene)
-        q, cost = _costs(mean - scene.shift[:, None], own + (mine + scene.spread)[:, None])
-        probability = _doubted(_probabilities(cost, none), q - self.patch_level)
-        far = np.sqrt(q / self.patch_level)
-        at = np.arange(ids.size), cost.argmin(axis=1)
+        placed = self.within / pixels + self.between + mine
+        found = explanations(
+            Patches(mean, own + mine[:, None], tells),
+            self._before(ids.size, errors),
+            lambda error: self._none(x, patch, placed, error),
+        )
+        probability, share, distance2 = np.zeros((ids.size, self.names.size + 1)), 0.0, 0.0
+        for weight, error in found:
+            q, cost = costs(mean - error.shift[:, None], own + (mine + error.spread)[:, None])
+            each = probabilities(cost, self._none(x, patch, placed, error))
+            probability += weight * _doubted(each, q - self.patch_level)
+            known = weight * np.maximum(each[:, :-1], 1e-12)
+            share, distance2 = share + known, distance2 + known * q
+        far = np.sqrt(distance2 / share / self.patch_level)
+        at, scene = (np.arange(ids.size), np.argmax(share, axis=1)), found[0][1]
         alone = self._patch_covariances(1.0)[None] + (mine + scene.spread)[:, None]
-        pixel_q, pixel_cost = _costs(d - scene.shift[patch][:, None], alone[patch])
+        pixel_q, pixel_cost = costs(d - scene.shift[patch][:, None], alone[patch])
         if others is not None:
             prior = (1 - others) * probability[:, :-1] + others / self.names.size
             pixel_cost = pixel_cost - 2 * np.log(prior[patch])
@@ -210,7 +191,7 @@ class ErrorDiscriminant(Model):
         apart = every.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
         return self._chosen(apart).swapaxes(1, 2)
 
-    def _before(self, count: int, errors: SceneErrors | None) -> _Scene:
+    def _before(self, count: int, errors: SceneErrors | None) -> CommonError:
         """The error that so many patches have in common before any is seen: zero, as uncertain as scans differ."""
         width = len(self.scan)
         design, prior = np.tile(np.eye(width), (count, 1, 1)), self.scan
@@ -219,32 +200,9 @@ class ErrorDiscriminant(Model):
             both = np.zeros((design.shape[2],) * 2)
             both[:width, :width], both[width:, width:] = prior, errors.covariance
             prior = both
-        return _Scene(design, np.zeros(len(prior)), prior, np.asarray(np.linalg.inv(prior), np.float64))
+        return CommonError(design, np.zeros(len(prior)), prior, np.asarray(np.linalg.inv(prior), np.float64))
 
-    @staticmethod
-    def _scene(mean: Real, own: Real, scene: _Scene, tells: npt.NDArray, none: Real) -> _Scene:
-        """The error that a scan's patches have in common, from their deviations [patches, materials, d].
-
-        Which material a patch is, is as uncertain as the last round left it; a patch that is none of them counts for
-        nothing. Where fewer than two patches tell it stays as it was before.
-        """
-        at = np.flatnonzero(tells)
-        if at.size < 2:
-            return scene
-        design, precision, g = scene.design, scene.precision, scene.design[at]
-        for _ in range(_ROUNDS):
-            _, cost = _costs(mean - scene.shift[:, None], own + scene.spread[:, None])
-            weight = _probabilities(cost, none)[at, :-1]
-            middle, information = _moments(mean[at], own[at], weight)
-            covariance = np.linalg.inv(precision + np.sum(g.mT @ information @ g, axis=0))
-            told = np.sum(g.mT @ (information @ middle[:, :, None]), axis=0)[:, 0]
-            before, value = scene.value, covariance @ told
-            scene = _Scene(design, value, covariance, precision)
-            if np.abs(design @ (value - before)).max() < 1e-7:
-                break
-        return scene
-
-    def _none(self, x: Real, patch: npt.NDArray[np.intp], covariances: Real, scene: _Scene) -> Real:
+    def _none(self, x: Real, patch: npt.NDArray[np.intp], covariances: Real, scene: CommonError) -> Real:
         """Minus twice the log likelihood of each patch as any other half space, [patch]; see `none_of_these.py`.
 
         `covariances` [patch, d, d] of the patches' own errors; the scene's come to them, as for the materials.
@@ -335,26 +293,6 @@ class ErrorDiscriminant(Model):
         self.pixel_level = max(law, farthest(pixels, of, self._pixel_covariances()))
 
 
-def _costs(d: Real, covariances: Real) -> tuple[Real, Real]:
-    """Squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials]."""
-    inverse = np.linalg.inv(covariances)
-    q = np.sum(d * (inverse @ d[..., None])[..., 0], axis=-1)
-    return q, q - np.linalg.slogdet(inverse)[1] + d.shape[2] * _LN_2PI
-
-
-def _moments(d: Real, covariances: Real, weight: Real) -> tuple[Real, Real]:
-    """What a patch tells whose material is uncertain: mean deviation [patch, d] and information [patch, d, d].
-
-    As of the normal distribution with the moments of the mixture; less for what is none of the materials.
-    """
-    known, weight = weight.sum(axis=1), weight + 1e-12
-    share = weight / weight.sum(axis=1, keepdims=True)
-    middle = np.einsum("pk,pkd->pd", share, d)
-    off = d - middle[:, None]
-    spread = np.einsum("pk,pkde->pde", share, covariances + off[..., :, None] * off[..., None, :])
-    return middle, np.asarray(known[:, None, None] * np.linalg.inv(spread), np.float64)
-
-
 def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, tells: npt.NDArray) -> tuple[Real, Real]:
     """Least squares of patch means = material + scan: offsets [scans, d], of mean zero, and levels [materials, d]."""
     offset, level = np.zeros((scan.max() + 1, mean.shape[1])), np.zeros((material.max() + 1, mean.shape[1]))
@@ -388,10 +326,3 @@ def _doubted(probability: Real, beyond: Real) -> Real:
     """
     known = probability[:, :-1] * scipy.special.expit(-beyond)
     return np.concatenate([known, 1 - known.sum(axis=1, keepdims=True)], axis=1)
-
-
-def _probabilities(cost: Real, none: Real) -> Real:
-    """Of every material and, last, of none of them, [n, materials + 1]."""
-    every = np.concatenate([cost, none[:, None]], axis=1)
-    w = np.exp(-0.5 * (every - every.min(axis=1, keepdims=True)))
-    return w / w.sum(axis=1, keepdims=True)

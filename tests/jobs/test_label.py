@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from polysight.host.cli.main import main
 from polysight.host.jobs.label import Edits, label
 from polysight.host.materials import read_labels
-from polysight.host.products import find_labels, making_products, write_json
+from polysight.host.products import find_labels, find_products, making_products, write_image, write_json
 from tests.support.products import judged_products
 
 NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
@@ -70,6 +71,18 @@ def test_a_patch_told_to_be_metal_is_called_so(products):
     assert (list(boxes(products).boxes), boxes(products).metal) == (["metal", "oak"], "metal")
     assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "1=x", "--rename", "2=oak"]) == 0
     assert boxes(products).metal == "x"
+
+
+def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
+    found = find_products(products)
+    dim = np.where(found.x_m > 0.02, 0.01, 1.0).astype(np.float32)  # -40 dB
+    write_image(
+        products / "image.npz", found.h * dim, found.v * dim, found.h / found.v, found.x_m, found.y_m, found.valid, None
+    )
+    assert main(["label", str(products), "--box", "oak=-40,-10,-20,10", "--metal", "oak"]) == 0
+    assert "note: dark" not in capsys.readouterr().out
+    assert main(["label", str(products), "--box", "nothing=30,-10,50,10"]) == 0
+    assert "note: dark, as where nothing lies: nothing;" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,9 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     for folder in (first, elsewhere):  # a scan folder, and products without their rows
         assert main(["label", str(folder), *drawn(), "--specimen", f"{MINE}=board 7"]) == 0
     assert main(["train", str(first), str(elsewhere), "--out", str(library)]) == 0
-    assert f"  {MINE}: 2 patches in 2 scans" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"  {MINE}: 2 patches in 2 scans" in told
+    assert "which piece" not in told
     known = Library.load(library)
     assert known.names == ("copper", MINE)
     assert known.scans == ("small", "small (2)")

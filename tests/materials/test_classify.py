@@ -160,6 +160,32 @@ def test_two_scans_as_typed(folders, capsys):
     assert PAPER in out
 
 
+def test_patches_exchanged_between_two_angles_are_told(seen, folders, capsys):
+    there, angle = _seen(seen[1][60.0]), "60"
+    truths = {"wood": "ceramic", "ceramic": "wood"}
+    like = {p.truth: p for p in there.patches}
+    swap = {a: b for a in like for key, other in truths.items() if a and key in a for b in like if b and other in b}
+    assert len(swap) == 2
+    with np.load(folders / angle / PATCHES) as stored:
+        content = dict(stored)
+    features, first = content["features"].copy(), np.cumsum([0, *[len(p.features) for p in there.patches]])
+    where = {p.truth: np.arange(first[i], first[i + 1]) for i, p in enumerate(there.patches)}
+    one, other = swap
+    middle = {name: np.median(features[where[name]], axis=0) for name in swap}
+    features[where[one]] = middle[other]
+    features[where[other]] = middle[one]
+    content["features"] = features
+    np.savez(folders / angle / PATCHES, **content)
+    command = ["classify", str(folders / "55"), str(folders / angle), "--library", str(folders / "library.npz")]
+    assert main([*command, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    unknown = [p for p in told["patches"] if p["truth"] in swap]
+    assert [p["name"] for p in unknown] == ["unknown", "unknown"]
+    assert len(told["contradictions"]) == 2
+    assert main(command) == 0
+    assert capsys.readouterr().out.count("contradicts itself") == 2
+
+
 def test_one_scan_and_wrong_folders_as_typed(folders, capsys):
     library = ["--library", str(folders / "library.npz")]
     assert main(["classify", str(folders / "60"), *library]) == 0

@@ -1,0 +1,178 @@
+"""The error that all patches of a scan share, found together with what the patches are.
+
+One leakage or one gain moves every patch alike, and a patch tells of it only as far as its material is known. So the
+error and the names are estimated in turns (expectation maximisation). A library whose materials lie in a row can be
+entered one place off: a common error then makes each plate look like its neighbour, and fits nearly as well. Turns
+that begin at no error find one of these explanations only. Here they begin at the error that would make any one patch
+any one material, and every explanation that is reached counts with its evidence (Laplace's approximation; MacKay,
+Information Theory, Inference, and Learning Algorithms, chapter 27).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from polysight.host.materials.samples import Real
+
+_ROUNDS, _FIRST_ROUNDS = 30, 3
+_TURNS = 2  # of the error and of what it makes of patches that are none
+_STARTS = 48  # the most plausible ones
+_UNLIKELY = 12.0  # an explanation whose log evidence lies so far below the best one's after the first rounds
+_SAME = 1.0  # explanations closer than this many standard deviations are one
+_LN_2PI = float(np.log(2 * np.pi))
+
+
+@dataclass(frozen=True)
+class CommonError:
+    """What a scan's patches have in common: an error, its covariance, and what it does to each patch.
+
+    `design` [patch, d, q] turns the error's q numbers into deviations; `value` [q]; `covariance` [q, q]; `precision`
+    [q, q] is what was known before any patch was seen.
+    """
+
+    design: Real
+    value: Real
+    covariance: Real
+    precision: Real
+
+    @property
+    def shift(self) -> Real:
+        """Deviations that the error makes, [patch, d]."""
+        return np.asarray(self.design @ self.value, np.float64)
+
+    @property
+    def spread(self) -> Real:
+        """Their covariances, [patch, d, d]."""
+        return np.asarray(self.design @ self.covariance @ self.design.mT, np.float64)
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Patches beside materials.
+
+    `mean` [patch, materials, d] the deviations of their means, `own` [patch, materials, d, d] the covariances of each
+    patch alone, `tells` bool [patch] those that tell of the error.
+    """
+
+    mean: Real
+    own: Real
+    tells: npt.NDArray[np.bool_]
+
+
+def explanations(
+    seen: Patches, before: CommonError, none: Callable[[CommonError], Real]
+) -> list[tuple[float, CommonError]]:
+    """The errors that explain a scan, each with its probability, the likeliest first.
+
+    `before` is the error as it is known without the patches; `none` gives minus twice the log likelihood [patch] of
+    none of the materials under an error. Where fewer than two patches tell, the error stays as it was before.
+    """
+    at = np.flatnonzero(seen.tells)
+    if at.size < 2:
+        return [(1.0, before)]
+    cost = none(before)
+    first = [_turns(seen, start, cost, _FIRST_ROUNDS) for start in (before, *_starts(seen, before))]
+    found: list[tuple[float, CommonError]] = []
+    for evidence, start in _distinct([(_evidence(seen, e, cost), e) for e in first]):
+        if found and evidence < found[0][0] - _UNLIKELY:
+            continue
+        error = start
+        for _ in range(_TURNS):
+            cost_of_none = none(error)
+            error = _turns(seen, error, cost_of_none, _ROUNDS)
+        found.append((_evidence(seen, error, cost_of_none), error))
+    found = _distinct(found)
+    weight = np.exp(np.array([e for e, _ in found]) - found[0][0])
+    return [(float(w), error) for w, (_, error) in zip(weight / weight.sum(), found, strict=True)]
+
+
+def costs(d: Real, covariances: Real) -> tuple[Real, Real]:
+    """Squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials]."""
+    inverse = np.linalg.inv(covariances)
+    q = np.sum(d * (inverse @ d[..., None])[..., 0], axis=-1)
+    return q, q - np.linalg.slogdet(inverse)[1] + d.shape[2] * _LN_2PI
+
+
+def probabilities(cost: Real, none: Real) -> Real:
+    """Of every material and, last, of none of them, [n, materials + 1]."""
+    every = np.concatenate([cost, none[:, None]], axis=1)
+    w = np.exp(-0.5 * (every - every.min(axis=1, keepdims=True)))
+    return w / w.sum(axis=1, keepdims=True)
+
+
+def _starts(seen: Patches, before: CommonError) -> list[CommonError]:
+    """The error as each patch alone would have it if it were each of the materials, the most plausible ones."""
+    at = np.flatnonzero(seen.tells)
+    g = before.design[at][:, None]  # [patch, 1, d, q]
+    weighed = g.mT @ np.linalg.inv(seen.own[at])
+    covariance = np.linalg.inv(before.precision + weighed @ g)
+    value = (covariance @ weighed @ seen.mean[at][..., None])[..., 0]
+    off = seen.mean[at] - (g @ value[..., None])[..., 0]
+    surprise = np.einsum("pkq,qr,pkr->pk", value, before.precision, value) + costs(off, seen.own[at])[0]
+    nearest = np.argsort(surprise, axis=None)[:_STARTS]
+    return [
+        replace(before, value=value[i], covariance=covariance[i])
+        for i in zip(*np.unravel_index(nearest, surprise.shape), strict=True)
+    ]
+
+
+def _turns(seen: Patches, error: CommonError, none: Real, rounds: int) -> CommonError:
+    """The error from the patches' deviations, names and error in turns.
+
+    Which material a patch is, is as uncertain as the last round left it; a patch that is none of them counts for
+    nothing.
+    """
+    at = np.flatnonzero(seen.tells)
+    design, precision, g = error.design, error.precision, error.design[at]
+    mean, own = seen.mean[at], seen.own[at]
+    for _ in range(rounds):
+        _, cost = costs(mean - error.shift[at][:, None], own + error.spread[at][:, None])
+        middle, information = _moments(mean, own, probabilities(cost, none[at])[:, :-1])
+        covariance = np.linalg.inv(precision + np.sum(g.mT @ information @ g, axis=0))
+        told = np.sum(g.mT @ (information @ middle[:, :, None]), axis=0)[:, 0]
+        before, value = error.value, covariance @ told
+        error = CommonError(design, value, covariance, precision)
+        if np.abs(design @ (value - before)).max() < 1e-7:
+            break
+    return error
+
+
+def _evidence(seen: Patches, error: CommonError, none: Real) -> float:
+    """Log evidence of an explanation, by Laplace's approximation, but for a constant."""
+    at = np.flatnonzero(seen.tells)
+    _, cost = costs(seen.mean[at] - error.shift[at][:, None], seen.own[at])
+    every = -0.5 * np.concatenate([cost, none[at, None]], axis=1)
+    top = every.max(axis=1)
+    likelihood = float(np.sum(top + np.log(np.exp(every - top[:, None]).sum(axis=1))))
+    prior = -0.5 * float(error.value @ error.precision @ error.value)
+    return likelihood + prior + 0.5 * float(np.linalg.slogdet(error.covariance)[1])
+
+
+def _distinct(found: list[tuple[float, CommonError]]) -> list[tuple[float, CommonError]]:
+    """Without those that are one with a likelier one, the likeliest first."""
+    out: list[tuple[float, CommonError]] = []
+    for evidence, error in sorted(found, key=lambda f: -f[0]):
+        apart = (error.value - kept.value for _, kept in out)
+        if all(float(a @ np.linalg.solve(k.covariance, a)) > _SAME**2 for a, (_, k) in zip(apart, out, strict=True)):
+            out.append((evidence, error))
+    return out
+
+
+def _moments(d: Real, covariances: Real, weight: Real) -> tuple[Real, Real]:
+    """What a patch tells whose material is uncertain: mean deviation [patch, d] and information [patch, d, d].
+
+    As of the normal distribution with the moments of the mixture; less for what is none of the materials.
+    """
+    known, weight = weight.sum(axis=1), weight + 1e-12
+    share = weight / weight.sum(axis=1, keepdims=True)
+    middle = np.einsum("pk,pkd->pd", share, d)
+    off = d - middle[:, None]
+    spread = np.einsum("pk,pkde->pde", share, covariances + off[..., :, None] * off[..., None, :])
+    return middle, np.asarray(known[:, None, None] * np.linalg.inv(spread), np.float64)
+
+
+__all__ = ["CommonError", "Patches", "costs", "explanations", "probabilities"]

@@ -48,7 +48,7 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
     for _ in range(LAST_ROWS):
         with last.timed():
             pipeline.add_row(rows[-1])
-            pipeline.images.finish()
+            pipeline.form_images(from_sums=live)
     return {
         "rows": len(rows),
         "cpu_s": whole.cpu[0],

@@ -33,22 +33,23 @@ class Pipeline:
 
     def synchronise_row(self, row: int) -> dict[str, sync.SyncedRow]:
         """Read, synchronise and reduce one row of every board for the images; returns the synchronised rows."""
-        synced: dict[str, sync.SyncedRow] = {}
-        for board in self.quality.boards:
-            with self.quality.timed("read and decode"):
-                recorded = self.source.read_row(board, row)
-            with self.quality.timed("synchronise"):
-                synced[board], frames_whole = self.synchroniser.synchronise(board, recorded)
-            with self.quality.timed("reduce"):
-                self.images.add_row(board, row, synced[board])
-                self.sub_bands.add_row(board, row, synced[board])
-            self.quality.boards[board].add(row, recorded, frames_whole, synced[board])
+        return process.of_each(self.quality.boards, lambda board: self._synchronise(board, row), self.images.live)
+
+    def _synchronise(self, board: str, row: int) -> sync.SyncedRow:
+        with self.quality.timed("read and decode"):
+            recorded = self.source.read_row(board, row)
+        with self.quality.timed("synchronise"):
+            synced, frames_whole = self.synchroniser.synchronise(board, recorded)
+        with self.quality.timed("reduce"):
+            self.images.add_row(board, row, synced)
+            self.sub_bands.add_row(board, row, synced)
+        self.quality.boards[board].add(row, recorded, frames_whole, synced)
         return synced
 
-    def form_images(self) -> imaging.ChannelImages:
-        """Both channels, flattened by their footprint, on the rig file's plane, not yet referenced to metal."""
+    def form_images(self, from_sums: bool = False) -> imaging.ChannelImages:
+        """Both channels, flattened by footprint, on the rig file's plane, not referenced; `from_sums`: of live rows."""
         with self.quality.timed("image"):
-            images = self.images.finish()
+            images = self.images.current() if from_sums else self.images.finish()
         self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 

@@ -146,7 +146,7 @@ class ImageBuilder:
         depth_m: float = 0.0,
         gate_m: tuple[float, float] | None = None,
     ) -> None:
-        self.rig, self.grid = rig, image_grid(rig)
+        self.rig, self.grid, self.live = rig, image_grid(rig), live
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
         self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m

@@ -7,7 +7,7 @@ while rows are processed, `KeptSamples` their reduced samples; `save_images` and
 from polysight.host.process.judge import error_budget, judge, recording_verdict
 from polysight.host.process.quality import Quality
 from polysight.host.process.request import DrawnBoxes, Options, ProcessRequest
-from polysight.host.process.rows import cores, each_row
+from polysight.host.process.rows import cores, each_row, of_each
 from polysight.host.process.samples import Choices, KeptSamples
 from polysight.host.process.save import (
     Findings,
@@ -37,6 +37,7 @@ __all__ = [
     "error_budget",
     "judge",
     "materials_content",
+    "of_each",
     "quality_content",
     "recording_verdict",
     "save_images",

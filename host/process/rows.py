@@ -1,10 +1,13 @@
-"""Rows of one scan on all cores: the passes of synchronisation release the interpreter."""
+"""Rows of one scan, or boards of a row, on all cores: the passes of synchronisation release the interpreter."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Result = TypeVar("Result")
 
 MOST = 8
 """Rows at a time: each holds some 60 MB of the published grid, and memory is slower than so many cores."""
@@ -34,3 +37,13 @@ def each_row(add: Callable[[int], object], rows: Sequence[int], threads: int | N
                 yield row
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def of_each(names: Iterable[str], make: Callable[[str], Result], at_once: bool) -> dict[str, Result]:
+    """What `make` returns for each name; `at_once`: on as many cores as there are."""
+    names = list(names)
+    count = min(cores(), len(names)) if at_once else 1
+    if count <= 1:
+        return {name: make(name) for name in names}
+    with ThreadPoolExecutor(count) as pool:
+        return dict(zip(names, pool.map(make, names), strict=True))

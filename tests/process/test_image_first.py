@@ -44,6 +44,19 @@ def test_the_image_is_there_before_anything_is_made_of_it(
     assert (tmp_path / "out" / "report.html").exists()
 
 
+def test_images_published_beside_a_scan_are_those_of_all_rows_at_once(scan: Path, tmp_path: Path) -> None:
+    source = ScanFolder.load(scan)
+    pipeline = Pipeline(source, live=True)
+    for row in source.rows():
+        pipeline.add_row(row)
+    publish_images(pipeline, tmp_path)
+    first, whole = read_products(tmp_path), pipeline.form_images()
+    assert (first.valid == whole.valid).mean() > 0.999
+    at = first.valid & whole.valid
+    for one, other in ((first.h, whole.h), (first.v, whole.v)):
+        assert np.abs(one - other)[at].max() < 1e-5 * np.abs(other[at]).max()
+
+
 def test_an_earlier_report_stays_until_the_new_one_is_whole(scan: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()

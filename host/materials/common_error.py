@@ -20,7 +20,7 @@ from polysight.host.materials.samples import Real
 
 _ROUNDS, _FIRST_ROUNDS = 30, 3
 _TURNS = 2  # of the error and of what it makes of patches that are none
-_STARTS = 48  # the most plausible ones
+_STARTS, _TRIED = 100, 6  # the most plausible ones, and those of them that explain most of the other patches
 _UNLIKELY = 12.0  # an explanation whose log evidence lies so far below the best one's after the first rounds
 _SAME = 1.0  # explanations closer than this many standard deviations are one
 _LN_2PI = float(np.log(2 * np.pi))
@@ -75,7 +75,7 @@ def explanations(
     if at.size < 2:
         return [(1.0, before)]
     cost = none(before)
-    first = [_turns(seen, start, cost, _FIRST_ROUNDS) for start in (before, *_starts(seen, before))]
+    first = [_turns(seen, start, cost, _FIRST_ROUNDS) for start in (before, *_starts(seen, before, cost))]
     found: list[tuple[float, CommonError]] = []
     for evidence, start in _distinct([(_evidence(seen, e, cost), e) for e in first]):
         if found and evidence < found[0][0] - _UNLIKELY:
@@ -104,20 +104,30 @@ def probabilities(cost: Real, none: Real) -> Real:
     return w / w.sum(axis=1, keepdims=True)
 
 
-def _starts(seen: Patches, before: CommonError) -> list[CommonError]:
-    """The error as each patch alone would have it if it were each of the materials, the most plausible ones."""
+def _starts(seen: Patches, before: CommonError, none: Real) -> list[CommonError]:
+    """The error as each patch alone would have it if it were each of the materials, those that explain most."""
     at = np.flatnonzero(seen.tells)
-    g = before.design[at][:, None]  # [patch, 1, d, q]
-    weighed = g.mT @ np.linalg.inv(seen.own[at])
+    mean, g = seen.mean[at], before.design[at][:, None]  # [patch, materials, d], [patch, 1, d, q]
+    inverse = np.linalg.inv(seen.own[at])
+    constant = -np.linalg.slogdet(inverse)[1] + mean.shape[2] * _LN_2PI
+    weighed = g.mT @ inverse
     covariance = np.linalg.inv(before.precision + weighed @ g)
-    value = (covariance @ weighed @ seen.mean[at][..., None])[..., 0]
-    off = seen.mean[at] - (g @ value[..., None])[..., 0]
-    surprise = np.einsum("pkq,qr,pkr->pk", value, before.precision, value) + costs(off, seen.own[at])[0]
-    nearest = np.argsort(surprise, axis=None)[:_STARTS]
-    return [
-        replace(before, value=value[i], covariance=covariance[i])
-        for i in zip(*np.unravel_index(nearest, surprise.shape), strict=True)
-    ]
+    value = (covariance @ weighed @ mean[..., None])[..., 0]
+
+    def distances(errors: Real) -> Real:
+        """Squared distances [..., patch, materials] under errors [..., q], and of the errors themselves [...]."""
+        off = mean - (before.design[at] @ errors[..., None, :, None])[..., None, :, 0]
+        return np.einsum("...pkd,pkde,...pke->...pk", off, inverse, off, optimize=True)
+
+    prior = np.einsum("pkq,qr,pkr->pk", value, before.precision, value)
+    own = (mean - (g @ value[..., None])[..., 0])[..., None]
+    surprise = prior + (own.mT @ inverse @ own)[..., 0, 0]
+    nearest = np.unravel_index(np.argsort(surprise, axis=None)[:_STARTS], surprise.shape)
+    each = 0.5 * distances(value[nearest]) + constant  # half: the start is about as uncertain as a patch
+    fit = np.minimum(each.min(axis=-1), none[at]).sum(axis=-1) + prior[nearest]
+    starts = zip(fit, value[nearest], covariance[nearest], strict=True)
+    found = [(-float(f), replace(before, value=v, covariance=c)) for f, v, c in starts]
+    return [error for _, error in _distinct(found, _TRIED)]
 
 
 def _turns(seen: Patches, error: CommonError, none: Real, rounds: int) -> CommonError:
@@ -152,12 +162,14 @@ def _evidence(seen: Patches, error: CommonError, none: Real) -> float:
     return likelihood + prior + 0.5 * float(np.linalg.slogdet(error.covariance)[1])
 
 
-def _distinct(found: list[tuple[float, CommonError]]) -> list[tuple[float, CommonError]]:
-    """Without those that are one with a likelier one, the likeliest first."""
+def _distinct(found: list[tuple[float, CommonError]], most: int | None = None) -> list[tuple[float, CommonError]]:
+    """Without those that are one with a likelier one, the likeliest first, so many at most."""
     out: list[tuple[float, CommonError]] = []
     for evidence, error in sorted(found, key=lambda f: -f[0]):
-        apart = (error.value - kept.value for _, kept in out)
-        if all(float(a @ np.linalg.solve(k.covariance, a)) > _SAME**2 for a, (_, k) in zip(apart, out, strict=True)):
+        if len(out) == most:
+            break
+        apart = [(error.value - kept.value, np.linalg.inv(kept.covariance)) for _, kept in out]
+        if all(float(a @ inverse @ a) > _SAME**2 for a, inverse in apart):
             out.append((evidence, error))
     return out
 

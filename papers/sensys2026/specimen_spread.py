@@ -19,6 +19,8 @@ from polysight.papers.sensys2026.patches import Errors, calibrated_errors, draw,
 SPREADS = ((0.0, 0.0), (0.01, 0.05), (0.02, 0.1), (0.05, 0.2))
 """Relative standard deviations of real part and loss; Fig. 17 of the paper has 1 and 4 % / 23 and 14 %."""
 LIBRARY_SCANS = 24
+TEST_SCANS = 160
+"""So many that the calibration error of exact probabilities would be told as 0.01 to 0.03 (4 to 23 names a scan)."""
 _TEST_SEED = 500
 _GRID = 21  # nodes a dimension of the specimens' distribution, to 3.5 standard deviations
 Real = npt.NDArray[np.float64]
@@ -49,7 +51,7 @@ def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, 
     """Judge the discriminant on specimens and scans it has not seen, and Bayes' rule on the same errors."""
     errors = replace(calibrated_errors(group, 1 if quick else 3), spread=spread)
     taught = both_angles(group, angles_deg, errors, 41, LIBRARY_SCANS)
-    test = both_angles(group, angles_deg, errors, _TEST_SEED, 6 if quick else 40)
+    test = both_angles(group, angles_deg, errors, _TEST_SEED, 6 if quick else TEST_SCANS)
     model = MODELS[DISCRIMINANT]("H+V+P").fit(taught)
     named, right, sure = by_patch(model, test)
     told = calibration_error(sure[named], right[named])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 from tests.support.paths import REPO
-from tests.support.suite.scheduling import FIRST, TOGETHER, ByFile, longest_first
+from tests.support.suite.scheduling import FIRST, ROOMS, TOGETHER, ByFile, longest_first
 
 
 class _Worker:
@@ -45,6 +45,7 @@ def handed_out(tests: list[str], workers: int) -> list[list[str]]:
 def test_a_files_tests_run_in_one_worker_and_each_once():
     tests = [f"tests/a/test_{file}.py::test_law[{n}]" for file in "abcdef" for n in range(5)]
     tests += [f"{file}::test" for file in sorted({*TOGETHER, *TOGETHER.values()})]
+    tests += [f"{room}/test_{file}.py::test" for room in ROOMS for file in "ab"]
     got = handed_out(tests, 3)
     assert sorted(test for worker in got for test in worker) == sorted(tests)
     files = [{test.partition("::")[0] for test in worker} for worker in got]
@@ -52,14 +53,16 @@ def test_a_files_tests_run_in_one_worker_and_each_once():
     assert all(files)
     for file, other in TOGETHER.items():
         assert any({file, other} <= worker for worker in files)
+    for room in ROOMS:
+        assert sum(any(file.startswith(room) for file in worker) for worker in files) == 1
 
 
 def test_the_longest_files_go_first_and_the_others_stay_in_order():
-    ids = ["tests/z.py::b", "tests/z.py::a", f"{FIRST[1]}::x", "tests/a.py::c", f"{FIRST[0]}::y"]
+    ids = ["tests/z.py::b", "tests/z.py::a", f"{FIRST[1]}/test_b.py::x", "tests/a.py::c", f"{FIRST[0]}::y"]
     items = [SimpleNamespace(nodeid=i) for i in ids]
     longest_first(items)  # type: ignore[arg-type]
     assert [i.nodeid for i in items] == [ids[4], ids[2], ids[0], ids[1], ids[3]]
 
 
-def test_the_files_that_are_named_are_there():
-    assert [f for f in {*FIRST, *TOGETHER, *TOGETHER.values()} if not (REPO / f).is_file()] == []
+def test_what_is_named_is_there():
+    assert [f for f in {*FIRST, *ROOMS, *TOGETHER, *TOGETHER.values()} if not (REPO / f).exists()] == []

@@ -18,14 +18,17 @@ TOGETHER = {
 }
 """Files whose tests share an expensive fixture with another file's."""
 
+ROOMS = ("tests/api", "tests/materials")
+"""Folders with an expensive fixture for most of their files: one worker runs them."""
+
 FIRST = (
     "tests/pi/test_network_memory.py",
+    "tests/materials",
     "tests/process/test_laws.py",
     "tests/e2e/test_killed_processes.py",
-    "tests/api/test_scan.py",
+    "tests/api",
     "tests/stage/test_dialogues.py",
     "tests/doctor/test_live_rig.py",
-    "tests/materials/test_classify.py",
     "tests/process/test_verdicts.py",
     "tests/acquisition/test_run.py",
     "tests/e2e/test_demo.py",
@@ -38,13 +41,14 @@ FIRST = (
     "tests/stage/test_uno.py",
     "tests/e2e/test_kill_and_resume.py",
 )
-"""Files that take longest: begun first, so that no worker ends long after the others."""
+"""Files and folders that take longest: begun first, so that no worker ends long after the others."""
 
 
 def group_of(node_id: str) -> str:
-    """What a test shares a worker with: the first file of its group."""
+    """Folder or file whose tests share a worker."""
     file = node_id.partition("::")[0]
-    return TOGETHER.get(file, file)
+    room = file.rpartition("/")[0]
+    return room if room in ROOMS else TOGETHER.get(file, file)
 
 
 def longest_first(items: list[pytest.Item]) -> None:

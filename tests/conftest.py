@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -21,6 +22,7 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
 
 from tests.support.rigs import published_rig  # noqa: E402
+from tests.support.suite.scheduling import ByFile, longest_first  # noqa: E402
 
 # A shell that starts the tests in the background has Ctrl-C ignored, and so would every program the tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -48,6 +50,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--long"):
         settings.load_profile("searching")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if hasattr(config, "workerinput"):  # with one worker alone, as they are
+        longest_first(items)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
+    return ByFile(config, log)
 
 
 UNRENDERED = ("calibration", "house", "jobs", "plan", "process", "products", "store")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from polysight.shared.config import Board, Instrument
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, mean_burst_travel_mm
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
-from polysight.simulators.scene.draws import pulse_uniform, stream_key
+from polysight.simulators.scene.draws import pulse_normal, pulse_uniform, stream_key
 from polysight.simulators.scene.field import ObjectField, build_field, node_matrix
 from polysight.simulators.scene.optics import antennas, direct_factor
 from polysight.simulators.scene.receiver import high_pass, per_chirp, power_on, sync_delay_s
@@ -210,7 +210,7 @@ class SimulatedRig:
         ideal = np.matmul(nodes[:, None], own.expand)  # [chirp, 2, rx, sample]
         ideal += own.direct
         if not d.hpf:
-            out += factor[:, None].astype(np.complex64) * ideal[:, 0]
+            out += factor[:, None] * ideal[:, 0]
             return
         h, slope = high_pass(own.middle_hz + shift, chirp)
         ideal[:, 0] *= (factor * h).astype(np.complex64)[:, None]
@@ -224,13 +224,7 @@ class SimulatedRig:
         if snr_db is None:
             out[...] = 0
             return
-        philox = np.random.Philox(key=stream_key(self.seed, "noise", board.name))
-        generator, state = np.random.Generator(philox), philox.state
-        flat = out.view(np.float32)
-        for i, pulse in enumerate(pulses):  # a counter block for each pulse: noise does not depend on batching
-            state["state"]["counter"][:] = (0, 0, pulse, 0)
-            philox.state = state
-            generator.standard_normal(out=flat[i], dtype=np.float32)
+        pulse_normal(stream_key(self.seed, "noise", board.name), int(pulses[0]), out.view(np.float32))
         sigma = np.sqrt(0.5 * 10 ** (-snr_db / 10))
         if board.role == "transmit":
             out *= np.float32(sigma)

@@ -29,9 +29,13 @@ def high_pass(if_hz: Real, chirp: Chirp) -> tuple[Complex, Complex]:
     f = np.where(np.abs(if_hz) < 1e-3, 1e-3, if_hz)
     h, log_slope = np.ones(np.shape(f), np.complex128), np.zeros(np.shape(f), np.complex128)
     for corner in (chirp.hpf1_khz * 1e3, chirp.hpf2_khz * 1e3):
-        section = 1.0 / (1.0 - 1j * corner / f)
+        u = corner / f
+        section = np.empty(np.shape(f), np.complex128)  # 1 / (1 - j u), without a complex division
+        section.real = 1.0 / (1.0 + u * u)
+        section.imag = u * section.real
         h *= section
-        log_slope -= section * 1j * corner / f**2
+        log_slope.real += section.imag * u / f  # -j u section / f
+        log_slope.imag -= section.real * u / f
     return h, h * log_slope
 
 
@@ -89,8 +93,8 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     return Receiver(board, chirp, gains.astype(np.complex64), phase - phase[0], error)
 
 
-def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> tuple[Complex, Real]:
-    """Factor of each chirp before the filter, and the IF shift it makes, both [chirp, sample].
+def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> tuple[NDArray[np.complex64], Real]:
+    """Factor of each chirp before the filter, and the IF shift it makes (0 without a filter), both [chirp, sample].
 
     A chirp of the receiver that starts `delay_s` after the transmitter's sees every path shorter by that time:
     exp(-j 2 pi (f0 + K t) delay).
@@ -99,6 +103,9 @@ def per_chirp(receiver: Receiver, delay_s: Real, phase_rad: Real, hpf: bool) -> 
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
     f = chirp.first_sample_hz + chirp.slope_hz_per_s * t
     turns = (receiver.phase + phase_rad[:, None]) / (2 * np.pi) - f * delay_s[:, None]
-    factor = np.exp(2j * np.pi * (turns - np.round(turns)))
+    turns -= np.rint(turns)
+    factor = np.empty(turns.shape, np.complex64)
+    angle = (2 * np.pi * turns).astype(np.float32)  # less than a turn: single precision is enough from here
+    factor.real, factor.imag = np.cos(angle), np.sin(angle)
     shift = receiver.if_error_hz - chirp.slope_hz_per_s * delay_s[:, None]
     return factor, shift if hpf else np.zeros_like(shift)

@@ -43,7 +43,6 @@ def test_notebooks_are_valid_and_stripped(notebook):
             assert not [line for line in cell.source.splitlines() if "import _" in line or "._" in line]
 
 
-@pytest.mark.xdist_group("notebooks")
 def test_simulate_and_image(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     names = run(REPO / "examples" / "notebooks" / "simulate-and-image.ipynb")
@@ -52,7 +51,6 @@ def test_simulate_and_image(tmp_path, monkeypatch, capsys):
     assert "expected from Fresnel" in capsys.readouterr().out
 
 
-@pytest.mark.xdist_group("notebooks")
 def test_own_material(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run(REPO / "examples" / "notebooks" / "own-material.ipynb")

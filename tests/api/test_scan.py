@@ -21,7 +21,6 @@ from polysight.shared.errors import ConfigError, DataError, PolysightError
 
 from .conftest import COPPER, PET, REPO, command, simulated
 
-pytestmark = pytest.mark.xdist_group("api")
 DATASETS = ("image", "patches", "permittivity", "materials")
 
 

@@ -22,7 +22,6 @@ from polysight.shared.errors import PolysightError
 from polysight.shared.messages import BeginRun
 from polysight.shared.raster import plan_raster
 
-pytestmark = pytest.mark.xdist_group("doctor")
 QUICK = System(
     write_speed=lambda _folder: 200e6, held=lambda _rig, rates: ([Held(r, r, 9, 0) for r in rates], "any core")
 )

@@ -9,8 +9,6 @@ import pytest
 from polysight.host.store.manifest import decode_line
 from tests.support.paths import RIG_FILE
 
-pytestmark = pytest.mark.xdist_group("rig")
-
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_while_scanning(bench, scene_file, number):

@@ -8,13 +8,9 @@ from __future__ import annotations
 import hashlib
 import resource
 
-import pytest
-
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.messages import RowStarted
-
-pytestmark = pytest.mark.xdist_group("rig")
 
 
 def digests(path):

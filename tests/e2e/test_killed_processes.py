@@ -30,7 +30,7 @@ from polysight.shared.messages import RowStarted
 from tests.support.paths import REPO
 from tests.support.scenes import small_scene
 
-pytestmark = [pytest.mark.xdist_group("rig"), pytest.mark.slow]
+pytestmark = pytest.mark.slow
 KILLED_AT = REPO / "tests/support/killed_at.py"
 NO_RESULT = 7
 SCENE = small_scene(6, 4, step_mm=(20.0, 20.0), pulses=4, seed=4)

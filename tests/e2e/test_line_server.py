@@ -11,7 +11,6 @@ from polysight.shared.config import Instrument
 from polysight.shared.tables import decode, to_builtins
 from tests.support.pattern_rig import counts, small_table, start_rig
 
-pytestmark = pytest.mark.xdist_group("rig")
 PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
 
 

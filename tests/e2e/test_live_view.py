@@ -20,7 +20,6 @@ from tests.support.scenes import small_scene
 LIMIT_S = 120.0
 ROWS = 40
 SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
-pytestmark = pytest.mark.xdist_group("rig")
 
 
 class View:

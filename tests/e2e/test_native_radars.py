@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.store.validation import validate
 from tests.support.pattern_rig import COLUMNS, PULSES, ROWS, counts, small_table, start_rig
 
-pytestmark = pytest.mark.xdist_group("rig")
 ROW_PULSES = COLUMNS * PULSES
 
 

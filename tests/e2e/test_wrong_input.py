@@ -335,7 +335,6 @@ def test_interrupted_while_simulating(bench):
     assert ended.err == "polysight simulate: stopped\n"
 
 
-@pytest.mark.xdist_group("rig")
 def test_cards_that_do_not_serve(rig):
     """The simulated rig runs; one card after another is wrong."""
     board = rig.instrument.by_name("RV")

@@ -33,7 +33,6 @@ def folder(tmp_path_factory):
         yield made
 
 
-@pytest.mark.xdist_group("examples")
 def test_raw_to_image(folder):
     grid = {"columns": 21, "rows": 21, "step_x_mm": 8.0, "step_y_mm": 6.0}
     image = {"columns": 40, "rows": 40, "pixel_mm": 2.0}
@@ -53,7 +52,6 @@ def test_raw_to_image_takes_twenty_lines():
     assert len(code_lines(to_the_image)) <= LIMIT
 
 
-@pytest.mark.xdist_group("examples")
 def test_own_scene_then_own_material(folder, capsys):
     run("own_scene")
     assert (folder / "out" / "own-products" / "report.html").exists()

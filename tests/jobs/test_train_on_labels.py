@@ -18,7 +18,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
 from tests.support.scenes import scene_of
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("labelled")]
+pytestmark = pytest.mark.slow
 MINE = "h\u00e4rtes \u6a61\u6728"
 PLACES = (-40.0, 10.0), (40.0, -10.0)
 BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")  # 5 mm inside the plates

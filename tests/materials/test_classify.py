@@ -29,7 +29,7 @@ def powders():
 
 @pytest.fixture(scope="module")
 def seen(synthetic):
-    """Images of nine plates under both angles: four placements to learn from, one to name."""
+    """Nine plates under both angles: a library of four placements, and the patches file of one to name, by angle."""
 
     def at(angle, seed):
         return replace(synthetic(seed, theta=np.radians(angle)), theta=np.radians(angle))
@@ -40,19 +40,26 @@ def seen(synthetic):
         for seed in range(1000, 1004)
         for e in entries_of(TrainingScan(f"{angle:g}-{seed}", at(angle, seed).analyse(), True, seed))
     ]
-    return Library(tuple(entries)), {angle: at(angle, 1) for angle in ANGLES}
+    scenes = {angle: at(angle, 1) for angle in ANGLES}
+    packed = {a: pack_patches(s.analyse(), s.x_m, s.y_m, simulated=True) for a, s in scenes.items()}
+    return Library(tuple(entries)), packed
 
 
 @pytest.fixture
 def folders(seen, tmp_path):
     """What `polysight process` leaves of the two scans, as far as naming needs it."""
-    library, scenes = seen
+    library, packed = seen
     library.save(tmp_path / "library.npz")
-    for angle, scene in scenes.items():
-        folder = tmp_path / f"{angle:g}"
-        folder.mkdir()
-        (folder / PATCHES).write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))
+    for angle, content in packed.items():
+        (tmp_path / f"{angle:g}").mkdir()
+        (tmp_path / f"{angle:g}" / PATCHES).write_bytes(content)
     return tmp_path
+
+
+@pytest.fixture
+def scans(folders):
+    """The patches of the two scans, in the order of the angles."""
+    return [read_patches(folders / f"{angle:g}" / PATCHES) for angle in ANGLES]
 
 
 def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabilities_names(powders, tmp_path):
@@ -100,30 +107,17 @@ def test_an_angle_the_library_does_not_hold_is_refused(powders):
 
 
 @pytest.mark.parametrize("model", [None, "knn", "discriminant"])
-def test_patches_under_two_angles_are_named_together(seen, model):
-    library, scenes = seen
-    scans = [_seen(scene) for scene in scenes.values()]
+def test_patches_under_two_angles_are_named_together(seen, scans, model):
     matched = match_patches(scans)
     assert len(matched) == 9
-    named = Classifier(library, model=model, angles_deg=ANGLES).scan([m.features for m in matched])
+    named = Classifier(seen[0], model=model, angles_deg=ANGLES).scan([m.features for m in matched])
     assert sum(n.verdict.name == m.truth for n, m in zip(named, matched, strict=True)) >= 8
     for n in named:
         assert 0 < n.verdict.confidence <= 1
         assert sum(n.verdict.votes.values()) == pytest.approx(1)
 
 
-def _seen(scene):
-    from pathlib import Path
-    from tempfile import TemporaryDirectory
-
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / PATCHES
-        path.write_bytes(pack_patches(scene.analyse(), scene.x_m, scene.y_m, simulated=True))
-        return read_patches(path)
-
-
-def test_patches_match_by_place_alone(seen):
-    scans = [_seen(scene) for scene in seen[1].values()]
+def test_patches_match_by_place_alone(scans):
     there = scans[1]
     reordered = replace(there, patches=there.patches[::-1])
     assert [m.label for m in match_patches([scans[0], reordered])] == [m.label for m in match_patches(scans)]
@@ -133,9 +127,9 @@ def test_patches_match_by_place_alone(seen):
     assert len(match_patches([scans[0], without])) == 8
 
 
-def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(seen):
+def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(seen, scans):
     classifier = Classifier(seen[0], model="discriminant", angles_deg=[55.0])
-    x = _seen(seen[1][55.0]).patches[0].features.copy()
+    x = scans[0].patches[0].features.copy()
     x[0, 2] = np.nan
     broken, empty, lost = classifier.scan([x, np.zeros((0, 4)), np.full((2, 4), np.nan)])
     assert broken.names[0] == UNKNOWN

@@ -16,7 +16,6 @@ from tests.support.rigs import published_rig
 
 TOKEN = "0123456789"
 PICTURES = "[...document.querySelectorAll('.view img')]"
-pytestmark = pytest.mark.xdist_group("browser")
 
 
 def opened(browser: Browser, view, size=DESK, token: str = "") -> None:

@@ -11,8 +11,6 @@ from polysight.host.materials.labels import labels_of, pack_labels, read_labels
 from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.process.request import Options
 
-pytestmark = pytest.mark.xdist_group("host_sim")
-
 
 @pytest.fixture
 def found(imaged):

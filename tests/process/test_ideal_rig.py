@@ -1,12 +1,8 @@
 """A scan of an ideal rig is processed as one: what its scene switched off is not taken away once more."""
 
-import pytest
-
 from polysight.host.materials import Classifier, Library
 from polysight.host.materials.analyse import KnownScene
 from polysight.host.materials.library import SIMULATED_LIBRARY
-
-pytestmark = pytest.mark.xdist_group("host_sim")
 
 
 def test_all_plates_of_an_ideal_scan_are_named_right(imaged):

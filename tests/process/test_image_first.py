@@ -17,8 +17,6 @@ from polysight.host.store import ScanFolder
 from polysight.shared.errors import DataError
 from tests.support.commands import told_by
 
-pytestmark = pytest.mark.xdist_group("samples")
-
 
 @pytest.fixture(scope="module")
 def scan(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

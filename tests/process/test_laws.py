@@ -1,7 +1,4 @@
-"""Laws of the whole chain on raw data from an independent simulator: bytes in, images and materials out.
-
-One worker runs them all (xdist_group), so that scans are simulated once.
-"""
+"""Laws of the whole chain on raw data from an independent simulator: bytes in, images and materials out."""
 
 import numpy as np
 import pytest
@@ -11,8 +8,6 @@ from polysight.host.materials.analyse import KnownScene
 from polysight.host.materials.library import SIMULATED_LIBRARY
 from polysight.host.materials.segment import axis_mm, box_mask
 from polysight.host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
-
-pytestmark = pytest.mark.xdist_group("host_sim")
 
 
 def inside(scan, name, rim_mm=11.0):

@@ -19,8 +19,6 @@ from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument
 from polysight.simulators.scene import decode_scene, simulate
 
-pytestmark = pytest.mark.xdist_group("metal_scans")
-
 BANDS = 3
 LEAKAGE = {"leakage_h": [0.08, 0.03], "leakage_v": [-0.02, 0.06]}
 GLASS = {"permittivity": [5.5, 0.05], "thickness_mm": 3.0, "name": "glass"}

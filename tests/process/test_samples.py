@@ -16,7 +16,6 @@ from polysight.host.process import each_row
 from polysight.host.store import ScanFolder
 from polysight.shared.errors import DataError
 
-pytestmark = pytest.mark.xdist_group("samples")
 PIXELS = ("h", "v", "h_raw", "v_raw", "h_footprint", "v_footprint", "valid")
 
 

@@ -14,7 +14,6 @@ import pytest
 from tests.support.paths import REPO
 
 SKETCH = REPO / "arduino_stage"
-pytestmark = pytest.mark.xdist_group("firmware")  # built once
 SIGNATURE = bytes([0x1E, 0x95, 0x0F])  # ATmega328P
 IN_SYNC, OK, END = b"\x14", b"\x10", b"\x20"
 

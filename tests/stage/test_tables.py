@@ -19,7 +19,6 @@ from polysight.simulators.stage import python_stage as stage_python
 from tests.support.paths import REPO
 
 SKETCH = REPO / "arduino_stage"
-FIRMWARE = pytest.mark.xdist_group("firmware")  # built once
 PAGE = (REPO / "docs" / "spec" / "stage-line.md").read_text(encoding="utf-8")
 
 
@@ -126,14 +125,12 @@ def test_immediate_bytes_are_far_from_line_bytes():
         assert all((byte ^ other).bit_count() > 1 for other in others)
 
 
-@FIRMWARE
 def test_sketch_fits_an_uno(built: tuple[Path, str]):
     sizes = dict(re.findall(r"^(Program|Data): +(\d+) bytes", built[1], re.MULTILINE))
     assert int(sizes["Program"]) < 32_256  # flash without the boot loader
     assert int(sizes["Data"]) < 1_536  # a quarter of the memory is left for the stack
 
 
-@FIRMWARE
 def test_no_floating_point_anywhere(built: tuple[Path, str]):
     """Not in the interrupt, and nowhere else: no routine of the compiler's soft floating point is linked."""
     elf = str(built[0] / "arduino_stage.elf")
@@ -142,7 +139,6 @@ def test_no_floating_point_anywhere(built: tuple[Path, str]):
     assert not re.findall(r"\b__\w*(?:sf|fp|float)\w*", symbols)
 
 
-@FIRMWARE
 def test_the_arduino_ide_makes_the_same_image(built: tuple[Path, str], tmp_path: Path):
     """The IDE's own builder opens the folder as it is, and its image is ours byte for byte."""
     if shutil.which("arduino-builder") is None:

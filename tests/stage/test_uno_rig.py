@@ -27,7 +27,6 @@ def run(*command: str) -> None:
 
 
 @pytest.mark.usefixtures("uno_programs")
-@pytest.mark.xdist_group("rig")
 def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     """Every row is committed, and the radars saw the plate from where the plan has the stage, between triggers too."""
     rig = published_rig()

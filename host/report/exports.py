@@ -17,6 +17,7 @@ import scipy
 from polysight.host.products import (
     CONVENTION,
     SavedProducts,
+    fresh_part,
     full_dataset,
     material_columns,
     read_processed,
@@ -83,7 +84,7 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
         when h5py is not installed.
     """
     h5py = _h5py()
-    part = path.with_name(f".{path.name}.part")
+    part = fresh_part(path)
     with h5py.File(part, "w") as f:
         axes = {"y": products.y_m, "x": products.x_m}
         for name, values in axes.items():
@@ -239,7 +240,10 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             "only images were made of this scan",
             "polysight process names them",
         )
-    out = out or products.folder.parent / f"{products.folder.name}-{_FOLDER}"
+    if out is None:
+        out = products.folder.parent / f"{products.folder.name}-{_FOLDER}"
+        if out.is_symlink():
+            raise ConfigError(f"{out} is a link", "files would be replaced elsewhere", "give --out, or remove the link")
     out.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
     for kind in formats:

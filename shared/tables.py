@@ -12,8 +12,10 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from polysight.shared.errors import ConfigError, did_you_mean
+from polysight.shared.errors import ConfigError, DataError, did_you_mean
+from polysight.shared.files import read_bounded
 
+_MOST_BYTES = 64 << 20
 T = TypeVar("T")
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 _RIG_KEYS = "instrument.toml in the repository shows every key with its meaning"
@@ -34,12 +36,12 @@ def require(ok: bool, rule: str) -> None:
 def read_toml(path: Path) -> dict[str, Any]:
     """Parse a TOML file. Raises ConfigError when it is absent, unreadable or not TOML."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_bounded(path, _MOST_BYTES).decode("utf-8"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file", "the path is wrong", "give the path of a TOML file") from None
-    except (OSError, UnicodeDecodeError) as e:
+    except (OSError, UnicodeDecodeError, DataError) as e:
         raise ConfigError(f"{path}: cannot be read: {e}", "not a readable text file", "check the path") from None
-    except tomllib.TOMLDecodeError as e:
+    except (tomllib.TOMLDecodeError, RecursionError) as e:
         raise ConfigError(f"{path}: not valid TOML: {e}", "a typing error", "correct that line") from None
 
 

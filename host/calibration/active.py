@@ -158,6 +158,13 @@ def load_calibration(paths: dict[str, Path]) -> Calibration:
     """Read the files, by kind. Raises ConfigError naming the one that is not what it should be."""
     kinds = {"direct_path": PlacesFile, "hpf": FilterFile, "metal": MetalFile}
     found = {kind: read(path, kinds[kind], kind) for kind, path in paths.items()}
+    metal = found.get("metal")
+    if metal is not None and Path(metal.images).name != metal.images:
+        raise DataError(
+            f"{paths['metal']}: its images are {metal.images!r}, which is no file beside it",
+            "it was changed, or made by another program",
+            "calibrate again: `polysight calibrate metal`",
+        )
     return Calibration(found.get("direct_path"), found.get("hpf"), found.get("metal"), dict(paths))
 
 
@@ -176,10 +183,13 @@ def of_scan(scan: Any) -> Calibration:
     """
     facts = scan.facts("scan_started") if isinstance(scan, ScanFolder) else []
     recorded = facts[0].get(FACT) if facts else None
-    if recorded is None or not isinstance(scan, ScanFolder):
+    if not isinstance(scan, ScanFolder):
         return of_rig(scan.instrument)
-    paths = {}
-    for kind, fact in recorded.items():
+    if recorded is None:
+        named = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
+        return load_calibration({kind: inside(scan.path, name) for kind, name in named.items()})
+    paths: dict[str, Path] = {}
+    for kind, fact in _recorded(scan, recorded).items():
         path = paths[kind] = inside(scan.path, fact["file"])
         if not path.is_file() or f"{zlib.crc32(path.read_bytes()):08x}" != fact["crc32"]:
             raise DataError(
@@ -188,6 +198,18 @@ def of_scan(scan: Any) -> Calibration:
                 f"restore it from a copy, or from {fact['copied_from']}",
             )
     return load_calibration(paths)
+
+
+def _recorded(scan: ScanFolder, recorded: Any) -> dict[str, dict[str, str]]:
+    """The fact of a manifest that names a scan's own copies. Raises DataError when it has another form."""
+    try:
+        return msgspec.convert(recorded, dict[str, dict[str, str]])
+    except msgspec.ValidationError as e:
+        raise DataError(
+            f"{scan.path / MANIFEST}: what it says of the calibration has another form: {e}",
+            "the manifest was made by another program or changed",
+            "restore it from a copy",
+        ) from None
 
 
 def checked(rig: Instrument, simulated: bool) -> Calibration:

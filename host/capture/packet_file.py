@@ -19,6 +19,7 @@ from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed
 from polysight.host.capture.segment import damaged, write_durably
 from polysight.shared.errors import DataError
+from polysight.shared.files import read_bounded
 
 PACKETS = ".pkt"  # suffix, beside the row's file
 FORMAT = 1
@@ -28,6 +29,7 @@ RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), 
 `place`: offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
 """
 BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets that had come by then
+_MOST_RUN_BYTES = 256 << 20  # of batches and runs
 Bytes = NDArray[np.uint8]
 
 
@@ -94,7 +96,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
         when the file is absent or damaged, or does not belong to the row.
     """
     try:
-        line, _, tail = path.read_bytes().partition(b"\n")
+        line, _, tail = read_bounded(path, PacketLog.most_kept(row.size) + _MOST_RUN_BYTES).partition(b"\n")
         head: dict[str, Any] = json.loads(line)
         evidence = msgspec.convert(head["evidence"], Evidence)
         size = 2 * BATCH.itemsize * head["batches"]
@@ -108,7 +110,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
         if not whole or log.count != head["kept"] or head["format"] != FORMAT:
             raise ValueError("it does not hold what it says")
         log.malformed = int(head["malformed"])
-    except (OSError, ValueError, KeyError, TypeError, msgspec.ValidationError) as e:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as e:
         raise DataError(f"{path}: not a readable packet log: {e}", *damaged(path)) from None
     return evidence, log
 
@@ -125,7 +127,8 @@ def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
 def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
     """The log again. Raises ValueError where payload is missing."""
     many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
-    if expected != row.size or not PacketLog.would_keep(expected, int((many * sizes).sum())) or (sizes == 0).any():
+    payload_bytes = sum((many * sizes).tolist())  # each product fits 48 bits; their sum need not fit 64
+    if expected != row.size or not PacketLog.would_keep(expected, payload_bytes) or (sizes == 0).any():
         raise ValueError("it is of another row, or of more payload than a receiver keeps")
     nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
     each = np.repeat(sizes, many)

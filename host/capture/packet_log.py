@@ -116,7 +116,12 @@ class PacketLog:
     @staticmethod
     def would_keep(expected: int, payload_bytes: int) -> bool:
         """Whether so much payload of a row is ever kept."""
-        return payload_bytes <= _MOST * (expected + _SPARE_BYTES)
+        return payload_bytes <= PacketLog.most_kept(expected)
+
+    @staticmethod
+    def most_kept(expected: int) -> int:
+        """Payload of a row of `expected` bytes that is kept at most."""
+        return _MOST * (expected + _SPARE_BYTES)
 
     def _note(self, t_ns: int) -> None:
         if self._noted + 2 > len(self._batches):

@@ -17,10 +17,12 @@ from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Code, Status
 from polysight.host.capture.inspect import CardReport, Known, Report, inspect_payload, place_packets
 from polysight.shared.errors import DataError, ProtocolError
+from polysight.shared.files import read_bounded
 
 _MAGIC = {0xA1B2C3D4: 1_000, 0xA1B23C4D: 1}  # microseconds or nanoseconds, as ns a tick
 _PCAPNG = 0x0A0D0D0A
 _AGAIN = "record again: let tcpdump end by itself, or stop it with Ctrl-C"
+_MOST_BYTES = 4 << 30  # half an hour of three boards
 _ETHERNET, _IPV4, _VLAN, _UDP = 1, 0x0800, 0x8100, 17
 
 
@@ -47,7 +49,7 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
         when the file is not a classic pcap file of Ethernet packets, or ends within a packet.
     """
     try:
-        raw = path.read_bytes()
+        raw = read_bounded(path, _MOST_BYTES)
     except OSError as e:
         raise DataError(f"{path}: cannot be read: {e.strerror}", "the path is wrong", "give a capture file") from None
     for order in "<>":

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.errors import DataError, DeviceError
+from polysight.shared.files import open_to_write, read_bounded
 
 PAIR = np.dtype("<i8")
+MOST_INDEX_BYTES = 256 << 20  # sixteen million batches of packets
 
 
 def _scan_of(path: Path) -> Path:
@@ -60,7 +62,7 @@ class Segment:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with ExitStack() as stack:
-                self._file = stack.enter_context(path.open("w+b", buffering=0))
+                self._file = stack.enter_context(open_to_write(path, "w+b", 0))
                 stack.callback(path.unlink, missing_ok=True)
                 if size:
                     # Reserve the space now: a full disk must be an error here, not after the row.
@@ -107,7 +109,7 @@ def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) 
 def write_durably(path: Path, raw: bytes) -> int:
     """Write a file that is on the disk when this returns; returns its CRC-32. Raises DeviceError."""
     try:
-        with path.open("wb") as f:
+        with open_to_write(path) as f:
             f.write(raw)
             f.flush()
             os.fsync(f.fileno())
@@ -119,10 +121,10 @@ def write_durably(path: Path, raw: bytes) -> int:
 def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
     """The facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError when absent or damaged."""
     try:
-        head, _, tail = path.read_bytes().partition(b"\n")
+        head, _, tail = read_bounded(path, MOST_INDEX_BYTES).partition(b"\n")
         facts = json.loads(head)
         pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
-    except (OSError, ValueError) as e:
+    except (OSError, ValueError, RecursionError) as e:
         raise DataError(f"{path}: not a readable row index: {e}", *damaged(path)) from None
     if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
         raise DataError(f"{path}: the row index does not hold what it says", *damaged(path))

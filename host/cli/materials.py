@@ -242,19 +242,31 @@ _FORMATS = {
 
 
 def _export(args: argparse.Namespace) -> int:
+    formats = [name for name in _FORMATS if getattr(args, name)]
+    if args.cphd:
+        from polysight.host.jobs.phase_history import export_cphd
+
+        export_cphd(args.products, args.out)
+        if not formats:
+            return 0
     from polysight.host.report import export
 
-    return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
+    return export(args.products, formats, args.out)
 
 
 def _add_export(add: Add) -> None:
     sub = add(
         "export",
         _export,
-        "write the products of a processed scan for other programs: HDF5, NetCDF, Zarr, MATLAB, PNG, CSV",
+        "write the products of a processed scan for other programs: HDF5, NetCDF, Zarr, MATLAB, PNG, CSV, CPHD",
         "polysight export out/one --hdf5 --csv",
     )
     sub.add_argument("products", type=Path, metavar="DIR", help="folder that polysight process wrote, or a scan folder")
     for name, text in _FORMATS.items():
         sub.add_argument(f"--{name}", action="store_true", help=text)
+    sub.add_argument(
+        "--cphd",
+        action="store_true",
+        help="phase-history.cphd: the scan's rows as bistatic phase history, for other SAR processors (needs sarkit)",
+    )
     sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")

@@ -94,7 +94,8 @@ def _doctor(args: argparse.Namespace) -> int:
         raise ConfigError(
             "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out"
         )
-    return doctor(Wanted(args.config, args.out, args.move, args.pulse, args.bursts), args.json)
+    wanted = Wanted(args.config, args.out, args.move, args.pulse, args.bursts)
+    return doctor(wanted, args.json, bundle=args.bundle)
 
 
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
@@ -122,6 +123,13 @@ def _add_doctor(add: Add) -> None:
         dest="pulse",
         action="store_false",
         help="send no SYNC_IN pulses (default: a few bursts at rest; radars that are armed transmit meanwhile)",
+    )
+    sub.add_argument(
+        "--bundle",
+        type=Path,
+        metavar="FILE.zip",
+        help="write what was found, versions, rig file, logs and the last lines of manifests, to send to somebody;"
+        " no raw data, no keys",
     )
     sub.add_argument("--bursts", type=_bursts, default=4, metavar="N", help="how many bursts to capture (default: 4)")
     sub.add_argument("--json", action="store_true", help="print JSON, for programs")

@@ -9,6 +9,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 from polysight.host.doctor.bench import Bench, Finding, System, Wanted, not_checked, of_error
 from polysight.host.doctor.check_capture import check_buffer, check_card, check_network, check_pulses, check_radar
@@ -22,7 +23,7 @@ from polysight.host.doctor.check_host import (
 )
 from polysight.host.doctor.check_pi import SIMULATED, check_free, check_keys, check_pi, check_stage, check_trigger
 from polysight.shared.config import Board
-from polysight.shared.errors import DeviceError, PolysightError
+from polysight.shared.errors import DeviceError, PolysightError, no_such
 from polysight.shared.messages import is_simulated
 
 _WIDTH = 16  # of the column of names
@@ -145,9 +146,11 @@ def _try(check: Check, bench: Bench, board: Board | None) -> Finding:
         )
 
 
-def doctor(wanted: Wanted, as_json: bool, system: System = System()) -> int:  # noqa: B008 - immutable
-    """Walk the rig; 0 when no check found an error, 1 otherwise."""
+def doctor(wanted: Wanted, as_json: bool, system: System = System(), bundle: Path | None = None) -> int:  # noqa: B008 - immutable
+    """Walk the rig; 0 when no check found an error, 1 otherwise. `bundle`: write what was found into this archive."""
     findings: list[Finding] = []
+    if bundle is not None and not bundle.resolve().parent.is_dir():
+        raise no_such(bundle.parent)
     with Bench(wanted, system) as bench:
         for finding in walk(bench):
             findings.append(finding)
@@ -155,12 +158,19 @@ def doctor(wanted: Wanted, as_json: bool, system: System = System()) -> int:  # 
                 sys.stdout.write(line(finding))
                 sys.stdout.flush()
         simulated = bench.hello is not None and is_simulated(bench.hello.backend)
+        rig = bench.given
     wrong = [f.check for f in findings if f.verdict == "error"]
+    told = _sum(findings, wrong) + (f" ({SIMULATED})" if simulated else "") + "\n"
     if as_json:
         found = {"ok": not wrong, "simulated": simulated, "findings": [asdict(f) for f in findings]}
         sys.stdout.write(json.dumps(found, indent=1) + "\n")
     else:
-        sys.stdout.write(_sum(findings, wrong) + (f" ({SIMULATED})" if simulated else "") + "\n")
+        sys.stdout.write(told)
+    if bundle is not None:
+        from polysight.host.doctor.bundle import write_bundle
+
+        write_bundle(bundle, wanted, rig, findings, "".join(map(line, findings)) + told, system.root)
+        sys.stderr.write(f"{bundle}: to send to somebody; no raw data, no keys. Look through it first\n")
     return 1 if wrong else 0
 
 

@@ -26,6 +26,7 @@ from polysight.host.process import ProcessRequest, cores
 from polysight.host.products import FINISHED, SavedProducts, write_json
 from polysight.host.store import COLLECTION, MANIFEST, ScanFolder, is_source, versions
 from polysight.shared.errors import ConfigError, PolysightError
+from polysight.shared.files import read_json
 
 SUMMARY = "processed.json"
 Status = Literal["done", "skipped", "failed", "stopped"]
@@ -125,8 +126,8 @@ def _digest(path: Path) -> Any:
 def finished(job: Job) -> bool:
     """Whether the products are there and were made with just this."""
     try:
-        mark = json.loads((job.out / FINISHED).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        mark = read_json(job.out / FINISHED)
+    except (OSError, ValueError, PolysightError):
         return False
     same = isinstance(mark, dict) and mark.get("made_with") == json.loads(json.dumps(job.made_with))
     return same and all((job.out / name).exists() for name in _PRODUCTS)
@@ -178,7 +179,7 @@ def _follow(child: subprocess.Popen[bytes], job: Job, stop: Event | None) -> Non
 
 
 def _done(job: Job, seconds: float = 0.0) -> Outcome:
-    mark = json.loads((job.out / FINISHED).read_text(encoding="utf-8"))
+    mark = read_json(job.out / FINISHED)
     return Outcome(job.name, "done", seconds or float(mark.get("seconds", 0.0)), float(mark["memory_gb"]))
 
 
@@ -314,7 +315,7 @@ def _positions(data: Path) -> int:
     """Positions of a scan, or of the published grid where its files do not say it at a glance."""
     try:
         if (data / COLLECTION).exists():
-            s = json.loads((data / COLLECTION).read_text(encoding="utf-8"))
+            s = read_json(data / COLLECTION)
             return int(s["total_x"]) * int(s["total_y"])
         return ScanFolder.load(data).plan.positions
     except (PolysightError, OSError, ValueError, KeyError, TypeError):  # its own program will say what is wrong

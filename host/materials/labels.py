@@ -21,6 +21,7 @@ from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.segment import Box, Patch, Segmentation, axis_mm, box_mask, make_patch
 from polysight.host.materials.truth import TruthPlate
 from polysight.shared.errors import DataError
+from polysight.shared.files import read_json
 
 METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")
 SPECIMEN = "#"
@@ -107,10 +108,10 @@ def read_labels(path: Path) -> Labels:
     """
     remedy = "correct it, or draw the boxes again: polysight label SCAN"
     try:
-        raw: Any = json.loads(path.read_text(encoding="utf-8"))
+        raw: Any = read_json(path)
     except FileNotFoundError:
         raise DataError(f"{path}: no such label file", "the path is wrong", "polysight label SCAN makes one") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as e:
+    except (OSError, ValueError) as e:
         raise DataError(f"{path}: not a label file: {e}", "a label file is JSON with a key `labels`", remedy) from None
     boxes = raw.get("labels") if isinstance(raw, dict) else None
     if not isinstance(boxes, dict):

@@ -11,7 +11,6 @@ unpickler that admits arrays and plain types only.
 from __future__ import annotations
 
 import io
-import json
 import pickle
 import re
 from collections.abc import Iterable, Sequence
@@ -27,6 +26,7 @@ from polysight.host.materials.library import Entry, Library
 from polysight.host.materials.segment import Box
 from polysight.host.polarimetry import calibrate
 from polysight.shared.errors import DataError
+from polysight.shared.files import read_bounded, read_json
 
 Image = npt.NDArray[np.complexfloating]
 PIXELS = 120
@@ -116,7 +116,7 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
             raise DataError(f"{file}: no such label file", "the download is not complete", "fetch the scan again")
         file = others[0]
     boxes = dict(read_labels(file).boxes)
-    description = str(json.loads(file.read_text(encoding="utf-8")).get("description", ""))
+    description = str(read_json(file).get("description", ""))
     images = []
     for name in ("sar_h", "sar_v"):
         path = folder / f"{name}.npy"
@@ -215,6 +215,9 @@ def told_angle(texts: Iterable[str]) -> float | None:
     return None
 
 
+_MOST_BYTES = 1 << 30
+
+
 class _Restricted(pickle.Unpickler):
     """An unpickler for arrays and plain types."""
 
@@ -234,7 +237,9 @@ def read_pickle(path: Path) -> Any:
         when the file is absent, damaged, or would call anything but numpy's array constructors.
     """
     try:
-        return _Restricted(io.BytesIO(path.read_bytes())).load()
+        return _Restricted(io.BytesIO(read_bounded(path, _MOST_BYTES))).load()
+    except DataError:
+        raise
     except OSError as e:
         raise DataError(f"{path}: cannot be read: {e.strerror}", "the path is wrong, or you may not read it") from None
     except pickle.UnpicklingError as e:
@@ -258,10 +263,10 @@ def read_material(path: Path) -> Entry:
     DataError
         as :func:`read_pickle`, or when keys are missing or arrays have another form.
     """
-    raw = read_pickle(path)
+    raw, most = read_pickle(path), path.stat().st_size
     try:
-        p, h, v = (_pixels(x) for x in raw["values"])
-        ref_p, ref_h, ref_v = (_pixels(x) for x in raw["ref_values"])
+        p, h, v = (_pixels(x, most) for x in raw["values"])
+        ref_p, ref_h, ref_v = (_pixels(x, most) for x in raw["ref_values"])
         name, angle = str(raw["name"]), float(raw["incident_angle"])
         scan, reference = str(raw["collection_name"]), str(raw["ref_name"])
         thickness = _number(raw.get("thickness"))
@@ -325,7 +330,12 @@ def write_materials(folder: Path, entries: Iterable[Entry]) -> None:
         write_material(path if not path.exists() else path.with_stem(f"{path.stem}_{i}"), entry)
 
 
-def _pixels(values: Any) -> npt.NDArray[np.complex128]:
+def _pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
+    """Numbers of a file of `most` bytes. Raises ValueError: lists of lists that are one list can be of any size."""
+    plain = isinstance(values, list | tuple) and all(isinstance(v, int | float | complex) for v in values)
+    size = values.nbytes if isinstance(values, np.ndarray) else len(values) if plain else most + 1
+    if size > most:
+        raise ValueError("pixels are not an array or list of numbers, or of more numbers than the file has bytes")
     return np.asarray(values, np.complex128).ravel()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from polysight.host.materials.segment import Box, Patch, box_mask
 from polysight.shared.errors import DataError
+from polysight.shared.files import read_json
 
 TRUTH = "truth.json"
 
@@ -60,10 +60,10 @@ def read_truth(path: Path) -> tuple[TruthPlate, ...]:
     """Plates of a truth.json. Raises DataError."""
     remedy = f"give the one that polysight simulate wrote beside its data, or move {path.name} away"
     try:
-        return truth_plates(json.loads(path.read_text(encoding="utf-8")))
+        return truth_plates(read_json(path))
     except DataError as e:
         raise DataError(f"{path}: {e.what}", e.why, remedy) from None
-    except (OSError, ValueError, RecursionError) as e:
+    except (OSError, ValueError) as e:
         raise DataError(f"{path}: cannot be read as truth: {e}", "another program's file, or damaged", remedy) from None
 
 
@@ -73,7 +73,7 @@ def drawn_specimens(path: Path) -> int | None:
     Raises DataError.
     """
     read_truth(path)
-    scene = json.loads(path.read_text(encoding="utf-8")).get("scene")
+    scene = read_json(path).get("scene")
     spread = scene.get("specimen_spread") if isinstance(scene, dict) else None
     return scene.get("seed") if isinstance(scene, dict) and isinstance(spread, list) and any(spread) else None
 

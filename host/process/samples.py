@@ -36,6 +36,7 @@ from polysight.host.store import ScanFolder, Source, crc32, inside, manifest
 from polysight.host.sync import HighPass
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
+from polysight.shared.files import read_json
 
 FOLDER, HEAD, ROWS = "samples", "samples.json", "rows.jsonl"
 FORMAT = 1
@@ -202,8 +203,8 @@ class KeptSamples:
         if self._scan is None:
             return {}
         try:
-            head = json.loads((self._folder / HEAD).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            head = read_json(self._folder / HEAD)
+        except (OSError, ValueError, DataError):
             return {}
         wanted = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
         if not isinstance(head, dict) or any(head.get(key) != value for key, value in wanted.items()):

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from polysight.host.products.files import fresh_part
+from polysight.host.store import MOST_BYTES
 from polysight.shared.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -77,7 +79,7 @@ def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
     split.attrs = {key: int(value) if isinstance(value, bool) else value for key, value in split.attrs.items()}
     packed = {"zlib": True, "complevel": 4, "shuffle": True}
     encoding = {name: packed for name, v in split.data_vars.items() if v.ndim == 2 and v.dtype.kind in "biuf"}
-    part = path.with_name(f".{path.name}.part")
+    part = fresh_part(path)
     split.to_netcdf(part, engine="h5netcdf", encoding=encoding)
     part.replace(path)
 
@@ -96,12 +98,47 @@ def read_netcdf(path: Path) -> xarray.Dataset:
 
     _require("h5netcdf", "NetCDF")
     try:
+        _check_hdf5(path)
         dataset = xarray.load_dataset(path, engine="h5netcdf")
     except (OSError, ValueError) as e:
         raise DataError(f"{path}: not a NetCDF file: {e}", "the path is wrong, or the file is damaged") from None
     if "simulated" in dataset.attrs and dataset.attrs["simulated"] != "unknown":
         dataset.attrs["simulated"] = bool(dataset.attrs["simulated"])
     return join_complex(dataset)
+
+
+def _check_hdf5(path: Path) -> None:
+    """Refuse a file whose arrays lie in other files, or take more than is read, before any of it is.
+
+    Raises
+    ------
+    DataError, OSError
+        naming what.
+    """
+    import h5py
+
+    sizes: list[int] = []
+    elsewhere: list[str] = []
+    with h5py.File(path, "r") as file:
+
+        def look(name: str) -> None:  # must not raise: HDF5 calls it
+            outside = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
+            found = None if outside else file.get(name)
+            if isinstance(found, h5py.Dataset):
+                outside = bool(found.external) or found.is_virtual
+                sizes.append((found.size or 0) * found.dtype.itemsize)
+            if outside:
+                elsewhere.append(name)
+
+        file.visit_links(look)
+    if elsewhere:
+        raise DataError(f"{path}: {elsewhere[0]} lies in another file", "it was not made by this program")
+    if sum(sizes) > MOST_BYTES:
+        raise DataError(
+            f"{path}: its arrays take {sum(sizes)} bytes, more than the {MOST_BYTES} bytes that are read",
+            "it was not made by this program, or is damaged",
+            "export the products again",
+        )
 
 
 def write_zarr(path: Path, dataset: xarray.Dataset) -> None:
@@ -115,8 +152,7 @@ def write_zarr(path: Path, dataset: xarray.Dataset) -> None:
     _require("zarr", "Zarr")
     if path.exists() and not (path / ".zgroup").exists():
         raise ConfigError(f"{path} is not a Zarr store", "something else has that name", "give another folder")
-    part = path.with_name(f".{path.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    part = fresh_part(path)
     dataset.to_zarr(part, mode="w", zarr_format=_ZARR_FORMAT, consolidated=True)
     if path.exists():
         shutil.rmtree(path)

@@ -10,6 +10,7 @@ import io
 import json
 import math
 import os
+import shutil
 import zipfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -27,6 +28,7 @@ from polysight.host.store import Scan, open_npz, versions
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError, no_such
+from polysight.shared.files import open_to_write, read_json
 from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
@@ -36,11 +38,24 @@ _OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not wr
 _PRODUCTS = "products"  # of a scan folder
 
 
+def fresh_part(path: Path) -> Path:
+    """The temporary name beside a file or folder to be made; whatever an ended program, or a link, left there is gone.
+
+    Raises OSError.
+    """
+    part = path.with_name(f".{path.name}.part")
+    if part.is_dir() and not part.is_symlink():
+        shutil.rmtree(part)
+    else:
+        part.unlink(missing_ok=True)
+    return part
+
+
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file under a temporary name beside it, flush it to disk, then take its place."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
-    with part.open("wb") as f:
+    with open_to_write(part) as f:
         f.write(data)
         f.flush()
         os.fsync(f.fileno())
@@ -286,10 +301,10 @@ def read_products(folder: Path, needs: str = IMAGE) -> SavedProducts:
 def _json(path: Path) -> dict[str, Any]:
     """Content of a JSON file; empty when it is absent."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
     except FileNotFoundError:
         return {}
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as e:
+    except (OSError, ValueError) as e:
         raise _damaged(path, str(e)) from None
     if not isinstance(content, dict):
         raise _damaged(path, "not a JSON object")

@@ -142,13 +142,13 @@ def _check_writable(folder: Path) -> None:
 def _begin(new: Path) -> int:
     """The folder, empty and locked; what a killed program left in it is removed. Returns the lock's file descriptor."""
     new.mkdir(exist_ok=True)
-    lock = os.open(new, os.O_RDONLY | os.O_DIRECTORY)
+    lock = os.open(new, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)  # what a link leads to is not ours
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if not os.path.samestat(os.fstat(lock), new.stat()):
             raise BlockingIOError(errno.EAGAIN, "it has just taken its place")
         for entry in new.iterdir():
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
     except BaseException:
         os.close(lock)
         raise

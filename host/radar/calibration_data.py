@@ -14,7 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from polysight.host.radar import events as e
-from polysight.host.radar.files import read_bounded
 from polysight.host.radar.lab_commands import (
     ALL_CALIBRATIONS,
     CALIBRATION_PART_BYTES,
@@ -26,6 +25,7 @@ from polysight.host.radar.lab_commands import (
 )
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.files import read_bounded
 
 _BYTES = CALIBRATION_PARTS * CALIBRATION_PART_BYTES
 NO_DIE = "-".join(["00000000"] * 4)  # tells no boards apart

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from polysight.host.radar.commands import FileChunk
-from polysight.host.radar.files import read_bounded
 from polysight.host.radar.messages import BODY_LIMIT
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.files import read_bounded
 
 TO_RAM = 0  # lost at the next reset (ICD 302)
 TO_FLASH = 4  # the first of four places in the board's serial flash

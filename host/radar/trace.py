@@ -16,11 +16,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from polysight.host.radar.files import read_bounded
 from polysight.host.radar.spi import Clock, WordLink
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.files import read_bounded
 
 FORM = 1
 INTERRUPT, RESET = "HOST_INTR", "NRST"

@@ -1,11 +1,14 @@
 """The report of a processed scan, its figures and tables, and exports for other programs.
 
 `context_of` collects what a report shows, `write_report` makes the page; `sync_report` shows what synchronisation
-leaves of errors; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from saved products.
+leaves of errors; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from saved products; `write_cphd` writes a
+scan's phase history for other SAR processors.
 """
 
 from polysight.host.report.context import ReportContext, classifier_sentence, context_of
-from polysight.host.report.exports import export
+from polysight.host.report.cphd import Channel as CphdChannel
+from polysight.host.report.cphd import PhaseHistory, write_cphd
+from polysight.host.report.exports import export, export_folder
 from polysight.host.report.figures import banner_png, draw_channel, draw_overview, figures
 from polysight.host.report.focus_figure import focus_figure
 from polysight.host.report.fonts import figure_label, font_families
@@ -21,6 +24,8 @@ __all__ = [
     "PALETTE",
     "QUANTITIES",
     "STAMP",
+    "CphdChannel",
+    "PhaseHistory",
     "ReportContext",
     "SyncReport",
     "banner_png",
@@ -29,6 +34,7 @@ __all__ = [
     "draw_channel",
     "draw_overview",
     "export",
+    "export_folder",
     "extent_mm",
     "figure_label",
     "figures",
@@ -38,6 +44,7 @@ __all__ = [
     "manifest_sentence",
     "png",
     "recorded_sentence",
+    "write_cphd",
     "write_report",
     "write_sync_report",
 ]

@@ -17,6 +17,7 @@ import scipy
 from polysight.host.products import (
     CONVENTION,
     SavedProducts,
+    fresh_part,
     full_dataset,
     material_columns,
     read_processed,
@@ -75,7 +76,7 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
     /h, /v, /p complex64 [y, x], /valid bool [y, x], where known /p_sigma float32 [y, x]; /x, /y float64 in metres, the
     dimension scales of all of them; group /materials with a column for each of
     :func:`polysight.host.products.material_columns`; attributes scan_id, simulated, convention, verdict, and as JSON
-    verdict_reasons, config, versions; the JSON files under /documents.
+    verdict_reasons, config, versions; the JSON files under /documents. /entry shows the images by NeXus classes.
 
     Raises
     ------
@@ -83,7 +84,7 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
         when h5py is not installed.
     """
     h5py = _h5py()
-    part = path.with_name(f".{path.name}.part")
+    part = fresh_part(path)
     with h5py.File(part, "w") as f:
         axes = {"y": products.y_m, "x": products.x_m}
         for name, values in axes.items():
@@ -108,7 +109,30 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
             f.attrs[name] = value
         f.attrs["versions"] = json.dumps(products.scan.get("versions", {}))
         f.attrs["config"] = json.dumps(products.scan.get("instrument", {}))
+        _add_nexus(h5py, f, products)
     part.replace(path)
+
+
+def _add_nexus(h5py: Any, f: Any, products: SavedProducts) -> None:
+    """The same arrays by NeXus classes: NXentry with NXdata and NXinstrument, links to what is there already."""
+
+    def group(parent: Any, name: str, kind: str, **attributes: Any) -> Any:
+        made = parent.create_group(name)
+        made.attrs.update({"NX_class": kind, **attributes})
+        return made
+
+    f.attrs["NX_class"], f.attrs["default"] = "NXroot", "entry"
+    entry = group(f, "entry", "NXentry", default="image")
+    entry["title"], entry["entry_identifier"], entry["program_name"] = "polysight", products.scan_id, "polysight"
+    entry["program_name"].attrs["version"] = str(products.scan.get("versions", {}).get("polysight", ""))
+    if started := products.scan.get("started_utc"):
+        entry["start_time"] = str(started)
+    image = group(entry, "image", "NXdata", signal="p", auxiliary_signals=["h", "v"], axes=["y", "x"])
+    for name in (*_PLANES, "y", "x"):
+        if name in f:
+            image[name] = h5py.SoftLink(f"/{name}")
+    instrument = group(entry, "instrument", "NXinstrument")
+    instrument["name"] = "POLySIGHT, three AWR2243 radars on a stage"
 
 
 def _documents(products: SavedProducts) -> dict[str, dict[str, Any]]:
@@ -218,6 +242,16 @@ FORMATS = ("hdf5", "netcdf", "zarr", "mat", "png", "csv")
 _FOLDER = "export"
 
 
+def export_folder(folder: Path, out: Path | None) -> Path:
+    """The folder that is exported into, made: `out`, or one beside `folder`. Raises ConfigError for a link."""
+    if out is None:
+        out = folder.parent / f"{folder.name}-{_FOLDER}"
+        if out.is_symlink():
+            raise ConfigError(f"{out} is a link", "files would be replaced elsewhere", "give --out, or remove the link")
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
 def export(folder: Path, formats: list[str], out: Path | None) -> int:
     """Write the formats asked for; prints each file.
 
@@ -230,7 +264,7 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
         raise ConfigError(
             "nothing to export",
             "no format was named",
-            "add --hdf5, --netcdf, --zarr, --mat, --png or --csv, or several of them",
+            "add --hdf5, --netcdf, --zarr, --mat, --png, --csv or --cphd, or several of them",
         )
     products = read_products(folder)
     if "csv" in formats and not products.materials:
@@ -239,8 +273,7 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             "only images were made of this scan",
             "polysight process names them",
         )
-    out = out or products.folder.parent / f"{products.folder.name}-{_FOLDER}"
-    out.mkdir(parents=True, exist_ok=True)
+    out = export_folder(products.folder, out)
     written: list[Path] = []
     for kind in formats:
         if kind == "png":

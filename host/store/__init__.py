@@ -25,13 +25,14 @@ from polysight.host.store.scan_folder import (
 from polysight.host.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
 from polysight.host.store.sources.open import is_source, open_source
 from polysight.host.store.sources.published_settings import COLLECTION, mirrored, read_settings, rig_of
-from polysight.host.store.untrusted import inside, open_npz
+from polysight.host.store.untrusted import MOST_BYTES, check_links, inside, open_npz
 from polysight.host.store.validation import damaged_rows, to_json, validate
 
 __all__ = [
     "COLLECTION",
     "EVENTS",
     "MANIFEST",
+    "MOST_BYTES",
     "PART",
     "CubeRow",
     "Digests",
@@ -47,6 +48,7 @@ __all__ = [
     "Scan",
     "ScanFolder",
     "Source",
+    "check_links",
     "check_same_scan",
     "connection_of",
     "crc32",

@@ -11,6 +11,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from polysight.shared.errors import DeviceError
+from polysight.shared.files import open_to_write
 
 try:
     from zlib_ng.zlib_ng import crc32
@@ -46,7 +47,7 @@ class AppendFile:
         fresh = create and not path.exists()
         try:
             with ExitStack() as stack:
-                self._file = stack.enter_context(path.open("xb" if fresh else "r+b", buffering=0))
+                self._file = stack.enter_context(open_to_write(path, "xb" if fresh else "r+b", 0))
                 if fresh:
                     sync_folder(path.parent)
                 self.length = os.fstat(self._file.fileno()).st_size

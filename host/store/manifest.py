@@ -17,6 +17,7 @@ from typing import Any
 
 from polysight.host.store.append_only import AppendFile
 from polysight.shared.errors import DataError, DeviceError, PolysightError, no_such
+from polysight.shared.files import MOST_JSON_BYTES, read_bounded
 
 Fact = dict[str, Any]
 
@@ -96,7 +97,7 @@ def decode_line(line: bytes) -> Fact | None:
     """A line's fact without its CRC; None when the line is not one or its CRC is wrong."""
     try:
         fact = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(fact, dict) or not isinstance(fact.get("fact"), str):
         return None
@@ -162,7 +163,7 @@ def _compare(link: tuple[int, str], found: Manifest, due: int, number: int) -> N
 def read(path: Path) -> Manifest:
     """Read a manifest. Raises DataError when the file is absent or unreadable."""
     try:
-        return parse(path.read_bytes())
+        return parse(read_bounded(path, MOST_JSON_BYTES))
     except OSError as e:
         if not path.parent.exists():
             raise no_such(path.parent) from None

@@ -81,7 +81,7 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
                 path = scan.path / board.file
                 if not path.exists():
                     continue
-                if f"{crc32(path.read_bytes()):08x}" == board.crc32:
+                if path.stat().st_size == board.bytes and f"{crc32(path.read_bytes()):08x}" == board.crc32:
                     files.setdefault(row.row, {})[name] = path
                 else:
                     kept.append(f"{board.file}: not the bytes that were committed")

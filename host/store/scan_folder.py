@@ -23,7 +23,7 @@ from polysight.host.store import manifest
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact, Manifest, ManifestFault, ManifestWriter
 from polysight.host.store.source import RowData
-from polysight.host.store.untrusted import inside
+from polysight.host.store.untrusted import check_links, inside
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DataError, DeviceError
@@ -211,7 +211,9 @@ class ScanFolder:
 
     @staticmethod
     def load(path: Path) -> ScanFolder:
-        """Read a scan folder. Raises DataError or ConfigError when it is not one."""
+        """Read a scan folder. Raises DataError or ConfigError when it is not one, or links lead out of it."""
+        if (path / MANIFEST).exists():
+            check_links(path)
         return ScanFolder(path, manifest.read(path / MANIFEST))
 
     def reload(self) -> None:
@@ -321,12 +323,13 @@ class ScanFolder:
             )
         path = self.path / board.file
         try:
-            payload = np.fromfile(path, dtype=np.uint8)
+            size = path.stat().st_size
+            payload = np.fromfile(path, dtype=np.uint8, count=-1 if size == board.bytes else 0)
         except OSError as e:
             raise DataError(f"{path}: cannot be read: {e.strerror}", "the file was removed", self._remedy()) from None
         if payload.size != board.bytes or f"{crc32(payload.data):08x}" != board.crc32:
             raise DataError(
-                f"{path}: not the bytes that were committed ({payload.size} bytes, {board.bytes} expected)",
+                f"{path}: not the bytes that were committed ({size} bytes, {board.bytes} expected)",
                 "the file was changed, truncated or damaged after the scan",
                 self._remedy(),
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import numpy as np
 from polysight.host.capture import kind_of
 from polysight.shared.errors import DataError
 
+_MAY_BE_LINK = "products"
 MOST_BYTES = 2 << 30
 """Of arrays in one archive: a hundred times the images of the published scan."""
 
@@ -47,6 +49,48 @@ def inside(folder: Path, name: str, within: str = "") -> Path:
             "nothing there is read, written or removed; `polysight validate` a copy of the scan as it was recorded",
         )
     return path
+
+
+def check_links(folder: Path) -> None:
+    """Refuse a scan folder in which a link leads out of it, or in which there is a pipe or a device.
+
+    Only `products` may be a link: they are replaced as a whole, and only where products are.
+
+    Raises
+    ------
+    DataError
+        naming it.
+    """
+    root, left = folder.resolve(), [folder]
+    while left:
+        try:
+            with os.scandir(left.pop()) as entries:
+                for entry in entries:
+                    path = Path(entry.path)
+                    if entry.is_symlink():
+                        if path != folder / _MAY_BE_LINK and not _leads_into(path, root):
+                            raise _strange(folder, path, "is a link that leads out of it")
+                    elif entry.is_dir(follow_symlinks=False):
+                        left.append(path)
+                    elif not entry.is_file(follow_symlinks=False):
+                        raise _strange(folder, path, "is neither a file nor a folder")
+        except OSError:  # gone meanwhile, or not to be listed: whoever wants a file there says so
+            continue
+
+
+def _leads_into(link: Path, root: Path) -> bool:
+    try:
+        return link.resolve().is_relative_to(root)
+    except (OSError, RuntimeError):  # links in a circle
+        return False
+
+
+def _strange(folder: Path, path: Path, what: str) -> DataError:
+    return DataError(
+        f"{folder}: {path.relative_to(folder)} {what}",
+        "the folder was made by another program or changed: what is done with the scan would be done there",
+        f"nothing was read or written; remove it (rm '{path}'), or put what it leads to in its place",
+    )
 
 
 @contextmanager

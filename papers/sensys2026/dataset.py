@@ -35,6 +35,7 @@ from polysight.host.store import COLLECTION, open_npz, read_settings, rig_of
 from polysight.papers.sensys2026.table2 import Published, table2
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import DataError
+from polysight.shared.files import read_json
 from polysight.shared.geometry import incidence_deg
 
 T = TypeVar("T")
@@ -267,7 +268,7 @@ def row_of(name: str, thickness_mm: float | None = None) -> int | None:
 def read_names(path: Path) -> dict[str, int]:
     """A file that says what names mean: JSON, {their name: row of Table 2}. Raises DataError."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         given = {str(name): int(number) for name, number in content.items()}
     except (OSError, ValueError, AttributeError, TypeError) as e:
         raise DataError(f"{path}: not a list of names: {e}", 'expected JSON, {"their name": row of Table 2}') from None

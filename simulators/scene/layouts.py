@@ -67,6 +67,30 @@ def new_folder(path: Path) -> None:
     path.mkdir(parents=True, exist_ok=True)
 
 
+def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, str]]]:
+    """Copies in the scan of the files that `[calibration]` names; what they are, by kind."""
+    facts = {}
+    for kind, name in to_builtins(rig.calibration).items():
+        if not name:
+            continue
+        source, copy = Path(name), Path("calibration") / f"{kind}-{Path(name).name}"
+        try:
+            (path / copy).parent.mkdir(exist_ok=True)
+            (path / copy).write_bytes(source.read_bytes())
+            for images in source.parent.glob(f"{source.stem}.npz"):  # of a metal reference
+                (path / "calibration" / images.name).write_bytes(images.read_bytes())
+        except OSError as e:
+            raise DataError(
+                f"{source}: cannot be copied: {e.strerror}", f"calibration.{kind} names it", "correct or empty that key"
+            ) from None
+        facts[kind] = {
+            "file": str(copy),
+            "crc32": f"{crc32(source.read_bytes()):08x}",
+            "copied_from": str(source),
+        }
+    return {"calibration": facts} if facts else {}
+
+
 class OwnLayout:
     """A scan folder of this project: manifest.jsonl, events.msgpack, raw/<board>/<row>.bin and .idx."""
 
@@ -88,6 +112,7 @@ class OwnLayout:
             instrument=to_builtins(self._rig),
             plan=to_builtins(self._plan),
             versions=versions(),
+            **_calibration(self._rig, self._path),
         )
         self._event(RunStarted(plan=self._plan, **self._stamp()))
 

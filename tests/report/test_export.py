@@ -55,6 +55,19 @@ def folder(tmp_path):
     return made
 
 
+def test_hdf5_shows_the_images_by_nexus_classes(folder):
+    """What a NeXus reader follows: `default` from the root to a group whose `signal` and `axes` are in it."""
+    products = read_products(folder)
+    write_hdf5(folder / "image.h5", products)
+    with h5py.File(folder / "image.h5") as f:
+        entry = f[f.attrs["default"]]
+        data = entry[entry.attrs["default"]]
+        assert [x.attrs["NX_class"] for x in (f, entry, data)] == ["NXroot", "NXentry", "NXdata"]
+        assert (data[data.attrs["signal"]][:] == products.p).all()
+        assert data[data.attrs["signal"]].shape == tuple(data[axis].size for axis in data.attrs["axes"])
+        assert all((data[name][:] == getattr(products, name)).all() for name in data.attrs["auxiliary_signals"])
+
+
 def same_arrays(found, products):
     for name in ("h", "v", "p", "valid"):
         assert (np.asarray(found(name)) == getattr(products, name)).all()

@@ -4,22 +4,35 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import pickle
 import zipfile
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
-from polysight.host.capture import read_packets
+from polysight.host.calibration import of_scan
+from polysight.host.capture import read_index, read_packets
 from polysight.host.capture.packet_file import PACKETS, RUN
+from polysight.host.capture.segment import write_durably
+from polysight.host.cli.main import main
+from polysight.host.materials.labels import read_labels
 from polysight.host.materials.library import Library
 from polysight.host.materials.patch_files import read_patches
-from polysight.host.products.files import read_image
+from polysight.host.materials.published import read_material
+from polysight.host.materials.truth import read_truth
+from polysight.host.products.dataset_files import read_netcdf
+from polysight.host.products.files import SavedProducts, read_image, write_atomically
+from polysight.host.products.folder import making_products
+from polysight.host.store import manifest
 from polysight.host.store.raw import drop, droppable
 from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.store.sources.published_settings import read_json as read_settings_json
 from polysight.host.store.validation import validate
 from polysight.shared.config import load_instrument
-from polysight.shared.errors import ConfigError, DataError, PolysightError
+from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
 from tests.support.paths import RIG_FILE
 
 OUTSIDE = ["../victim.bin", "/etc/passwd", "raw/../../victim.bin", "raw/a\0b.bin", "", ".", "manifest.jsonl"]
@@ -57,8 +70,8 @@ def test_a_link_out_of_the_scan_is_refused(scan, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     (scan.path / "raw" / name).rename(elsewhere)
     (scan.path / "raw" / name).symlink_to(elsewhere)
-    with pytest.raises(DataError, match="outside"):
-        ScanFolder.load(scan.path).committed()
+    with pytest.raises(DataError, match="leads out"):
+        ScanFolder.load(scan.path)
 
 
 @pytest.mark.parametrize("name", ["../a", "a/b", "", ".", "..", ".hidden", "a\0b", "a" * 65])
@@ -126,3 +139,170 @@ def test_a_row_that_claims_to_be_larger_than_its_file_is_refused(scan):
     path.write_bytes(json.dumps(head).encode() + b"\n" + tail)
     with pytest.raises(PolysightError):
         read_packets(path, np.fromfile(scan.path / board.file, dtype=np.uint8))
+
+
+LINKS = ["manifest.jsonl", "events.msgpack", "raw/RH/0000.bin", "raw/RH/9999.idx", "samples", ".products.new", "x.part"]
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_a_scan_with_a_link_out_of_it_is_refused_before_anything_is_read_or_written(scan, tmp_path, name):
+    victim, link = tmp_path / "victim", scan.path / name
+    victim.mkdir()
+    (victim / "mine.txt").write_text("mine")
+    target = victim
+    if link.exists() and link.is_file():
+        target = link.rename(victim / "theirs")
+    before = {p: p.read_bytes() for p in victim.iterdir()}
+    link.symlink_to(target)
+    out = ["--out", str(tmp_path / "out")]
+    for command in (["resume"], ["process", *out], ["drop-raw", "--yes"], ["validate", "--replace"], ["focus", *out]):
+        assert main([command[0], str(scan.path), *command[1:]]) != 0
+    assert {p: p.read_bytes() for p in victim.iterdir()} == before
+
+
+def test_links_within_a_scan_and_of_its_products_folder_are_allowed(scan, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (scan.path / "products").symlink_to(tmp_path / "elsewhere")
+    (scan.path / "note").symlink_to("manifest.jsonl")
+    assert ScanFolder.load(scan.path).committed()
+
+
+def test_a_pipe_in_a_scan_keeps_nobody_waiting(scan):
+    os.mkfifo(scan.path / "raw" / "pipe")
+    with pytest.raises(DataError, match="raw/pipe"):
+        ScanFolder.load(scan.path)
+
+
+def test_what_a_link_leads_to_is_not_emptied_for_new_products(tmp_path):
+    victim, out = tmp_path / "victim", tmp_path / "products"
+    (victim / "folder").mkdir(parents=True)
+    (tmp_path / ".products.new").symlink_to(victim)
+    with pytest.raises(PolysightError), making_products(out, "scan"):
+        pass
+    assert (victim / "folder").is_dir()
+
+
+@pytest.mark.parametrize("write", [write_atomically, write_durably], ids=["products", "rows"])
+def test_nothing_is_written_through_a_link(write, tmp_path):
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"mine")
+    (tmp_path / "there").symlink_to(victim)
+    (tmp_path / ".there.part").symlink_to(victim)
+    with pytest.raises((OSError, DeviceError)):
+        write(tmp_path / "there", b"theirs")
+    assert victim.read_bytes() == b"mine"
+
+
+def begun_with(scan: ScanFolder, **told: object) -> Path:
+    """The scan's folder, whose first line says something else."""
+    first, *rest = (scan.path / "manifest.jsonl").read_bytes().splitlines(keepends=True)
+    fact = {**manifest.decode_line(first.rstrip()), **told}
+    (scan.path / "manifest.jsonl").write_bytes(manifest.encode_line(fact) + b"".join(rest))
+    return scan.path
+
+
+@pytest.mark.parametrize("file", ["../hpf.toml", "/etc/passwd"])
+def test_calibration_outside_the_scan_is_not_read(scan, file):
+    told = {"hpf": {"file": file, "crc32": "0", "copied_from": ""}}
+    with pytest.raises(DataError, match="outside"):
+        of_scan(ScanFolder.load(begun_with(scan, calibration=told)))
+
+
+def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
+    rig = scan.content.facts[0]["instrument"]
+    with pytest.raises(DataError, match="outside"):
+        of_scan(
+            ScanFolder.load(
+                begun_with(scan, instrument={**rig, "calibration": {"hpf": "/etc/passwd"}}, calibration=None)
+            )
+        )
+
+
+@pytest.mark.parametrize("told", ["text", ["a"], {"hpf": "a"}, {"hpf": {"file": 3}}])
+def test_a_manifest_with_another_form_of_calibration_is_refused(scan, told):
+    with pytest.raises(DataError, match="form"):
+        of_scan(ScanFolder.load(begun_with(scan, calibration=told)))
+
+
+def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
+    name, board = next(iter(scan.committed()[0].boards.items()))
+    os.truncate(scan.path / board.file, 1 << 42)  # a hole: the file takes no space, its bytes would
+    with pytest.raises(DataError, match=str(1 << 42)):
+        scan.read_row(name, 0)
+    assert board.file in str(droppable(scan, {name: {0: board.crc32}}).kept)
+
+
+@pytest.mark.parametrize("file", ["manifest.jsonl", "raw/{board}/0000.idx", "raw/{board}/0000.pkt"])
+def test_files_of_any_size_are_refused_before_they_are_read(scan, file):
+    board = next(iter(scan.committed()[0].boards))
+    path = scan.path / file.format(board=board)
+    os.truncate(path, 1 << 42)
+    for use in (manifest.read, read_index, lambda path: read_packets(path, np.zeros(8, np.uint8))):
+        with pytest.raises(DataError):
+            use(path)
+
+
+def test_a_packet_log_whose_numbers_overflow_is_refused(scan):
+    board = next(iter(scan.committed()[0].boards.values()))
+    path = (scan.path / board.file).with_suffix(PACKETS)
+    line, _, tail = path.read_bytes().partition(b"\n")
+    head = json.loads(line)
+    at = 16 * head["batches"]
+    runs = np.zeros(1 << 16, RUN)
+    runs["packets"], runs["size"] = 0xFFFFFFFF, 0x8000  # 2**63 bytes in all: 64 bits call that negative
+    head["runs"] = runs.size
+    path.write_bytes(json.dumps(head).encode() + b"\n" + tail[:at] + runs.tobytes())
+    with pytest.raises(DataError, match="more payload"):
+        read_packets(path, np.fromfile(scan.path / board.file, dtype=np.uint8))
+
+
+DEEP = "[" * 100_000
+
+
+@pytest.mark.parametrize(
+    "read", [read_index, read_truth, read_labels, read_settings_json, lambda p: SavedProducts(p.parent).quality]
+)
+def test_json_that_is_nested_too_deeply_is_refused(read, tmp_path):
+    (tmp_path / "quality.json").write_text(DEEP)
+    with pytest.raises(DataError):
+        read(tmp_path / "quality.json")
+    assert manifest.decode_line(DEEP.encode()) is None
+
+
+def test_toml_that_is_nested_too_deeply_is_refused(tmp_path):
+    (tmp_path / "rig.toml").write_text(f"a = {DEEP}")
+    with pytest.raises(ConfigError):
+        load_instrument(tmp_path / "rig.toml")
+
+
+def test_a_netcdf_file_that_claims_too_much_is_refused_by_its_size(tmp_path):
+    with h5py.File(tmp_path / "big.nc", "w") as f:
+        f.create_dataset("h_real", shape=(1 << 20, 1 << 20), dtype="f4", chunks=(1024, 1024), compression="gzip")
+    assert (tmp_path / "big.nc").stat().st_size < 1 << 20
+    with pytest.raises(DataError, match="bytes"):
+        read_netcdf(tmp_path / "big.nc")
+
+
+def external(f: h5py.File) -> None:
+    f.create_dataset("h", (4,), "u1", external=[("/etc/passwd", 0, 4)])
+
+
+def linked(f: h5py.File) -> None:
+    f["h"] = h5py.ExternalLink("/etc/other.h5", "/h")
+
+
+@pytest.mark.parametrize("make", [external, linked])
+def test_a_netcdf_file_with_arrays_in_other_files_is_refused(make, tmp_path):
+    with h5py.File(tmp_path / "a.nc", "w") as f:
+        make(f)
+    with pytest.raises(DataError, match="another file"):
+        read_netcdf(tmp_path / "a.nc")
+
+
+def test_a_pickle_whose_lists_are_one_list_is_refused_by_its_size(tmp_path):
+    row = [1.0] * 1000
+    one = [np.ones(1, np.complex64)] * 3
+    content = {"values": [[row] * 1000] * 3, "ref_values": one, "name": "a", "incident_angle": 55.0}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps({**content, "collection_name": "s", "ref_name": "m"}))
+    with pytest.raises(DataError, match="pixels"):
+        read_material(tmp_path / "a.pkl")

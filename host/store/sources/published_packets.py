@@ -133,6 +133,9 @@ def _numbers_by_line(path: Path, lines: list[str]) -> NDArray[np.float64]:
     return np.array(rows, np.float64).reshape(-1, 3)
 
 
+_MOST = 16  # rows' worth that a stream may span: what is not there is filled with zeros
+
+
 def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled: bool) -> Stream:
     """A row's stream from its file and its log.
 
@@ -152,6 +155,12 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     first = _first_sequence(log, shape, full, raw if zero_filled else None)
     start = (log.sequence - first) * full
     end = int(start[-1] + log.size[-1])
+    if end > _MOST * (shape.bytes + raw.size):
+        raise DataError(
+            f"{file}: its packet log spans {end} bytes, a row has {shape.bytes}",
+            "the numbers of its packets jump: a damaged log, or one of several rows",
+            "fetch both again",
+        )
     if not zero_filled and raw.size != log.size.sum():
         raise DataError(
             f"{file}: {raw.size} bytes, its packet log says {log.size.sum()}",

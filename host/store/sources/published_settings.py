@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
 
+from polysight.shared import files
 from polysight.shared.config import Board, Instrument, MountStep
 from polysight.shared.errors import DataError
 from polysight.shared.tables import decode
@@ -67,7 +67,7 @@ def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
     if missing_ok and not path.exists():
         return {}
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = files.read_json(path)
     except (OSError, ValueError) as e:
         raise DataError(f"{path}: not JSON: {e}", "the download is not complete", "fetch the file again") from None
     if not isinstance(content, dict):

@@ -1,0 +1,328 @@
+"""A scan's phase history as CPHD 1.1, the standard by which SAR processors take it (NGA.STND.0068, written by sarkit).
+
+The scene is laid on the equator where the Greenwich meridian meets it: the rig's origin has no place on the Earth. The
+object plane is the ground, the rig stands above it; x of the rig points east and y south, so that rig and Earth are
+right-handed alike. Bistatic: a channel a receiving antenna, a vector a stage position. Signals are of the domain FX
+with SGN = +1: an echo that comes later than one from the reference point by t turns by exp(+j 2 pi f t).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.host.products import fresh_part
+from polysight.host.store import versions
+from polysight.shared.errors import ConfigError
+from polysight.shared.units import SPEED_OF_LIGHT_M_S
+
+Floats = NDArray[np.float64]
+EARTH_RADIUS_M = 6_378_137.0
+"""WGS 84, at the equator."""
+NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
+_EACH = (
+    ("TxTime", 1), ("TxPos", 3), ("TxVel", 3), ("RcvTime", 1), ("RcvPos", 3), ("RcvVel", 3), ("SRPPos", 3),
+    ("aFDOP", 1), ("aFRR1", 1), ("aFRR2", 1), ("FX1", 1), ("FX2", 1), ("TOA1", 1), ("TOA2", 1), ("TDTropoSRP", 1),
+    ("SC0", 1), ("SCSS", 1), ("SIGNAL", 1),
+)  # fmt: skip
+"""Parameters of a vector, and how many words of 8 bytes each takes."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One receiving antenna: samples complex64 [vector, frequency], place [vector, 3] in metres, valid bool [vector].
+
+    Samples have the phase +2 pi f (path - direct path) / c of `direct_m`, metres; polarisation "H" or "V".
+    """
+
+    name: str
+    polarisation: str
+    samples: NDArray[np.complex64]
+    rx_m: Floats
+    direct_m: float
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class PhaseHistory:
+    """A scan as its rig frame has it; vectors in the order of time.
+
+    Attributes
+    ----------
+    channels
+        All receiving antennas.
+    time_s, tx_m, velocity_m_s
+        float64 [vector], [vector, 3], [vector, 3]: nominal time, place of the transmitting antenna, its velocity.
+    frequencies_hz
+        float64 [frequency], evenly spaced.
+    gate_m
+        Smallest and largest excess path that the samples hold.
+    centre_m
+        Middle of the image, on the object plane [3].
+    shape, pixel_m
+        Pixels of the image (ny, nx), and their distance.
+    """
+
+    scan_id: str
+    simulated: bool
+    started_utc: str
+    channels: Sequence[Channel]
+    time_s: Floats
+    tx_m: Floats
+    velocity_m_s: Floats
+    frequencies_hz: Floats
+    gate_m: tuple[float, float]
+    centre_m: Floats
+    shape: tuple[int, int]
+    pixel_m: float
+
+
+def to_earth(places_m: Floats, z_m: float, vector: bool = False) -> Floats:
+    """Places [..., 3] of the rig's frame as Earth-centred ones; object plane at `z_m`. A `vector` is only turned."""
+    x, y, z = np.moveaxis(np.asarray(places_m, np.float64), -1, 0)
+    up = -z if vector else EARTH_RADIUS_M + z_m - z
+    return np.stack([up, x, -y], axis=-1)
+
+
+def write_cphd(path: Path, history: PhaseHistory) -> None:
+    """Write the file. Raises ConfigError when sarkit is not installed, OSError when the disk fails."""
+    try:
+        cphd: Any = import_module("sarkit.cphd")
+        etree: Any = import_module("lxml.etree")
+    except ImportError:
+        raise ConfigError(
+            "CPHD needs the package sarkit, which is not installed",
+            "only this export uses it, so it is an extra",
+            "pip install 'polysight[export]', or pip install sarkit",
+        ) from None
+    vectors = {channel.name: _vectors(history, channel) for channel in history.channels}
+    root = etree.Element(f"{{{NAMESPACE}}}CPHD", nsmap={None: NAMESPACE})
+    _fill(etree, root, _tables(history, vectors))
+    tree = root.getroottree()
+    form = cphd.get_pvp_dtype(tree)
+    arrays = {}
+    for name, columns in vectors.items():
+        arrays[name] = np.zeros(history.time_s.size, form)
+        for key, values in columns.items():
+            arrays[name][key] = values
+    first = history.channels[0].name
+    where = next(k for k, child in enumerate(root) if child.tag.endswith("}Dwell")) + 1
+    root.insert(where, cphd.compute_reference_geometry(tree, arrays[first]))
+    part = fresh_part(path)
+    with part.open("wb") as file, cphd.Writer(file, cphd.Metadata(xmltree=tree)) as writer:
+        for channel in history.channels:
+            writer.write_signal(channel.name, _signal(history, channel))
+            writer.write_pvp(channel.name, arrays[channel.name])
+    part.replace(path)
+
+
+def _reference_path_m(history: PhaseHistory, channel: Channel) -> Floats:
+    """Path from TX over the scene's middle to the receiving antenna, [vector]."""
+    out = np.linalg.norm(history.tx_m - history.centre_m, axis=1)
+    return out + np.linalg.norm(channel.rx_m - history.centre_m, axis=1)
+
+
+def _signal(history: PhaseHistory, channel: Channel) -> NDArray[np.complex64]:
+    """Samples whose phase counts from the scene's middle, in place of the direct path."""
+    later = (channel.direct_m - _reference_path_m(history, channel)) / SPEED_OF_LIGHT_M_S
+    turned = channel.samples * np.exp(2j * np.pi * np.outer(later, history.frequencies_hz))
+    return turned.astype(np.complex64)
+
+
+def _vectors(history: PhaseHistory, channel: Channel) -> dict[str, Any]:
+    """Parameters of each vector of a channel. Vectors without data have SIGNAL 0."""
+    c, f, z = SPEED_OF_LIGHT_M_S, history.frequencies_hz, float(history.centre_m[2])
+    path = _reference_path_m(history, channel)
+    toa = (np.array(history.gate_m)[:, None] + channel.direct_m - path) / c
+    rate = sum(
+        np.sum((p - history.centre_m) * history.velocity_m_s, axis=1) / np.linalg.norm(p - history.centre_m, axis=1)
+        for p in (history.tx_m, channel.rx_m)
+    )
+    velocity = to_earth(history.velocity_m_s, z, vector=True)
+    return {
+        "TxTime": history.time_s,
+        "TxPos": to_earth(history.tx_m, z),
+        "TxVel": velocity,
+        "RcvTime": history.time_s + path / c,
+        "RcvPos": to_earth(channel.rx_m, z),
+        "RcvVel": velocity,
+        "SRPPos": to_earth(history.centre_m, z),
+        "aFDOP": -rate / c,
+        "aFRR1": 0.0,
+        "aFRR2": 0.0,
+        "FX1": f[0],
+        "FX2": f[-1],
+        "TOA1": toa[0],
+        "TOA2": toa[1],
+        "TDTropoSRP": 0.0,
+        "SC0": f[0],
+        "SCSS": f[1] - f[0],
+        "SIGNAL": channel.valid.astype(np.int64),
+    }
+
+
+def _tables(history: PhaseHistory, vectors: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """All of the XML but the reference geometry, in the order of the schema."""
+    f, t = history.frequencies_hz, history.time_s
+    toa = [np.min([v["TOA1"] for v in vectors.values()]), np.max([v["TOA2"] for v in vectors.values()])]
+    return {
+        "CollectionID": {
+            "CollectorName": "polysight",
+            "IlluminatorName": "polysight",
+            "CoreName": history.scan_id,
+            "CollectType": "BISTATIC",
+            "RadarMode": {"ModeType": "SPOTLIGHT"},
+            "Classification": "UNCLASSIFIED",
+            "ReleaseInfo": "UNRESTRICTED",
+            "Parameter": [
+                {"@name": "simulated", "#": str(history.simulated).lower()},
+                {"@name": "place", "#": "a laboratory: latitude, longitude and height are not where it is"},
+                {"@name": "samples", "#": "range-gated, Hann-weighted over the sweep, direct path taken out"},
+            ],
+        },
+        "Global": {
+            "DomainType": "FX",
+            "SGN": "+1",
+            "Timeline": {"CollectionStart": history.started_utc, "TxTime1": t.min(), "TxTime2": t.max()},
+            "FxBand": {"FxMin": f[0], "FxMax": f[-1]},
+            "TOASwath": {"TOAMin": toa[0], "TOAMax": toa[1]},
+        },
+        "SceneCoordinates": _scene(history),
+        "Data": _sizes(history),
+        "Channel": {
+            "RefChId": history.channels[0].name,
+            "FXFixedCPHD": True,
+            "TOAFixedCPHD": False,
+            "SRPFixedCPHD": True,
+            "Parameters": [_channel(history, c, vectors[c.name]) for c in history.channels],
+        },
+        "PVP": _layout(),
+        "Dwell": {
+            "NumCODTimes": 1,
+            "CODTime": {"Identifier": "all", "CODTimePoly": _constant(float(t.min() + t.max()) / 2)},
+            "NumDwellTimes": 1,
+            "DwellTime": {"Identifier": "all", "DwellTimePoly": _constant(float(np.ptp(t)))},
+        },
+        "ProductInfo": {
+            "CreationInfo": {
+                "Application": f"polysight {versions()['polysight']}",
+                "DateTime": history.started_utc,
+            }
+        },
+    }
+
+
+def _scene(history: PhaseHistory) -> dict[str, Any]:
+    """Where the object plane is: x of the image area points along the rig's y."""
+    centre, z = history.centre_m, float(history.centre_m[2])
+    (ny, nx), pixel = history.shape, history.pixel_m
+    x, y = nx * pixel / 2, ny * pixel / 2
+    corners = [(-y, -x), (-y, x), (y, x), (y, -x)]  # (along IAX, along IAY), clockwise from above
+    places = [to_earth(centre + np.array([b, a, 0.0]), z) for a, b in corners]
+    degrees = [np.degrees([np.arctan2(p[2], p[0]), np.arctan2(p[1], p[0])]) for p in (to_earth(centre, z), *places)]
+    return {
+        "EarthModel": "WGS_84",
+        "IARP": {
+            "ECF": _xyz(to_earth(centre, z)),
+            "LLH": {"Lat": degrees[0][0], "Lon": degrees[0][1], "HAE": 0.0},
+        },
+        "ReferenceSurface": {
+            "Planar": {
+                "uIAX": _xyz(to_earth(np.array([0.0, 1.0, 0.0]), 0, vector=True)),
+                "uIAY": _xyz(to_earth(np.array([1.0, 0.0, 0.0]), 0, vector=True)),
+            }
+        },
+        "ImageArea": {
+            "X1Y1": {"X": -y, "Y": -x},
+            "X2Y2": {"X": y, "Y": x},
+        },
+        "ImageAreaCornerPoints": {
+            "IACP": [{"@index": k, "Lat": at[0], "Lon": at[1]} for k, at in enumerate(degrees[1:], 1)]
+        },
+        "ImageGrid": {
+            "IARPLocation": {"Line": (ny - 1) / 2, "Sample": (nx - 1) / 2},
+            "IAXExtent": {"LineSpacing": pixel, "FirstLine": 0, "NumLines": ny},
+            "IAYExtent": {"SampleSpacing": pixel, "FirstSample": 0, "NumSamples": nx},
+        },
+    }
+
+
+def _sizes(history: PhaseHistory) -> dict[str, Any]:
+    vectors, samples = history.time_s.size, history.frequencies_hz.size
+    words = sum(size for _, size in _EACH)
+    return {
+        "SignalArrayFormat": "CF8",
+        "NumBytesPVP": 8 * words,
+        "NumCPHDChannels": len(history.channels),
+        "Channel": [
+            {
+                "Identifier": channel.name,
+                "NumVectors": vectors,
+                "NumSamples": samples,
+                "SignalArrayByteOffset": k * vectors * samples * 8,
+                "PVPArrayByteOffset": k * vectors * 8 * words,
+            }
+            for k, channel in enumerate(history.channels)
+        ],
+        "NumSupportArrays": 0,
+    }
+
+
+def _channel(history: PhaseHistory, channel: Channel, columns: Mapping[str, Any]) -> dict[str, Any]:
+    f = history.frequencies_hz
+    good = np.flatnonzero(channel.valid)
+    return {
+        "Identifier": channel.name,
+        "RefVectorIndex": int(good[good.size // 2]) if good.size else 0,
+        "FXFixed": True,
+        "TOAFixed": bool(np.ptp(columns["TOA1"]) == 0),
+        "SRPFixed": True,
+        "SignalNormal": bool(channel.valid.all()),
+        "Polarization": {"TxPol": "UNSPECIFIED", "RcvPol": channel.polarisation},
+        "FxC": (f[0] + f[-1]) / 2,
+        "FxBW": f[-1] - f[0],
+        "TOASaved": columns["TOA2"].max() - columns["TOA1"].min(),
+        "DwellTimes": {"CODId": "all", "DwellId": "all"},
+    }
+
+
+def _layout() -> dict[str, Any]:
+    out, offset = {}, 0
+    for name, size in _EACH:
+        form = {1: "F8", 3: "X=F8;Y=F8;Z=F8;"}[size] if name != "SIGNAL" else "I8"
+        out[name] = {"Offset": offset, "Size": size, "Format": form}
+        offset += size
+    return out
+
+
+def _constant(value: float) -> dict[str, Any]:
+    return {"@order1": 0, "@order2": 0, "Coef": {"@exponent1": 0, "@exponent2": 0, "#": value}}
+
+
+def _xyz(place: Floats) -> dict[str, float]:
+    return dict(zip("XYZ", map(float, place), strict=True))
+
+
+def _fill(etree: Any, node: Any, content: Any) -> None:
+    """Put content into an element: tables as children, lists as repeated children, `@` attributes, `#` the text."""
+    if not isinstance(content, dict):
+        node.text = str(content).lower() if isinstance(content, bool) else _number(content)
+        return
+    for name, value in content.items():
+        if name.startswith("@"):
+            node.set(name[1:], str(value))
+        elif name == "#":
+            node.text = _number(value)
+        else:
+            for one in value if isinstance(value, list) else [value]:
+                _fill(etree, etree.SubElement(node, f"{{{NAMESPACE}}}{name}"), one)
+
+
+def _number(value: Any) -> str:
+    return repr(float(value)) if isinstance(value, float | np.floating) else str(value)

@@ -52,20 +52,19 @@ def _check(args: argparse.Namespace, instrument: Instrument) -> int:
 
 def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller import realtime
+    from polysight.pi_controller.bursts import BurstSpec, send_bursts
     from polysight.pi_controller.client import refuse_beside_service
-    from polysight.pi_controller.lines import BurstSpec
+    from polysight.pi_controller.lines import open_lines
     from polysight.pi_controller.service import log
-    from polysight.pi_controller.trigger import send_bursts
-    from polysight.pi_controller.wiring import open_lines
 
     refuse_beside_service(instrument)
-    lines = open_lines(instrument, args.wires, log)
+    lines = open_lines(instrument, args.wires)
     try:
         if args.wires is None:
             for sentence in dict.fromkeys(realtime.prepare_process() + realtime.prepare_thread()):  # each once
                 log(sentence)
-        spec = BurstSpec.of(instrument.burst, check_width=False)
-        records = send_bursts(lines, spec, args.count, round(args.pause_ms * 1e6))
+        lines.check_width = False  # it is told below
+        records = send_bursts(lines, BurstSpec.of(instrument.burst), args.count, round(args.pause_ms * 1e6))
     finally:
         lines.close()
     width, jitter = max(r.width_max_ns for r in records), max(r.jitter_ns for r in records)

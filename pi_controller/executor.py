@@ -14,14 +14,14 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from polysight.pi_controller.bursts import BurstSpec
 from polysight.pi_controller.journal import JournalFullError
 from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.lines import BurstSpec
 from polysight.pi_controller.row_machine import RowMachine
 from polysight.pi_controller.rows import RefusedError, check_pulses, check_run, row_of
 from polysight.pi_controller.stage import StageDriver
 from polysight.pi_controller.stage_link import StageLost, StageNews
-from polysight.pi_controller.trigger import BenchBurst, BurstSent, LoopFault, TriggerLoop
+from polysight.pi_controller.trigger import BurstSent, LoopFault, TriggerLoop
 from polysight.shared import messages as m
 from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.faults import PiFault, explain
@@ -67,8 +67,7 @@ def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refuse
 class Executor:
     """Runs in a thread of its own; :meth:`post` and :attr:`snapshot` are for all threads.
 
-    With `check_width` a pulse that may have been too long is a fault (no hardware one-shot). `turned` is called with
-    every turn, once a second at least: it feeds the watchdog.
+    `turned` is called with every turn, once a second at least: it feeds the watchdog.
     """
 
     def __init__(
@@ -76,10 +75,9 @@ class Executor:
         stage: StageDriver,
         loop: TriggerLoop,
         ledger: Ledger,
-        check_width: bool = True,
         turned: Callable[[], None] = lambda: None,
     ) -> None:
-        self._loop, self._ledger, self._check_width, self._turned = loop, ledger, check_width, turned
+        self._loop, self._ledger, self._turned = loop, ledger, turned
         self.take_over_key = secrets.token_hex(16)  # an owner that every run obeys: of the person at the Pi
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -107,7 +105,7 @@ class Executor:
 
     # --- for other threads ------------------------------------------------------------------------------------------
 
-    def post(self, item: Request | StageNews | BurstSent | BenchBurst | LoopFault | Callable[[], object]) -> None:
+    def post(self, item: Request | StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
         """Hand something over; returns at once. Lines of the stage that find too many waiting are lost."""
         if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
             return  # what a row or homing waits for is asked again
@@ -191,8 +189,8 @@ class Executor:
         machine, row = self._machine, self._machine.row
         if isinstance(item, BurstSent):
             machine.take_burst(item)
-        elif isinstance(item, BenchBurst):
-            self._answer_pulses(item.told())
+        elif isinstance(item, m.Pulsed):
+            self._answer_pulses(item)
         elif isinstance(item, LoopFault):
             machine.take_loop_fault(item)
             self._answer_pulses(refused(item.number, item.detail))  # every request gets a reply
@@ -273,7 +271,7 @@ class Executor:
         self._machine.require("Pulse")
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
-        spec = check_pulses(command.pulses, command.period_us, command.width_us, self._check_width)
+        spec = check_pulses(command.pulses, command.period_us, command.width_us)
         if spec.pulses * spec.period_ns > m.MOST_PULSES_S * 1e9:
             lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MOST_PULSES_S:g} s"
             raise RefusedError(PiFault.NOT_READY, lasts, "the lines are busy meanwhile", "ask for fewer pulses")
@@ -345,7 +343,7 @@ class Executor:
         return self._accept("RunRow", row, command.take, self._burst_of(run), run.speed_mm_s)
 
     def _burst_of(self, run: m.BeginRun) -> BurstSpec:
-        return BurstSpec(run.pulses, us_to_ns(run.period_us), us_to_ns(run.width_us), self._check_width)
+        return BurstSpec(run.pulses, us_to_ns(run.period_us), us_to_ns(run.width_us))
 
     def _row_ended(self, row: tuple[int, int]) -> None:
         self._last_row = row

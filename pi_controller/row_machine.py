@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from polysight.pi_controller.bursts import BurstSpec
 from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.lines import BurstSpec
 from polysight.pi_controller.machine import END_LIMIT_S, Machine
 from polysight.pi_controller.rows import RefusedError, row_duration_s, stage_row
 from polysight.pi_controller.stage import MOST_MM, StageDriver
 from polysight.pi_controller.stage_link import StageLostError, StageRefusedError
-from polysight.pi_controller.trigger import BurstSent, Counts, LoopFault, RowJob, TriggerLoop, TriggerWatch
+from polysight.pi_controller.trigger import BurstSent, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight.shared import messages as m
 from polysight.shared.errors import ProtocolError
 from polysight.shared.faults import PiFault, StageError, explain
@@ -38,7 +38,7 @@ class RunningRow:
 
     row: Row
     take: int
-    job: RowJob
+    job: Job
     sequence: int  # of the stage's ROW, and of its `done`
     status: m.RowStatus | None = None
     fault: int = 0
@@ -87,7 +87,7 @@ class RowMachine(Machine):
     def take_burst(self, sent: BurstSent) -> None:
         """A burst has ended."""
         row, r = self.row, sent.record
-        if row is None or sent.job != row.job or not r.pulses:
+        if row is None or sent.job is not row.job or not r.pulses:
             return
         self.emit(
             m.Capture, row_index=row.row.index, take=row.take, point=sent.point, column=row.row.column(sent.point),
@@ -103,7 +103,7 @@ class RowMachine(Machine):
         if fault.job is None:
             self._lines_dead = True
             self.happen("lasting fault", fault.number, fault.detail)
-        elif self.row is not None and fault.job == self.row.job:
+        elif self.row is not None and fault.job is self.row.job:
             self.happen("row fault", fault.number, fault.detail)
 
     def take_stage(self, reply: Reply) -> None:
@@ -193,7 +193,7 @@ class RowMachine(Machine):
         self.in_run = False
 
     def _start_row(self, row: Row, take: int, spec: BurstSpec, speed_mm_s: float) -> None:
-        job = self._loop.arm(RowJob(row.index, take, row.points, spec))
+        job = self._loop.arm(row.points, spec)
         try:
             sequence = self.stage.row(stage_row(row, self.stage.config, speed_mm_s))
         except StageRefusedError as e:
@@ -317,7 +317,7 @@ class RowMachine(Machine):
                 self._tell_fault(row.fault, row.reason)
         self.emit(
             m.RowFinished, row_index=row.row.index, take=row.take, status=row.status, points=row.points,
-            **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by(row.job.spec),
+            **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by,
         )  # fmt: skip
         self.row = None
         return "fault" if row.lasting else "ready" if self.homed else "idle"

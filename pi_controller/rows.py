@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from polysight.pi_controller.lines import BurstSpec
+from polysight.pi_controller.bursts import BurstSpec
 from polysight.shared.config import Stage
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain
@@ -83,14 +83,14 @@ def check_run(run: BeginRun, stage: Stage) -> None:
     _require(not misfit, misfit)
 
 
-def check_pulses(pulses: int, period_us: float, width_us: float, check_width: bool = True) -> BurstSpec:
+def check_pulses(pulses: int, period_us: float, width_us: float) -> BurstSpec:
     """The burst, where the radars take it. Raises RefusedError PERIOD_TOO_SHORT or PULSE_TOO_LONG."""
     period_ns, width_ns = us_to_ns(period_us), us_to_ns(width_us)
     if period_ns < MIN_PERIOD_NS:
         raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {period_us} us is below {MIN_PERIOD_US} us")
     if not MIN_WIDTH_NS <= width_ns <= MAX_WIDTH_NS:
         raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {width_us} us is outside {WIDTH_TEXT}")
-    return BurstSpec(pulses, period_ns, width_ns, check_width)
+    return BurstSpec(pulses, period_ns, width_ns)
 
 
 def row_of(plan: RasterPlan, index: int) -> Row:

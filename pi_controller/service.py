@@ -10,18 +10,19 @@ from functools import partial
 from pathlib import Path
 
 from polysight.pi_controller import realtime
+from polysight.pi_controller.bursts import Lines
 from polysight.pi_controller.executor import Executor
 from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, JournalFullError
 from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.lines import TriggerLines
+from polysight.pi_controller.lines import open_lines
 from polysight.pi_controller.memory import MemoryWatch
 from polysight.pi_controller.server import Server
 from polysight.pi_controller.stage import StageDriver
 from polysight.pi_controller.stage_link import StageNews
-from polysight.pi_controller.trigger import BenchBurst, BurstSent, LoopFault, TriggerLoop
-from polysight.pi_controller.wiring import open_lines
+from polysight.pi_controller.trigger import BurstSent, LoopFault, TriggerLoop
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
+from polysight.shared.messages import Pulsed
 
 END_LIMIT_S = 0.8
 
@@ -52,12 +53,12 @@ class Service:
         when an address, a line, the journal or the stage cannot be had. What was opened before is closed again.
     """
 
-    def __init__(self, instrument: Instrument, options: Options, lines: TriggerLines | None = None) -> None:
+    def __init__(self, instrument: Instrument, options: Options, lines: Lines | None = None) -> None:
         pi, simulated = instrument.pi, options.wires is not None
         with ExitStack() as opened:
             folder = JournalFolder(options.journal or Path(pi.journal_dir))
             opened.callback(folder.close)
-            lines = lines or open_lines(instrument, options.wires, log)
+            lines = lines or open_lines(instrument, options.wires)
             # What is not permitted to its thread was not permitted to the process, which has said so.
             prepare = (lambda: None) if simulated else realtime.prepare_thread
             self._loop = TriggerLoop(lines, self._post, prepare)
@@ -70,12 +71,12 @@ class Service:
             stage = StageDriver(instrument.stage, options.stage_port or instrument.stage.port, self._post)
             opened.callback(stage.close)
             turned = partial(realtime.notify_systemd, "WATCHDOG=1")
-            self.executor = Executor(stage, self._loop, self._ledger, not pi.one_shot, turned)
+            self.executor = Executor(stage, self._loop, self._ledger, turned)
             folder.write_secret(TAKE_OVER_KEY, self.executor.take_over_key)
             stage.connect()
             self._opened = opened.pop_all()
 
-    def _post(self, item: StageNews | BurstSent | BenchBurst | LoopFault) -> None:
+    def _post(self, item: StageNews | BurstSent | Pulsed | LoopFault) -> None:
         self.executor.post(item)
 
     def _close_ledger(self) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.pi_controller.lines import BurstSpec, Edge
+from polysight.pi_controller.bursts import BurstSpec, Edge
 from polysight.pi_controller.machine import LIMITS_S, RULES, TOLD, State
 from polysight.pi_controller.row_machine import RowMachine
 from polysight.pi_controller.rows import RefusedError

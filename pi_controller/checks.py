@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 
 import zmq
 
-from polysight.pi_controller import AS_THE_SERVICE, realtime
+from polysight.pi_controller import AS_THE_SERVICE, system
 from polysight.pi_controller.bursts import SHORTEST_PART, BurstSpec, spi_burst
-from polysight.pi_controller.journal import JournalFolder
+from polysight.pi_controller.journal import Journal
 from polysight.pi_controller.lines import (
     GpiodLines,
     SpiDevice,
@@ -84,7 +84,7 @@ def _wires(instrument: Instrument, wires: Path) -> str:
 
 def _real_time() -> Finding:
     """Ask for what the service asks for: the widths are measured with the same rights."""
-    refused = dict.fromkeys(realtime.prepare_process() + realtime.prepare_thread())
+    refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
     if refused:
         remedy = "the unit gives both rights (LimitRTPRIO, LimitMEMLOCK); a shell lacks them"
         return Finding("real time", "warn", "; ".join(refused), remedy)
@@ -98,7 +98,7 @@ def _stage(instrument: Instrument, port: str) -> str:
 
 
 def _journal(path: Path, needed: int) -> str:
-    JournalFolder(path).close()
+    Journal(path).close()
     free = shutil.disk_usage(path).free
     if free < needed:
         wanted = f"{path}: {free >> 20} MiB free, {needed >> 20} MiB wanted"

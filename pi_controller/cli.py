@@ -51,7 +51,7 @@ def _check(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
-    from polysight.pi_controller import realtime
+    from polysight.pi_controller import system
     from polysight.pi_controller.bursts import BurstSpec, send_bursts
     from polysight.pi_controller.client import refuse_beside_service
     from polysight.pi_controller.lines import open_lines
@@ -61,7 +61,7 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     lines = open_lines(instrument, args.wires)
     try:
         if args.wires is None:
-            for sentence in dict.fromkeys(realtime.prepare_process() + realtime.prepare_thread()):  # each once
+            for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):  # each once
                 log(sentence)
         lines.check_width = False  # it is told below
         records = send_bursts(lines, BurstSpec.of(instrument.burst), args.count, round(args.pause_ms * 1e6))

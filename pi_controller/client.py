@@ -12,7 +12,7 @@ import msgspec
 import zmq
 
 from polysight.pi_controller import AS_THE_SERVICE
-from polysight.pi_controller.journal import TAKE_OVER_KEY
+from polysight.pi_controller.service import TAKE_OVER_KEY
 from polysight.pi_controller.stage import MOTION_LIMIT_S
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument

@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from polysight.pi_controller import realtime
+from polysight.pi_controller import system
 from polysight.pi_controller.bursts import Lines
 from polysight.pi_controller.executor import Executor
-from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, JournalFullError
-from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.journal import Journal, JournalFullError
 from polysight.pi_controller.lines import open_lines
-from polysight.pi_controller.memory import MemoryWatch
 from polysight.pi_controller.server import Server
 from polysight.pi_controller.stage import StageDriver
-from polysight.pi_controller.stage_link import StageNews
-from polysight.pi_controller.trigger import BurstSent, LoopFault, TriggerLoop
+from polysight.pi_controller.trigger import TriggerLoop
 from polysight.shared.config import Instrument
-from polysight.shared.errors import DeviceError
-from polysight.shared.messages import Pulsed
+from polysight.shared.errors import ConfigError, DeviceError
 
 END_LIMIT_S = 0.8
+TAKE_OVER_KEY = "take-over-key"  # file beside the journals: owner of every run, for the person at the Pi
 
 
 @dataclass(frozen=True)
@@ -55,41 +54,32 @@ class Service:
 
     def __init__(self, instrument: Instrument, options: Options, lines: Lines | None = None) -> None:
         pi, simulated = instrument.pi, options.wires is not None
+        folder = options.journal or Path(pi.journal_dir)
         with ExitStack() as opened:
-            folder = JournalFolder(options.journal or Path(pi.journal_dir))
-            opened.callback(folder.close)
+            journal = Journal(folder, lambda events: self.server.publish(events), log)
+            opened.callback(_close, journal)
             lines = lines or open_lines(instrument, options.wires)
             # What is not permitted to its thread was not permitted to the process, which has said so.
-            prepare = (lambda: None) if simulated else realtime.prepare_thread
-            self._loop = TriggerLoop(lines, self._post, prepare)
+            self._loop = TriggerLoop(lines, self._post, (lambda: None) if simulated else system.prepare_thread)
             opened.callback(self._loop.stop)
             addresses = options.command_address or pi.command_address, options.event_address or pi.event_address
-            self.server = Server(*addresses, Path(pi.key_dir), pi.heartbeat_ms, lines.name)
+            self.server = Server(*addresses, Path(pi.key_dir), pi.heartbeat_ms)
             opened.callback(self.server.close)
-            self._ledger = Ledger(folder, self.server.publish, log)
-            opened.callback(self._close_ledger)
             stage = StageDriver(instrument.stage, options.stage_port or instrument.stage.port, self._post)
             opened.callback(stage.close)
-            turned = partial(realtime.notify_systemd, "WATCHDOG=1")
-            self.executor = Executor(stage, self._loop, self._ledger, turned)
-            folder.write_secret(TAKE_OVER_KEY, self.executor.take_over_key)
+            self.executor = Executor(stage, self._loop, journal, partial(system.notify_systemd, "WATCHDOG=1"))
+            _write_secret(folder / TAKE_OVER_KEY, self.executor.take_over_key)
             stage.connect()
             self._opened = opened.pop_all()
 
-    def _post(self, item: StageNews | BurstSent | Pulsed | LoopFault) -> None:
+    def _post(self, item: Any) -> None:
         self.executor.post(item)
-
-    def _close_ledger(self) -> None:
-        try:
-            self._ledger.close()
-        except JournalFullError as e:
-            log(str(e))
 
     def serve(self) -> None:
         """Serve until :meth:`stop`; then stop the stage and end the row. Raises DeviceError when a part failed."""
         self._loop.start()
         self.executor.start()
-        memory = MemoryWatch(self.server.ports, log)
+        memory = system.MemoryWatch(self.server.ports, log)
         memory.start()
         self.server.run(self.executor)
         memory.stop()
@@ -110,15 +100,32 @@ class Service:
         self._opened.close()
 
 
+def _close(journal: Journal) -> None:
+    try:
+        journal.close()
+    except JournalFullError as e:
+        log(str(e))
+
+
+def _write_secret(path: Path, secret: str) -> None:
+    """Write a file that this program's user alone can read. Raises ConfigError."""
+    try:
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as file:
+            file.write(secret)
+    except OSError as e:
+        raise ConfigError(f"{path}: {e.strerror}", "the disk is full or read-only", "free space there") from None
+
+
 def run(instrument: Instrument, options: Options) -> int:
     """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout when it serves.
 
     Raises ConfigError or DeviceError when it cannot start.
     """
     if options.wires is not None:
-        realtime.die_with_parent(signal.SIGTERM)
+        system.die_with_parent(signal.SIGTERM)
     else:
-        for sentence in realtime.prepare_process():
+        for sentence in system.prepare_process():
             log(sentence)
     service = Service(instrument, options)
     try:
@@ -126,7 +133,7 @@ def run(instrument: Instrument, options: Options) -> int:
             signal.signal(number, lambda *_: service.stop())
         sys.stdout.write(f"ready {service.server.command_address}\nevents {service.server.event_address}\n")
         sys.stdout.flush()
-        realtime.notify_systemd("READY=1")
+        system.notify_systemd("READY=1")
         service.serve()
     finally:
         service.close()

@@ -91,6 +91,7 @@ class TriggerLoop:
         self._last_rise_ns: int | None = None
         self._busy_until_ns = self.strays = 0
         self.counts = Counts()
+        self.backend = lines.name
         self.timed_by: Timing = "program" if lines.check_width else "one-shot"
         if isinstance(lines, BitLines):
             self.timed_by = "spi"

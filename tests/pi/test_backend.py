@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from polysight.pi_controller import lines as pi_lines
-from polysight.pi_controller import realtime
+from polysight.pi_controller import system
 from polysight.pi_controller.lines import GpiodLines, SpiLines
 from polysight.pi_controller.service import Options, Service
 from polysight.pi_controller.sim_lines import WireLines
@@ -42,7 +42,7 @@ def test_hello_tells_the_lines_that_are_driven(instrument, stage, hub, monkeypat
     monkeypatch.setattr(pi_lines, "GpiodLines", standing_in(GpiodLines))
     monkeypatch.setattr(pi_lines, "SpiLines", standing_in(SpiLines))
     monkeypatch.setattr(pi_lines, "load_gpiod", lambda: None)
-    monkeypatch.setattr(realtime, "prepare_thread", list)
+    monkeypatch.setattr(system, "prepare_thread", list)
     running = Service(rig, Options(wires=hub if simulated else None, stage_port=stage.port))
     thread = threading.Thread(target=running.serve)
     thread.start()

@@ -157,8 +157,8 @@ def test_spi_that_is_off_is_told(rig, tmp_path):
 
 
 def test_rights_that_are_missing(monkeypatch):
-    monkeypatch.setattr(checks.realtime, "prepare_process", lambda: ["no real-time scheduling", "memory is not locked"])
-    monkeypatch.setattr(checks.realtime, "prepare_thread", lambda: ["no real-time scheduling"])
+    monkeypatch.setattr(checks.system, "prepare_process", lambda: ["no real-time scheduling", "memory is not locked"])
+    monkeypatch.setattr(checks.system, "prepare_thread", lambda: ["no real-time scheduling"])
     found = checks._real_time()
     assert (found.verdict, found.found) == ("warn", "no real-time scheduling; memory is not locked")
     assert "LimitRTPRIO" in found.remedy

@@ -175,8 +175,8 @@ def test_pulse_says_why_it_did_not_work(config, monkeypatch, capsys):
     late = BurstRecord(2, 0, 1, 2, 1000, 900, PiFault.PERIOD_TOO_SHORT)
     monkeypatch.setattr("polysight.pi_controller.lines.open_lines", lambda *_: FakeLines())
     monkeypatch.setattr("polysight.pi_controller.bursts.send_bursts", lambda *_: [late, late._replace(fault=0), late])
-    monkeypatch.setattr("polysight.pi_controller.realtime.prepare_process", list)
-    monkeypatch.setattr("polysight.pi_controller.realtime.prepare_thread", list)
+    monkeypatch.setattr("polysight.pi_controller.system.prepare_process", list)
+    monkeypatch.setattr("polysight.pi_controller.system.prepare_thread", list)
     assert main(["pulse", "--config", str(config)]) == 1
     said = capsys.readouterr().err
     assert "fault 106 in 2 of 3 bursts" in said

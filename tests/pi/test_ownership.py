@@ -13,9 +13,9 @@ import msgspec
 import pytest
 
 from polysight.pi_controller import executor as executors
-from polysight.pi_controller import realtime
+from polysight.pi_controller import system
 from polysight.pi_controller.client import take_over
-from polysight.pi_controller.journal import TAKE_OVER_KEY
+from polysight.pi_controller.service import TAKE_OVER_KEY
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 
@@ -111,7 +111,7 @@ def test_the_watchdog_is_fed_by_the_executor_alone(pi, monkeypatch, tmp_path):
     listener.bind(str(tmp_path / "notify"))
     listener.settimeout(60)
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    realtime.notify_systemd("READY=1")
+    system.notify_systemd("READY=1")
     assert listener.recv(100) == b"READY=1"
     assert {listener.recv(100) for _ in range(2)} == {b"WATCHDOG=1"}
     released, hangs = threading.Event(), threading.Event()

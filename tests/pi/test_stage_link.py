@@ -77,7 +77,7 @@ def test_answers_are_told_apart_from_what_comes_by_itself(dry_stage):
 
 
 def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage):
-    link, news = connect(dry_stage, silence_s=0.1)
+    link, news = connect(dry_stage, heartbeat_s=0.2)
     link.ask_status_every(0.02)
     assert news.get(timeout=5).kind == "status"
     dry_stage.deaf = True

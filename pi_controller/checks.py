@@ -55,7 +55,7 @@ def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Fi
     return found if isinstance(found, Finding) else Finding(name, "ok", found)
 
 
-def check_all(instrument: Instrument, wires: Path | None, stage_port: str, journal: Path) -> Iterator[Finding]:
+def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
     """Run every check, in the order in which a rig comes to life."""
     pi, keys = instrument.pi, Path(instrument.pi.key_dir)
     yield attempt("plan", _plan, instrument)
@@ -64,8 +64,8 @@ def check_all(instrument: Instrument, wires: Path | None, stage_port: str, journ
     else:
         yield _real_time()
         yield from check_lines(instrument)
-    yield attempt("stage", _stage, instrument, stage_port)
-    yield attempt("journal", _journal, journal, min(instrument.limits.free_disk_bytes, JOURNAL_BYTES))
+    yield attempt("stage", _stage, instrument)
+    yield attempt("journal", _journal, Path(pi.journal_dir), min(instrument.limits.free_disk_bytes, JOURNAL_BYTES))
     yield attempt("keys", _keys, keys, (pi.command_address, pi.event_address))
     yield attempt("command address", _address, replier, pi.command_address, keys)
     yield attempt("event address", _address, publisher, pi.event_address, keys)
@@ -91,10 +91,12 @@ def _real_time() -> Finding:
     return Finding("real time", "ok", "SCHED_FIFO and locked memory are permitted")
 
 
-def _stage(instrument: Instrument, port: str) -> str:
-    with bench_stage(instrument.stage, port) as stage:
+def _stage(instrument: Instrument) -> str:
+    with bench_stage(instrument.stage) as stage:
         here = stage.position()
-        return f"{port} answers, firmware {stage.firmware or '?'}, at {here.x_mm:.2f}, {here.y_mm:.2f} mm"
+        return (
+            f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {here.x_mm:.2f}, {here.y_mm:.2f} mm"
+        )
 
 
 def _journal(path: Path, needed: int) -> str:

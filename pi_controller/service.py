@@ -6,13 +6,11 @@ import os
 import signal
 import sys
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from polysight.pi_controller import system
-from polysight.pi_controller.bursts import Lines
 from polysight.pi_controller.executor import Executor
 from polysight.pi_controller.journal import Journal, JournalFullError
 from polysight.pi_controller.lines import open_lines
@@ -26,17 +24,6 @@ END_LIMIT_S = 0.8
 TAKE_OVER_KEY = "take-over-key"  # file beside the journals: owner of every run, for the person at the Pi
 
 
-@dataclass(frozen=True)
-class Options:
-    """What the command line adds to the rig file, or replaces in it."""
-
-    wires: Path | None = None
-    stage_port: str | None = None
-    journal: Path | None = None
-    command_address: str | None = None
-    event_address: str | None = None
-
-
 def log(text: str) -> None:
     """One line to the log (stderr)."""
     sys.stderr.write(f"polysight-pi: {text}\n")
@@ -44,7 +31,7 @@ def log(text: str) -> None:
 
 
 class Service:
-    """The Pi half as a whole; `lines` are used instead of opening those of the rig.
+    """The Pi half as a whole, on GPIO or on simulated wires.
 
     Raises
     ------
@@ -52,20 +39,18 @@ class Service:
         when an address, a line, the journal or the stage cannot be had. What was opened before is closed again.
     """
 
-    def __init__(self, instrument: Instrument, options: Options, lines: Lines | None = None) -> None:
-        pi, simulated = instrument.pi, options.wires is not None
-        folder = options.journal or Path(pi.journal_dir)
+    def __init__(self, instrument: Instrument, wires: Path | None = None) -> None:
+        pi, folder = instrument.pi, Path(instrument.pi.journal_dir)
         with ExitStack() as opened:
             journal = Journal(folder, lambda events: self.server.publish(events), log)
             opened.callback(_close, journal)
-            lines = lines or open_lines(instrument, options.wires)
             # What is not permitted to its thread was not permitted to the process, which has said so.
-            self._loop = TriggerLoop(lines, self._post, (lambda: None) if simulated else system.prepare_thread)
+            prepare = system.prepare_thread if wires is None else lambda: None
+            self._loop = TriggerLoop(open_lines(instrument, wires), self._post, prepare)
             opened.callback(self._loop.stop)
-            addresses = options.command_address or pi.command_address, options.event_address or pi.event_address
-            self.server = Server(*addresses, Path(pi.key_dir), pi.heartbeat_ms)
+            self.server = Server(pi.command_address, pi.event_address, Path(pi.key_dir), pi.heartbeat_ms)
             opened.callback(self.server.close)
-            stage = StageDriver(instrument.stage, options.stage_port or instrument.stage.port, self._post)
+            stage = StageDriver(instrument.stage, self._post)
             opened.callback(stage.close)
             self.executor = Executor(stage, self._loop, journal, partial(system.notify_systemd, "WATCHDOG=1"))
             _write_secret(folder / TAKE_OVER_KEY, self.executor.take_over_key)
@@ -117,17 +102,17 @@ def _write_secret(path: Path, secret: str) -> None:
         raise ConfigError(f"{path}: {e.strerror}", "the disk is full or read-only", "free space there") from None
 
 
-def run(instrument: Instrument, options: Options) -> int:
+def run(instrument: Instrument, wires: Path | None) -> int:
     """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout when it serves.
 
     Raises ConfigError or DeviceError when it cannot start.
     """
-    if options.wires is not None:
+    if wires is not None:
         system.die_with_parent(signal.SIGTERM)
     else:
         for sentence in system.prepare_process():
             log(sentence)
-    service = Service(instrument, options)
+    service = Service(instrument, wires)
     try:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: service.stop())

@@ -30,10 +30,10 @@ MOTION_LIMIT_S = HOMING_LIMIT_S  # no motion takes longer than homing
 
 
 class StageDriver:
-    """The stage of the [stage] table at a serial device, used by one thread; `news` as of :class:`StageLink`."""
+    """The stage of the [stage] table, used by one thread; `news` as of :class:`StageLink`."""
 
-    def __init__(self, config: Stage, port: str, news: Callable[[StageNews], None]) -> None:
-        self.config, self.port, self._news = config, port, news
+    def __init__(self, config: Stage, news: Callable[[StageNews], None]) -> None:
+        self.config, self.port, self._news = config, config.port, news
         self._open: StageLink | None = None
         self.x_mm = self.y_mm = 0.0
         self.firmware = ""
@@ -209,10 +209,10 @@ class BenchStage:
 
 
 @contextmanager
-def bench_stage(config: Stage, port: str) -> Iterator[BenchStage]:
+def bench_stage(config: Stage) -> Iterator[BenchStage]:
     """A connected stage, closed at the end."""
     news: queue.SimpleQueue[StageNews] = queue.SimpleQueue()
-    driver = StageDriver(config, port, news.put)
+    driver = StageDriver(config, news.put)
     try:
         driver.connect()
         yield BenchStage(driver, news)

@@ -10,11 +10,12 @@ import pytest
 from polysight.pi_controller import lines as pi_lines
 from polysight.pi_controller import system
 from polysight.pi_controller.lines import GpiodLines, SpiLines
-from polysight.pi_controller.service import Options, Service
+from polysight.pi_controller.service import Service
 from polysight.pi_controller.sim_lines import WireLines
 from polysight.shared import messages as m
 from polysight.shared.messages import is_simulated
 from tests.support.pi.host_side import HostSide
+from tests.support.rigs import at_stage_port
 
 
 def test_lines_of_pins_are_hardware_and_all_others_are_simulated():
@@ -43,7 +44,7 @@ def test_hello_tells_the_lines_that_are_driven(instrument, stage, hub, monkeypat
     monkeypatch.setattr(pi_lines, "SpiLines", standing_in(SpiLines))
     monkeypatch.setattr(pi_lines, "load_gpiod", lambda: None)
     monkeypatch.setattr(system, "prepare_thread", list)
-    running = Service(rig, Options(wires=hub if simulated else None, stage_port=stage.port))
+    running = Service(at_stage_port(rig, stage.port), hub if simulated else None)
     thread = threading.Thread(target=running.serve)
     thread.start()
     host = HostSide(running.server.command_address, running.server.event_address, rig)

@@ -236,7 +236,7 @@ def test_an_ordinary_user_is_told_whose_keys_they_are(config, monkeypatch, capsy
         return stat(path, **more)
 
     monkeypatch.setattr(Path, "stat", refuse)
-    assert main(["keys", "--config", str(config)]) == 2
+    assert main(["keys", "--config", str(config)]) == 5
     said = capsys.readouterr().err
     assert "Permission denied" in said
     assert "sudo -u polysight" in said

@@ -20,7 +20,7 @@ from polysight.pi_controller.bursts import (
     send_burst,
     spi_burst,
 )
-from polysight.pi_controller.service import Options, Service
+from polysight.pi_controller.service import Service
 from polysight.pi_controller.sim_lines import SpiWireLines
 from polysight.shared import messages as m
 from polysight.shared.config import Pi
@@ -29,7 +29,7 @@ from polysight.shared.faults import PiFault
 from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
 from polysight.shared.wires import WireClient, WireEdge
 from tests.support.pi.host_side import HostSide
-from tests.support.rigs import published_rig
+from tests.support.rigs import at_stage_port, published_rig
 
 bursts = st.tuples(st.integers(1, 256), st.integers(MIN_PERIOD_NS, 20_000_000), st.integers(MIN_WIDTH_NS, MAX_WIDTH_NS))
 ROOMY = 1 << 22
@@ -159,7 +159,7 @@ def test_a_row_of_the_shipped_rig_file_plays_the_wire_of_an_spi_controller(instr
     assert instrument.pi.wiring == "spi"
     radar = WireClient(hub, listen=instrument.pi.sync_out)
 
-    running = Service(instrument, Options(wires=hub, stage_port=stage.port))
+    running = Service(at_stage_port(instrument, stage.port), hub)
     thread = threading.Thread(target=running.serve)
     thread.start()
     host = HostSide(running.server.command_address, running.server.event_address, instrument)

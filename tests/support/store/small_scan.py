@@ -1,4 +1,4 @@
-"""A scan without processes: the host's own run and resume, the Pi's own ledger and journal, and simulated samples.
+"""A scan without processes: the host's own run and resume, the Pi's own journal, and simulated samples.
 
 Everything that is written to a disk is written by the code that writes it in the instrument; only wires, sockets and
 time are left out. A whole scan takes some milliseconds.

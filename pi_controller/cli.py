@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from polysight.pi_controller import AS_THE_SERVICE
 from polysight.shared import __version__
 from polysight.shared.config import Instrument, load_instrument
@@ -29,9 +31,9 @@ def _write(text: str) -> None:
 
 
 def _run(args: argparse.Namespace, instrument: Instrument) -> int:
-    from polysight.pi_controller.service import Options, run
+    from polysight.pi_controller.service import run
 
-    return run(instrument, Options(args.wires, args.stage_port, args.journal, args.command_address, args.event_address))
+    return run(instrument, args.wires)
 
 
 def _check(args: argparse.Namespace, instrument: Instrument) -> int:
@@ -39,9 +41,8 @@ def _check(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import refuse_beside_service
 
     refuse_beside_service(instrument)
-    port, journal = args.stage_port or instrument.stage.port, args.journal or Path(instrument.pi.journal_dir)
     findings = []
-    for f in check_all(instrument, args.wires, port, journal):
+    for f in check_all(instrument, args.wires):
         findings.append(f)
         if not args.json:
             _write(f"{f.verdict:5} {f.name}: {f.found}" + (f"\n        do: {f.remedy}" if f.remedy else ""))
@@ -51,21 +52,20 @@ def _check(args: argparse.Namespace, instrument: Instrument) -> int:
 
 
 def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
-    from polysight.pi_controller import realtime
+    from polysight.pi_controller import system
+    from polysight.pi_controller.bursts import BurstSpec, send_bursts
     from polysight.pi_controller.client import refuse_beside_service
-    from polysight.pi_controller.lines import BurstSpec
+    from polysight.pi_controller.lines import open_lines
     from polysight.pi_controller.service import log
-    from polysight.pi_controller.trigger import send_bursts
-    from polysight.pi_controller.wiring import open_lines
 
     refuse_beside_service(instrument)
-    lines = open_lines(instrument, args.wires, log)
+    lines = open_lines(instrument, args.wires)
     try:
         if args.wires is None:
-            for sentence in dict.fromkeys(realtime.prepare_process() + realtime.prepare_thread()):  # each once
+            for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):  # each once
                 log(sentence)
-        spec = BurstSpec.of(instrument.burst, check_width=False)
-        records = send_bursts(lines, spec, args.count, round(args.pause_ms * 1e6))
+        lines.check_width = False  # it is told below
+        records = send_bursts(lines, BurstSpec.of(instrument.burst), args.count, round(args.pause_ms * 1e6))
     finally:
         lines.close()
     width, jitter = max(r.width_max_ns for r in records), max(r.jitter_ns for r in records)
@@ -88,7 +88,7 @@ def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.stage import bench_stage
 
     refuse_beside_service(instrument)
-    with bench_stage(instrument.stage, args.stage_port or instrument.stage.port) as stage:
+    with bench_stage(instrument.stage) as stage:
         speed_mm_s = instrument.stage.travel_speed_mm_s if args.speed is None else args.speed
         return _tell_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
 
@@ -99,7 +99,7 @@ def _home(args: argparse.Namespace, instrument: Instrument) -> int:
 
     status = home_by_service(instrument)
     if status is None:
-        with bench_stage(instrument.stage, args.stage_port or instrument.stage.port) as stage:
+        with bench_stage(instrument.stage) as stage:
             return _tell_position(args, stage.home())
     if status.lost_x_mm or status.lost_y_mm:
         lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
@@ -130,7 +130,7 @@ def _events(args: argparse.Namespace, instrument: Instrument) -> int:
 def _keys(args: argparse.Namespace) -> int:
     from polysight.pi_controller.keys import COPY, allow, make_keys, read_allowed, revoke
 
-    folder = args.dir or Path(load_instrument(args.config).pi.key_dir)
+    folder = args.dir or Path(_rig(args).pi.key_dir)
     if args.revoke:
         revoke(folder, args.revoke)
     if args.client:
@@ -150,7 +150,7 @@ def _keys(args: argparse.Namespace) -> int:
 def _take_over(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import take_over
 
-    _write(f"the state is {take_over(instrument, args.what, args.journal or Path(instrument.pi.journal_dir))}")
+    _write(f"the state is {take_over(instrument, args.what)}")
     return 0
 
 
@@ -172,9 +172,20 @@ def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
     return names, how
 
 
+def _rig(args: argparse.Namespace) -> Instrument:
+    """The rig file, with what the command line replaces in it."""
+    rig, given = load_instrument(args.config), {k: v for k, v in vars(args).items() if v is not None}
+    replaced = {k: given[k] for k in ("journal_dir", "command_address", "event_address") if k in given}
+    stage = {"port": given["stage_port"]} if "stage_port" in given else {}
+    replace = msgspec.structs.replace
+    return replace(rig, pi=replace(rig.pi, **replaced), stage=replace(rig.stage, **stage))
+
+
 WIRES = _option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
 STAGE_PORT = _option("--stage-port", metavar="TTY", help="serial port of the stage, instead of stage.port")
-JOURNAL = _option("--journal", type=Path, metavar="DIR", help="folder of the journals, instead of pi.journal_dir")
+JOURNAL = _option(
+    "--journal", dest="journal_dir", metavar="DIR", help="folder of the journals, instead of pi.journal_dir"
+)
 JSON = _option("--json", action="store_true", help="print JSON, for programs")
 COUNT = {"type": _positive, "metavar": "N"}
 MM = {"type": float, "default": 0.0, "metavar": "MM"}
@@ -251,7 +262,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point. Exit status 0 only when it worked; an error is one message on stderr, without a trace."""
     args = _parser().parse_args(argv)
     try:
-        return args.action(args) if args.action is _keys else args.action(args, load_instrument(args.config))
+        return args.action(args) if args.action is _keys else args.action(args, _rig(args))
     except PolysightError as e:
         sys.stderr.write(f"error: {e}\n")
         return e.exit_status

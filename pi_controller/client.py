@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,14 +13,14 @@ import msgspec
 import zmq
 
 from polysight.pi_controller import AS_THE_SERVICE
-from polysight.pi_controller.journal import TAKE_OVER_KEY
+from polysight.pi_controller.service import TAKE_OVER_KEY
 from polysight.pi_controller.stage import MOTION_LIMIT_S
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument
-from polysight.shared.errors import DeviceError, PolysightError, os_error
+from polysight.shared.errors import DeviceError, os_error
 from polysight.shared.sockets import Socket, requester, subscriber
 
-HELLO_LIMIT_S = 0.5
+CONNECT_LIMIT_S = 2.0
 Ask = Callable[..., Any]
 
 
@@ -33,16 +34,16 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
     context: zmq.Context[Socket] = zmq.Context()
     address = instrument.pi.command_address
     try:
-        socket = requester(context, address, Path(instrument.pi.key_dir))
+        client = requester(context, address, Path(instrument.pi.key_dir))
 
-        def ask(command: m.AnyCommand, limit_s: float = instrument.limits.command_timeout_s) -> m.AnyReply:
+        def ask(command: m.AnyCommand) -> m.AnyReply:
             try:
-                socket.send(m.pack(command))
+                client.send(m.pack(command))
             except zmq.Again:  # nobody to send to
                 raise _silent(address) from None
-            if not socket.poll(round(limit_s * 1e3)):
+            if not client.poll(round(instrument.limits.command_timeout_s * 1e3)):
                 raise _silent(address)
-            reply = m.unpack_reply(socket.recv())
+            reply = m.unpack_reply(client.recv())
             if isinstance(reply, m.Refused):
                 raise DeviceError(f"{type(command).__name__} was refused: {reply.what}", reply.why, reply.remedy)
             return reply
@@ -52,22 +53,19 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
         context.destroy(linger=0)
 
 
-def _serves(ask: Ask) -> bool:
+def _listens(address: str) -> bool:
+    """Whether a program listens there, whatever it is: told at once, also by a machine that is slow to answer."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
-        ask(m.Hello(), HELLO_LIMIT_S)
-    except DeviceError:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_LIMIT_S).close()
+    except (OSError, ValueError):
         return False
     return True
 
 
 def refuse_beside_service(instrument: Instrument) -> None:
     """Refuse what needs lines, stage and ports for itself. Raises DeviceError when the service of this rig runs."""
-    try:
-        with _service(instrument) as ask:
-            serves = _serves(ask)
-    except PolysightError:
-        return  # no keys, or no such address: whatever runs, it does not serve there
-    if serves:
+    if _listens(instrument.pi.command_address):
         raise DeviceError(
             f"polysight-pi run serves at {instrument.pi.command_address}",
             "it holds the lines, the stage and the ports",
@@ -81,9 +79,9 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
 
     Raises DeviceError when the service refuses, or homing fails.
     """
+    if not _listens(instrument.pi.command_address):
+        return None
     with _service(instrument) as ask:
-        if not _serves(ask):
-            return None
         ask(m.Home())
         deadline = time.monotonic() + MOTION_LIMIT_S
         while time.monotonic() < deadline:
@@ -96,13 +94,13 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
         raise DeviceError("homing has not ended", "the motors stall", "look at the stage")
 
 
-def take_over(instrument: Instrument, what: str, journal: Path) -> str:
+def take_over(instrument: Instrument, what: str) -> str:
     """Hold, resume, abort or end the run that is begun, whoever began it; returns the state after it.
 
     Raises DeviceError when the service refuses or is silent, or the key of the person at the Pi cannot be read.
     """
     try:
-        owner = (journal / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
+        owner = (Path(instrument.pi.journal_dir) / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
     except OSError as e:
         raise os_error(e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE) from None
     reason = "a person at the Pi took over"
@@ -119,9 +117,9 @@ def follow_events(instrument: Instrument, limit_s: float) -> Iterator[Any]:
     """Live events as plain objects. Raises DeviceError when none comes for `limit_s`."""
     context: zmq.Context[Socket] = zmq.Context()
     try:
-        socket = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
-        while socket.poll(round(limit_s * 1e3)):
-            yield msgspec.to_builtins(m.unpack_event(socket.recv_multipart()[-1]))
+        listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
+        while listener.poll(round(limit_s * 1e3)):
+            yield msgspec.to_builtins(m.unpack_event(listener.recv_multipart()[-1]))
         raise _silent(instrument.pi.event_address)
     finally:
         context.destroy(linger=0)

@@ -14,25 +14,26 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from polysight.pi_controller.journal import JournalFullError
-from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.lines import BurstSpec
+from polysight.pi_controller.bursts import BurstSpec
+from polysight.pi_controller.journal import Journal, JournalFullError
+from polysight.pi_controller.machine import RefusedError
 from polysight.pi_controller.row_machine import RowMachine
-from polysight.pi_controller.rows import RefusedError, check_pulses, check_run, row_of
 from polysight.pi_controller.stage import StageDriver
 from polysight.pi_controller.stage_link import StageLost, StageNews
-from polysight.pi_controller.trigger import BenchBurst, BurstSent, LoopFault, TriggerLoop
+from polysight.pi_controller.trigger import BurstSent, LoopFault, TriggerLoop
+from polysight.shared import __version__
 from polysight.shared import messages as m
+from polysight.shared.config import Stage
 from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.faults import PiFault, explain
+from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, MIN_WIDTH_NS, WIDTH_TEXT
 from polysight.shared.stage_line import Reply
 from polysight.shared.units import us_to_ns
 
 TURN_LIMIT_S = 0.2  # what still waits then is for the next turn: a queue that never empties is no executor that hangs
 TURN_S = 1.0  # the executor turns at least so often: whoever sees it stand still for HUNG_S knows that it hangs
 HUNG_S = 10.0
-WAITING = 64  # commands that may wait for the executor
-REPLAYS = 4  # of them
+COMMANDS_WAITING, REPLAYS_WAITING = 64, 4
 LINES_WAITING = 64  # of the stage: one that talks without end keeps nobody waiting and fills no memory
 REPLAYED_AT_REST = 1000  # events a reply: half a second of a Pi
 REPLAYED_IN_A_ROW = 20  # events a reply while a row runs: many are long calls that keep the trigger thread waiting
@@ -41,19 +42,11 @@ OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # refused to whom the r
 
 
 class Request(NamedTuple):
-    """A command and where its reply goes."""
+    """A command, where its reply goes, and whose room it takes while it waits."""
 
     command: m.AnyCommand
     answer: Callable[[m.AnyReply], None]
-
-
-class Snapshot(NamedTuple):
-    """What Hello, Status and heartbeats tell; replaced as a whole, so that other threads may read it."""
-
-    status: m.StatusReply
-    firmware: str
-    in_run: bool
-    placing: dict[str, float]
+    room: threading.Semaphore | None = None
 
 
 def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
@@ -65,62 +58,45 @@ def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refuse
 
 
 class Executor:
-    """Runs in a thread of its own; :meth:`post` and :attr:`snapshot` are for all threads.
+    """Runs in a thread of its own; :meth:`submit`, :meth:`post`, `status` and `hello` are for all threads.
 
-    With `check_width` a pulse that may have been too long is a fault (no hardware one-shot). `turned` is called with
-    every turn, once a second at least: it feeds the watchdog.
+    `turned` is called with every turn, once a second at least: it feeds the watchdog.
     """
 
     def __init__(
-        self,
-        stage: StageDriver,
-        loop: TriggerLoop,
-        ledger: Ledger,
-        check_width: bool = True,
-        turned: Callable[[], None] = lambda: None,
+        self, stage: StageDriver, loop: TriggerLoop, journal: Journal, turned: Callable[[], None] = lambda: None
     ) -> None:
-        self._loop, self._ledger, self._check_width, self._turned = loop, ledger, check_width, turned
+        self._loop, self._journal, self._turned = loop, journal, turned
         self.take_over_key = secrets.token_hex(16)  # an owner that every run obeys: of the person at the Pi
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._machine = RowMachine(stage, loop, ledger, self._inbox.put)
+        self._room, self._replay_room = map(threading.Semaphore, (COMMANDS_WAITING, REPLAYS_WAITING))
+        self._machine = RowMachine(stage, loop, journal, self._inbox.put)
         self._run: m.BeginRun | None = None
         self._last_row: tuple[int, int] | None = None
         self._after_row: Request | None = None
         self._replies: list[tuple[Request, m.AnyReply]] = []
         self._pulsing: list[Request] = []
-        self._asked = self._replays_asked = 0  # counted by the server's thread, those taken by the executor's
-        self._taken = self._replays_taken = 0
         self._ending = self._ended = False
         self.crash: BaseException | None = None
-        self._commands: dict[type, Callable[[Any], m.AnyReply | None]] = {
-            m.Home: lambda _: self._accept("Home"),
-            m.RunRow: self._run_row,
-            m.Hold: lambda _: self._accept("Hold"),
-            m.Resume: lambda _: self._accept("Resume"),
-            m.Abort: lambda c: self._accept("Abort", c.reason or "asked for by the host"),
-            m.BeginRun: self._begin,
-            m.EndRun: self._end_run,
-        }
         self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
         self._refresh()
 
     # --- for other threads ------------------------------------------------------------------------------------------
 
-    def post(self, item: Request | StageNews | BurstSent | BenchBurst | LoopFault | Callable[[], object]) -> None:
+    def post(self, item: Request | StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
         """Hand something over; returns at once. Lines of the stage that find too many waiting are lost."""
         if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
             return  # what a row or homing waits for is asked again
         self._inbox.put(item)
 
-    def full(self, command: m.AnyCommand) -> bool:
-        """Whether so many commands wait that this one is not taken. Asked by the thread that posts commands."""
-        replay = isinstance(command, m.Replay)
-        if self._asked - self._taken >= WAITING or (replay and self._replays_asked - self._replays_taken >= REPLAYS):
-            return True
-        self._asked += 1
-        self._replays_asked += replay
-        return False
+    def submit(self, command: m.AnyCommand, answer: Callable[[m.AnyReply], None]) -> bool:
+        """Queue a command; its reply goes to `answer`. False when too many wait already: it is not taken."""
+        room = self._replay_room if isinstance(command, m.Replay) else self._room
+        if not room.acquire(blocking=False):
+            return False
+        self._inbox.put(Request(command, answer, room))
+        return True
 
     @property
     def stands_still_s(self) -> float:
@@ -135,7 +111,7 @@ class Executor:
         if run.owner != owner:
             return refused(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
         self._machine.hear_host()
-        return m.Accepted(state=self.snapshot.status.state)
+        return m.Accepted(state=self.status.state)
 
     def start(self) -> None:
         """Start the thread. The stage is connected by now."""
@@ -160,8 +136,7 @@ class Executor:
     def _turn(self) -> None:
         try:
             left_s = self._machine.seconds_left()
-            item = self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S))
-            self._take(item)
+            self._take(self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S)))
             until_s = time.monotonic() + TURN_LIMIT_S
             while time.monotonic() < until_s:
                 self._take(self._inbox.get_nowait())
@@ -169,10 +144,10 @@ class Executor:
             pass
         self._machine.check_limits()
         try:
-            self._ledger.commit()
+            self._journal.commit()
         except JournalFullError as e:
-            self._machine.happen("lasting fault", PiFault.JOURNAL_FULL, str(e))
-            self._ledger.commit()
+            self._machine.happen("lasting fault", e.number, str(e))
+            self._journal.commit()
         self._refresh()
         replies, self._replies = self._replies, []
         for request, reply in replies:
@@ -191,17 +166,15 @@ class Executor:
         machine, row = self._machine, self._machine.row
         if isinstance(item, BurstSent):
             machine.take_burst(item)
-        elif isinstance(item, BenchBurst):
-            self._answer_pulses(item.told())
+        elif isinstance(item, m.Pulsed):
+            self._answer_pulses(item)
         elif isinstance(item, LoopFault):
             machine.take_loop_fault(item)
             self._answer_pulses(refused(item.number, item.detail))  # every request gets a reply
         elif isinstance(item, Request):
-            self._taken += 1
-            reply = self._reply_to(item)
-            self._hear(item.command)  # before the limits are looked at: it may have taken long
-            if reply is not None:
-                self._replies.append((item, reply))
+            if item.room is not None:
+                item.room.release()
+            self._execute(item._replace(room=None))
         elif isinstance(item, Reply):
             machine.take_stage(item)
         elif isinstance(item, StageLost):
@@ -217,21 +190,23 @@ class Executor:
 
     # --- commands ---------------------------------------------------------------------------------------------------
 
-    def _reply_to(self, request: Request) -> m.AnyReply | None:
+    def _execute(self, request: Request) -> None:
         """Whatever a command leads to, it ends in a reply: no message ends this program."""
         try:
-            return self._on_command(request)
-        except RefusedError as e:
-            return refused(e.number, e.what, e.why, e.remedy)
+            reply = self._on_command(request)
         except PolysightError as e:
-            return refused(PiFault.BAD_REQUEST, e.what, e.why, e.remedy)
+            reply = refused(getattr(e, "number", PiFault.BAD_REQUEST), e.what, e.why, e.remedy)
         except OSError as e:
-            return refused(PiFault.BAD_REQUEST, os_error(e).what, "the system refuses it", "look at the Pi's disk")
+            reply = refused(PiFault.BAD_REQUEST, os_error(e).what, "the system refuses it", "look at the Pi's disk")
         except Exception as e:  # noqa: BLE001 - told to the client, and in the log
             traceback.print_exc()
-            return refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
+            reply = refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
+        self._hear(request.command)  # before the limits are looked at: it may have taken long
+        if reply is not None:
+            self._replies.append((request, reply))
 
     def _on_command(self, request: Request) -> m.AnyReply | None:
+        """The reply; None when it comes later."""
         command, run = request.command, self._run
         if isinstance(command, m.Replay):
             return self._replay(command)
@@ -239,25 +214,33 @@ class Executor:
             raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
         if run and isinstance(command, OWNED) and command.owner not in (run.owner, self.take_over_key):
             raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
-        if isinstance(command, m.Pulse):
-            return self._pulse(request, command)
-        if isinstance(command, m.BeginRun) and self._begins_later(request, command):
-            return None
-        return self._commands[type(command)](command)
+        match command:
+            case m.BeginRun():
+                return None if self._begins_later(request, command) else self._begin(command)
+            case m.EndRun():
+                return self._end_run(command)
+            case m.RunRow():
+                return self._run_row(command)
+            case m.Abort():
+                return self._accept("Abort", command.reason or "asked for by the host")
+            case m.Pulse():
+                return self._pulse(request, command)
+            case _:  # Home, Hold, Resume
+                return self._accept(type(command).__name__)
 
     def _replay(self, command: m.Replay) -> m.ReplayReply:
-        self._replays_taken += 1
         limit = min(command.limit, REPLAYED_AT_REST)
         if self._machine.row is not None:
-            if command.scan_id != self._ledger.scan_id:  # its whole file is read, however few events are wanted
+            if command.scan_id != self._journal.scan_id:  # its whole file is read, however few events are wanted
                 raise RefusedError(
                     PiFault.NOT_READY,
-                    f"a row of scan {self._ledger.scan_id} runs",
+                    f"a row of scan {self._journal.scan_id} runs",
                     "reading another scan's journal would hold up its pulses",
                     "ask again when the row has ended",
                 )
             limit = min(limit, REPLAYED_IN_A_ROW)
-        return self._ledger.replay(command.scan_id, command.from_seq, limit)
+        found, last = self._journal.read(command.scan_id, command.from_seq, limit)
+        return m.ReplayReply(events=[m.unpack_event(raw) for raw in found], last_seq=last)
 
     def _accept(self, event: str = "", *args: Any) -> m.Accepted:
         """Carry out a command of the state machine. Raises RefusedError."""
@@ -273,7 +256,7 @@ class Executor:
         self._machine.require("Pulse")
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
-        spec = check_pulses(command.pulses, command.period_us, command.width_us, self._check_width)
+        spec = burst_of(command)
         if spec.pulses * spec.period_ns > m.MOST_PULSES_S * 1e9:
             lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MOST_PULSES_S:g} s"
             raise RefusedError(PiFault.NOT_READY, lasts, "the lines are busy meanwhile", "ask for fewer pulses")
@@ -283,7 +266,7 @@ class Executor:
     def _begins_later(self, request: Request, run: m.BeginRun) -> bool:
         """Check a run. If a row runs, it is ended first, and the request is taken again then. Raises RefusedError."""
         check_run(run, self._machine.stage.config)
-        self._loop.check(self._burst_of(run))
+        self._loop.check(burst_of(run))
         begun = self._run
         other = begun is not None and (run.scan_id, run.owner) != (begun.scan_id, begun.owner)
         if begun is not None and other and self._machine.host_lives:
@@ -300,18 +283,15 @@ class Executor:
         return self._machine.row is not None
 
     def _begin(self, run: m.BeginRun) -> m.Accepted:
-        try:
-            resumed, lost = self._ledger.open(run.scan_id, run.plan, run.last_seq)
-        except JournalFullError as e:
-            raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
-        self._run, self._last_row = None, None  # whichever was begun: the ledger is this scan's now
+        resumed, lost = self._journal.open(run.scan_id, run.plan, run.last_seq)
+        self._run, self._last_row = None, None  # whichever was begun: the journal is this scan's now
         self._machine.happen("EndRun")
         self._keep(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
         self._run = run
         return self._accept("BeginRun", run.heartbeat_ms)
 
     def _end_run(self, command: m.EndRun) -> m.Accepted:
-        if self._run is None and command.scan_id == self._ledger.scan_id:
+        if self._run is None and command.scan_id == self._journal.scan_id:
             return self._accept()  # a repeated request
         self._need_run(command.scan_id)
         self._machine.require("EndRun")
@@ -320,14 +300,14 @@ class Executor:
         return self._accept("EndRun")
 
     def _keep(self, kind: type[m.RunStarted | m.RunStopped], **fields: Any) -> None:
-        """Emit an event whose command is accepted only when it is on the disk. Raises RefusedError."""
-        self._ledger.broken = False  # there may be room again
-        self._machine.emit(kind, **fields)
+        """Write an event whose command is accepted only when it is on the disk. Raises JournalFullError."""
+        self._journal.broken = False  # there may be room again
+        self._journal.add(kind, **fields)
         try:
-            self._ledger.commit()
+            self._journal.commit()
         except JournalFullError as e:
-            self._machine.happen("lasting fault", PiFault.JOURNAL_FULL, str(e))
-            raise RefusedError(PiFault.JOURNAL_FULL, e.what, e.why, e.remedy) from None
+            self._machine.happen("lasting fault", e.number, str(e))
+            raise
 
     def _need_run(self, scan_id: str) -> m.BeginRun:
         if self._run is None or self._run.scan_id != scan_id:
@@ -341,11 +321,8 @@ class Executor:
         if wanted in (current and (current.row.index, current.take), self._last_row):
             return self._accept()  # a repeated request: the row runs, or has run
         self._machine.require("RunRow")
-        row = row_of(run.plan, command.row_index)
-        return self._accept("RunRow", row, command.take, self._burst_of(run), run.speed_mm_s)
-
-    def _burst_of(self, run: m.BeginRun) -> BurstSpec:
-        return BurstSpec(run.pulses, us_to_ns(run.period_us), us_to_ns(run.width_us), self._check_width)
+        _require(command.row_index < run.plan.rows, f"row {command.row_index} is not of the plan's {run.plan.rows}")
+        return self._accept("RunRow", run.plan.row(command.row_index), command.take, burst_of(run), run.speed_mm_s)
 
     def _row_ended(self, row: tuple[int, int]) -> None:
         self._last_row = row
@@ -359,13 +336,59 @@ class Executor:
         self._ended = not self._machine.terminate()
 
     def _refresh(self) -> None:
-        machine, row, counts = self._machine, self._machine.row, self._loop.counts
-        self.snapshot = Snapshot(
-            m.StatusReply(
-                state=machine.told, homed=machine.homed, x_mm=machine.stage.x_mm, y_mm=machine.stage.y_mm,
-                scan_id=self._ledger.scan_id, row_index=row.row.index if row else -1, take=row.take if row else 0,
-                points=counts.bursts if row else 0, pulses=counts.pulses if row else 0, last_seq=self._ledger.last_seq,
-                fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
-            ),
-            machine.stage.firmware, self._run is not None, machine.stage.config.placing,
+        """What Hello, Status and heartbeats tell; replaced as a whole, so that other threads may read it."""
+        machine, stage, row, counts = self._machine, self._machine.stage, self._machine.row, self._loop.counts
+        scan_id, last_seq = self._journal.scan_id, self._journal.last_seq
+        self.status = m.StatusReply(
+            state=machine.told, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
+            scan_id=scan_id, row_index=row.row.index if row else -1, take=row.take if row else 0,
+            points=counts.bursts if row else 0, pulses=counts.pulses if row else 0, last_seq=last_seq,
+            fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
         )  # fmt: skip
+        self.hello = m.HelloReply(
+            pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.told,
+            scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placing,
+        )  # fmt: skip
+
+
+# --- what a run asks for, and what this rig can do --------------------------------------------------------------------
+
+
+def burst_of(asked: m.BeginRun | m.Pulse) -> BurstSpec:
+    """The burst, where the radars take it. Raises RefusedError PERIOD_TOO_SHORT or PULSE_TOO_LONG."""
+    spec = BurstSpec(asked.pulses, us_to_ns(asked.period_us), us_to_ns(asked.width_us))
+    if spec.period_ns < MIN_PERIOD_NS:
+        raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {asked.period_us} us is below {MIN_PERIOD_US} us")
+    if not MIN_WIDTH_NS <= spec.width_ns <= MAX_WIDTH_NS:
+        raise RefusedError(PiFault.PULSE_TOO_LONG, f"pulse width of {asked.width_us} us is outside {WIDTH_TEXT}")
+    return spec
+
+
+def check_run(run: m.BeginRun, stage: Stage) -> None:
+    """Compare a run with this rig. Raises RefusedError with the values that do not go together."""
+    plan, spec = run.plan, burst_of(run)
+    _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
+    _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
+    fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)
+    _require(
+        0 < run.speed_mm_s <= fastest,
+        f"speed of {run.speed_mm_s} mm/s is outside 0..{fastest} mm/s of this rig's [stage]",
+    )
+    steps = plan.step_x_mm * stage.steps_per_mm
+    _require(
+        abs(steps - round(steps)) < 1e-6 and round(steps) >= 1,
+        f"step of {plan.step_x_mm} mm is {steps:g} motor steps: it must be a whole number",
+    )
+    between_ms, burst_ms = 1e3 * plan.step_x_mm / run.speed_mm_s, run.pulses * spec.period_ns * 1e-6
+    _require(
+        burst_ms <= between_ms,
+        f"burst of {run.pulses} x {run.period_us} us lasts {burst_ms:.2f} ms, a point passes every "
+        f"{between_ms:.2f} ms at {run.speed_mm_s} mm/s",
+    )
+    misfit = stage.misfit(plan, run.speed_mm_s)
+    _require(not misfit, misfit)
+
+
+def _require(ok: bool, what: str) -> None:
+    if not ok:
+        raise RefusedError(PiFault.BAD_REQUEST, what)

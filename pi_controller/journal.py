@@ -1,9 +1,9 @@
-"""The journal: every event of a scan on disk before it is published, so that a lost message can be asked for again.
+"""The journal: every event of a scan on disk before it is published, so that a lost message can be replayed.
 
 One file a scan, append-only: 8 bytes of magic, then records of `<length, sequence, crc32(sequence + payload)>` (three
 little-endian u32) and the packed event. Sequence numbers count up from 1; they jump only where a lost journal was begun
 anew behind what the host has. A torn or damaged tail, as a power cut leaves it, is cut off at the last good record when
-the file is opened. Specification: docs/spec/wire.md.
+the file is opened. Specification: docs/spec/wire.md. Used by the executor's thread alone.
 """
 
 from __future__ import annotations
@@ -13,28 +13,34 @@ import fcntl
 import os
 import shutil
 import struct
+import time
 import zlib
-from array import array
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
-from polysight.shared.errors import ConfigError, DataError, DeviceError
+import msgspec
+
+from polysight.shared import messages as m
+from polysight.shared.errors import ConfigError, DataError, DeviceError, ProtocolError
+from polysight.shared.faults import PiFault
+from polysight.shared.raster import RasterPlan
 
 MAGIC = b"PSJRNL1\n"
 MAX_RECORD_BYTES = 1 << 20
 CAPTURE_BYTES = 320  # a position's record takes less
 SPARE_BYTES = 4 << 20  # faults, rows taken again
 SEARCHED_BYTES = 1 << 20  # behind damage, for a good record
-TAKE_OVER_KEY = "take-over-key"  # file beside the journals: owner of every run, for the person at the Pi
 DAMAGED = ".damaged"  # suffix of the copy that is kept of a damaged journal
 _HEAD = struct.Struct("<III")
 
 
 class JournalFullError(DeviceError):
     """The journal cannot be written. Nothing of the failed write is in it."""
+
+    number = PiFault.JOURNAL_FULL
 
     def __init__(self, path: Path, e: OSError) -> None:
         why = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else "the disk is read-only or broken"
@@ -51,9 +57,9 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
     Raises DataError when the file is no journal at all.
     """
     magic = file.read(len(MAGIC))
-    if not magic.strip(b"\0"):
-        return  # made, and the power was cut before its first bytes were on the disk
-    if magic != MAGIC[: len(magic)]:
+    if magic != MAGIC:
+        if MAGIC.startswith(magic.rstrip(b"\0")):
+            return  # made, and the power was cut before its first bytes were on the disk
         name = getattr(file, "name", "journal")
         raise DataError(f"{name}: not a journal", "another program wrote it", "move it out of the journal folder")
     offset, last = len(MAGIC), 0
@@ -78,7 +84,7 @@ def _holds_records(tail: bytes) -> bool:
     return False
 
 
-class Journal:
+class JournalFile:
     """The journal of one scan, open for appending: made when absent, cut at its last good record otherwise.
 
     `damage` says what was cut off, when that was more than the torn record of a power cut: a copy is kept then.
@@ -88,8 +94,8 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path, self.damage = path, ""
-        self._offsets, self._seqs = array("Q"), array("I")
-        self._passed = 0  # numbers up to this one are the host's
+        self.last_seq = 0  # of the newest record, or of the host's newest event
+        self._places: list[tuple[int, int]] = []  # sequence number and offset of each record
         self._synced = True
         try:
             self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
@@ -97,19 +103,15 @@ class Journal:
             raise JournalFullError(path, e) from None
         try:
             self._recover()
-        except OSError as e:
+        except (OSError, DataError) as e:
             os.close(self._fd)
-            raise JournalFullError(path, e) from None
-        except DataError:
-            os.close(self._fd)
-            raise
+            raise (JournalFullError(path, e) if isinstance(e, OSError) else e) from None
 
     def _recover(self) -> None:
         self._end = len(MAGIC)
         with self.path.open("rb") as file:
-            for offset, seq, payload in records(file):
-                self._offsets.append(offset)
-                self._seqs.append(seq)
+            for offset, self.last_seq, payload in records(file):
+                self._places.append((self.last_seq, offset))
                 self._end = offset + _HEAD.size + len(payload)
             file.seek(self._end)
             tail = file.read()
@@ -121,7 +123,7 @@ class Journal:
                 f"{self.path}: damaged behind event {self.last_seq}, {len(tail)} bytes that followed are cut off;"
                 f" the file as it was is {copy}; the disk or card fails: replace it"
             )
-        if not self._seqs:
+        if not self._places:
             os.pwrite(self._fd, MAGIC, 0)
         os.ftruncate(self._fd, self._end)
         os.fsync(self._fd)
@@ -131,15 +133,10 @@ class Journal:
         finally:
             os.close(folder)
 
-    @property
-    def last_seq(self) -> int:
-        """Sequence number of the newest record; 0 when there is none."""
-        return max(self._passed, self._seqs[-1] if self._seqs else 0)
-
     def number_behind(self, seq: int) -> int:
-        """Number the next record behind `seq`. Returns how many numbers this passes over, which others have used."""
+        """Number the next record behind `seq`. Returns how many numbers this skips, which others have used."""
         lost = max(0, seq - self.last_seq)
-        self._passed = max(self._passed, seq)
+        self.last_seq += lost
         return lost
 
     def write(self, payloads: Sequence[bytes], sync: bool = False) -> None:
@@ -147,10 +144,9 @@ class Journal:
 
         Raises JournalFullError when the disk is full or broken. The file is then as before.
         """
-        offsets, seqs, data = array("Q"), array("I"), bytearray()
+        places, data = [], bytearray()
         for seq, payload in enumerate(payloads, self.last_seq + 1):
-            offsets.append(self._end + len(data))
-            seqs.append(seq)
+            places.append((seq, self._end + len(data)))
             data += _HEAD.pack(len(payload), seq, _crc(seq, payload)) + payload
         done = 0
         try:
@@ -163,15 +159,14 @@ class Journal:
                 os.ftruncate(self._fd, self._end)
             raise JournalFullError(self.path, e) from None
         self._end += len(data)
-        self._offsets += offsets
-        self._seqs += seqs
+        self._places += places
+        self.last_seq += len(places)
         self._synced = sync or (self._synced and not data)
 
     def read(self, from_seq: int, limit: int) -> list[bytes]:
         """Payloads from `from_seq` on, at most `limit` of them. Raises DataError for a damaged one."""
-        first, found = bisect_left(self._seqs, from_seq), []
-        part = slice(first, first + limit)
-        for seq, offset in zip(self._seqs[part], self._offsets[part], strict=True):
+        first, found = bisect_left(self._places, (from_seq, 0)), []
+        for seq, offset in self._places[first : first + limit]:
             length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
             payload = os.pread(self._fd, length, offset + _HEAD.size)
             if _crc(seq, payload) != crc:
@@ -187,20 +182,32 @@ class Journal:
             os.close(self._fd)
 
 
-class JournalFolder:
-    """The folder of journals, held by one process at a time.
+class Journal:
+    """Events in order: numbered, written to the file of the current scan, then published. One process a folder.
+
+    `publish` takes packed events once they are in the file, `warn` sentences.
 
     Raises ConfigError when the folder cannot be made or written, DeviceError when another process holds it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(
+        self,
+        folder: Path,
+        publish: Callable[[list[bytes]], None] = lambda _: None,
+        warn: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.folder, self._publish, self._warn = folder, publish, warn
+        self._file: JournalFile | None = None
+        self._batch: list[tuple[m.AnyEvent, bytes]] = []
+        self._pending = 0  # events of the batch that belong into the file
+        self.broken = False
+        self.scan_id = ""
         try:
-            path.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(path / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as e:
             raise ConfigError(
-                f"journal folder {path}: {e.strerror}",
+                f"journal folder {folder}: {e.strerror}",
                 "it does not exist and cannot be made, or this user may not write there",
                 "make it, or choose another with --journal or pi.journal_dir",
             ) from None
@@ -208,20 +215,104 @@ class JournalFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
-            raise DeviceError(
-                f"journal folder {path} is in use", "another polysight-pi runs", "stop it, or give another --journal"
-            ) from None
+            busy = f"journal folder {folder} is in use", "another polysight-pi runs"
+            raise DeviceError(*busy, "stop it, or give another --journal") from None
+
+    @property
+    def last_seq(self) -> int:
+        """Sequence number of the newest event of the current scan."""
+        return self._file.last_seq + self._pending if self._file else 0
 
     def path_of(self, scan_id: str) -> Path:
         """The journal file of a scan."""
-        return self.path / f"{scan_id}.journal"
+        return self.folder / f"{scan_id}.journal"
 
-    def open(self, scan_id: str) -> Journal:
-        """The journal of a scan, made when absent."""
-        return Journal(self.path_of(scan_id))
+    def open(self, scan_id: str, plan: RasterPlan, host_seq: int) -> tuple[bool, int]:
+        """Make `scan_id` the current scan. The next event is numbered behind `host_seq`, the newest the host has.
+
+        Returns whether the scan was begun before, and how many of the host's events the journal has lost.
+
+        Raises
+        ------
+        JournalFullError
+            when the journal cannot be had, or there is no room for this plan's.
+        DataError
+            when it is no journal, or the scan was begun with another plan. In both cases nothing has changed.
+        """
+        self.broken = False
+        self.commit()
+        self.check_room(scan_id, plan.positions)
+        file = self._file
+        if file is None or self.scan_id != scan_id:
+            file = JournalFile(self.path_of(scan_id))
+            if file.damage:
+                self._warn(file.damage)
+        try:
+            begun = _plan_of(file)
+            if begun is not None and begun != plan:
+                raise DataError(
+                    f"scan {scan_id} was begun with another plan: {begun}",
+                    "the scan's name was used before, with another grid",
+                    "resume that scan with its own plan, or give the new one another name",
+                )
+        except (DataError, ProtocolError):
+            if file is not self._file:
+                file.close()
+            raise
+        if file is not self._file:
+            if self._file is not None:
+                self._file.close()
+            self._file, self.scan_id = file, scan_id
+        return begun is not None or host_seq > 0, file.number_behind(host_seq)
+
+    def check_room(self, scan_id: str, positions: int) -> None:
+        """Refuse a scan for whose journal, or the rest of it, the disk has no room. Raises JournalFullError."""
+        path = self.path_of(scan_id)
+        try:
+            there = path.stat().st_size if path.exists() else 0
+            free = shutil.disk_usage(self.folder).free
+        except OSError as e:
+            raise JournalFullError(self.folder, e) from None
+        needed = max(0, positions * CAPTURE_BYTES - there) + SPARE_BYTES
+        if free < needed:
+            room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions"
+            raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
+
+    def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
+        """Number an event and add it to the batch; words are cut to what a reader takes.
+
+        An event that does not go into the file carries the last number.
+        """
+        self._pending += issubclass(kind, m.JOURNALLED) and self._file is not None and not self.broken
+        fields = {k: v[: m.MOST_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
+        event = kind(scan_id=self.scan_id, seq=self.last_seq, t_mono_ns=time.monotonic_ns(), **fields)
+        self._batch.append((event, m.pack(event)))
+
+    def commit(self) -> None:
+        """Write the batch to the file, then publish it.
+
+        Raises JournalFullError when it cannot be written. From then on events are published with the last good number
+        and not kept, until the scan is opened again; of this batch, only what ends a row or names a fault is published.
+        """
+        batch, self._batch, self._pending = self._batch, [], 0
+        if self._file is not None:
+            after = self._file.last_seq
+            kept = [(e, raw) for e, raw in batch if isinstance(e, m.JOURNALLED) and e.seq > after]
+            try:
+                if kept:
+                    self._file.write([raw for _, raw in kept], any(not isinstance(e, m.Capture) for e, _ in kept))
+            except JournalFullError:
+                self.broken = True
+                told = [e for e, _ in batch if isinstance(e, m.RowFinished | m.Fault | m.StageStatus)]
+                self._publish([m.pack(msgspec.structs.replace(e, seq=after)) for e in told])
+                raise
+        if batch:
+            self._publish([raw for _, raw in batch])
 
     def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
-        """Payloads from `from_seq` on and the newest sequence number of a scan that is not open; ([], 0) if absent."""
+        """Packed events of any scan from `from_seq` on, and its newest sequence number; ([], 0) if there is none."""
+        if self._file is not None and scan_id == self.scan_id:
+            return self._file.read(from_seq, limit), self.last_seq
         found, last = [], 0
         with suppress(FileNotFoundError), self.path_of(scan_id).open("rb") as file:
             for _, last, payload in records(file):
@@ -229,29 +320,18 @@ class JournalFolder:
                     found.append(payload)
         return found, last
 
-    def check_room(self, scan_id: str, positions: int) -> None:
-        """Refuse a scan for whose journal, or the rest of it, the disk has no room. Raises JournalFullError."""
-        path = self.path_of(scan_id)
-        try:
-            there = path.stat().st_size if path.exists() else 0
-            free = shutil.disk_usage(self.path).free
-        except OSError as e:
-            raise JournalFullError(self.path, e) from None
-        needed = max(0, positions * CAPTURE_BYTES - there) + SPARE_BYTES
-        if free < needed:
-            room = f"{free / 1e6:.1f} MB free, {needed / 1e6:.1f} MB needed for {positions} positions"
-            raise JournalFullError(self.path, OSError(errno.ENOSPC, room))
-
-    def write_secret(self, name: str, secret: str) -> None:
-        """Write a file that this program's user alone can read. Raises ConfigError."""
-        path = self.path / name
-        try:
-            path.unlink(missing_ok=True)
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as file:
-                file.write(secret)
-        except OSError as e:
-            raise ConfigError(f"{path}: {e.strerror}", "the disk is full or read-only", "free space there") from None
-
     def close(self) -> None:
-        """Let another process have the folder."""
-        os.close(self._lock)
+        """Close the current file, and let another process have the folder. Raises JournalFullError."""
+        file, self._file = self._file, None
+        try:
+            if file is not None:
+                file.close()
+        finally:
+            os.close(self._lock)
+
+
+def _plan_of(file: JournalFile) -> RasterPlan | None:
+    """The plan of the first event; None when there is no event yet."""
+    first = file.read(1, 1)
+    event = m.unpack_event(first[0]) if first else None
+    return event.plan if isinstance(event, m.RunStarted) else None

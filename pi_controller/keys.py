@@ -6,14 +6,12 @@ name. Without that file `host.key` alone is allowed, as before there was one. It
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import zmq.utils.z85
 from zmq.auth import create_certificates, load_certificate
 
-from polysight.pi_controller import PROGRAM
 from polysight.shared.errors import ConfigError
 from polysight.shared.sockets import HOST_KEYS
 
@@ -49,20 +47,57 @@ def read_allowed(folder: Path) -> dict[str, str]:
         lines = (folder / ALLOWED).read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         with suppress(OSError, ValueError):
-            return {_public(folder / "host.key"): "host"}
+            return {_public(folder, "host"): "host"}
         return {}
     keys = (line.strip().partition(" ") for line in lines)
     return {key: name.strip() or "nameless" for key, _, name in keys if len(key) == KEY_CHARACTERS}
 
 
-def _public(certificate: Path) -> str:
-    return load_certificate(certificate)[0].decode("ascii")
+# --- for `polysight-pi keys`: these raise ConfigError, or OSError when the folder cannot be written -------------------
 
 
-def _write_allowed(folder: Path, names: dict[str, str]) -> None:
-    new = folder / (ALLOWED + ".new")
-    new.write_text("".join(f"{key} {name}\n" for key, name in names.items()), encoding="utf-8")
-    new.replace(folder / ALLOWED)
+def make_keys(folder: Path, replace: bool = False) -> list[Path]:
+    """Make `pi.key`, `pi.key_secret`, `host.key` and `host.key_secret`, the secret ones readable by the owner alone.
+
+    Returns the files. Raises ConfigError when there are keys already (unless `replace`).
+    """
+    there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
+    if there and not replace:
+        raise ConfigError(
+            f"{there[0]} exists",
+            "keys were made before; new ones lock out every host that has the old ones",
+            f"keep them, or give --replace, then {COPY}",
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    made = [path for name in PARTIES for path in _create(folder, name)]
+    _write_allowed(folder, {_public(folder, "host"): "host"})
+    return made
+
+
+def allow(folder: Path, name: str) -> list[Path]:
+    """Make keys for one more client and allow them. Returns its files; the secret one goes to the client alone."""
+    if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
+        raise ConfigError(
+            f"client {name!r} cannot be added",
+            "its name is taken, or has other signs than a-z 0-9 - _",
+            "choose another name, or revoke that client first",
+        )
+    made = _create(folder, name)
+    _write_allowed(folder, read_allowed(folder) | {_public(folder, name): name})
+    return made
+
+
+def revoke(folder: Path, name: str) -> None:
+    """Allow this client no more, at once: its next command is refused, and it cannot connect."""
+    names = read_allowed(folder)
+    left = {key: other for key, other in names.items() if other != name}
+    if left == names:
+        raise ConfigError(f"no client {name!r} is allowed", "a typing error", f"allowed: {', '.join(names.values())}")
+    _write_allowed(folder, left)
+
+
+def _public(folder: Path, name: str) -> str:
+    return load_certificate(folder / f"{name}.key")[0].decode("ascii")
 
 
 def _create(folder: Path, name: str) -> list[Path]:
@@ -71,61 +106,7 @@ def _create(folder: Path, name: str) -> list[Path]:
     return [public, secret]
 
 
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    """Tell in plain words that the folder cannot be written. Raises ConfigError."""
-    try:
-        yield
-    except OSError as e:
-        raise ConfigError(
-            f"keys cannot be written to {folder}: {e.strerror}",
-            "another user's folder, or the disk is full",
-            f"as the service's user: `sudo -u polysight {PROGRAM} keys`; or choose --dir",
-        ) from None
-
-
-def allow(folder: Path, name: str) -> list[Path]:
-    """Make keys for one more client and allow them. Returns its files; the secret one goes to the client alone.
-
-    Raises ConfigError when the name is taken, or none, or the folder cannot be written.
-    """
-    if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
-        raise ConfigError(
-            f"client {name!r} cannot be added",
-            "its name is taken, or has other signs than a-z 0-9 - _",
-            "choose another name, or revoke that client first",
-        )
-    with _writing(folder):
-        made = _create(folder, name)
-        _write_allowed(folder, read_allowed(folder) | {_public(made[0]): name})
-    return made
-
-
-def revoke(folder: Path, name: str) -> None:
-    """Allow this client no more, at once: its next command is refused, and it cannot connect. Raises ConfigError."""
-    names = read_allowed(folder)
-    left = {key: other for key, other in names.items() if other != name}
-    if left == names:
-        raise ConfigError(f"no client {name!r} is allowed", "a typing error", f"allowed: {', '.join(names.values())}")
-    with _writing(folder):
-        _write_allowed(folder, left)
-
-
-def make_keys(folder: Path, replace: bool = False) -> list[Path]:
-    """Make `pi.key`, `pi.key_secret`, `host.key` and `host.key_secret`, the secret ones readable by the owner alone.
-
-    Returns the files. Raises ConfigError when there are keys already (unless `replace`), or the folder cannot be
-    written.
-    """
-    with _writing(folder):
-        there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
-        if there and not replace:
-            raise ConfigError(
-                f"{there[0]} exists",
-                "keys were made before; new ones lock out every host that has the old ones",
-                f"keep them, or give --replace, then {COPY}",
-            )
-        folder.mkdir(parents=True, exist_ok=True)
-        made = [path for name in PARTIES for path in _create(folder, name)]
-        _write_allowed(folder, {_public(folder / "host.key"): "host"})
-    return made
+def _write_allowed(folder: Path, names: dict[str, str]) -> None:
+    new = folder / (ALLOWED + ".new")
+    new.write_text("".join(f"{key} {name}\n" for key, name in names.items()), encoding="utf-8")
+    new.replace(folder / ALLOWED)

@@ -10,10 +10,19 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
-from polysight.pi_controller.rows import RefusedError
 from polysight.shared import messages as m
+from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault
 from polysight.shared.stage_line import HOMING_LIMIT_S
+
+
+class RefusedError(PolysightError):
+    """A command is refused; `number` is of shared/faults.py, whose table says what is not said here."""
+
+    def __init__(self, number: int, what: str, why: str = "", remedy: str = "") -> None:
+        super().__init__(what, why, remedy)
+        self.number = int(number)
+
 
 State = Literal["idle", "homing", "homed", "ready", "running", "held", "stopping", "done", "ending", "fault"]
 
@@ -94,7 +103,7 @@ class Machine:
         self.reason = ""  # of the first fault
         self.row_limit_s = math.inf
         self._deadline_s = math.inf
-        self._host_limit_s, self._host_heard_s = math.inf, 0.0
+        self.watch_host(0)
         self._rules: dict[tuple[str, str], tuple[list[Any], Callable[..., str | None]]] = {
             (state, rule.event): (rule.leads_to.split(), getattr(self, f"_{rule.action}"))
             for rule in RULES
@@ -146,8 +155,8 @@ class Machine:
 
     # --- time -------------------------------------------------------------------------------------------------------
 
-    def promise(self, heartbeat_ms: int) -> None:
-        """How often the host promises to be heard; 0: it is not watched."""
+    def watch_host(self, heartbeat_ms: int) -> None:
+        """The host promises to be heard so often; 0: it is not watched."""
         self._host_limit_s = HOST_MISSES * heartbeat_ms / 1e3 if heartbeat_ms else math.inf
         self._host_heard_s = self._clock()
 

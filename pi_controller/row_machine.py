@@ -9,16 +9,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
-from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.lines import BurstSpec
-from polysight.pi_controller.machine import END_LIMIT_S, Machine
-from polysight.pi_controller.rows import RefusedError, row_duration_s, stage_row
+from polysight.pi_controller.bursts import BurstSpec
+from polysight.pi_controller.journal import Journal
+from polysight.pi_controller.machine import END_LIMIT_S, Machine, RefusedError
 from polysight.pi_controller.stage import MOST_MM, StageDriver
 from polysight.pi_controller.stage_link import StageLostError, StageRefusedError
-from polysight.pi_controller.trigger import BurstSent, Counts, LoopFault, RowJob, TriggerLoop, TriggerWatch
+from polysight.pi_controller.trigger import BurstSent, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight.shared import messages as m
+from polysight.shared.config import Stage
 from polysight.shared.errors import ProtocolError
 from polysight.shared.faults import PiFault, StageError, explain
 from polysight.shared.raster import Row
@@ -38,7 +37,7 @@ class RunningRow:
 
     row: Row
     take: int
-    job: RowJob
+    job: Job
     sequence: int  # of the stage's ROW, and of its `done`
     status: m.RowStatus | None = None
     fault: int = 0
@@ -67,12 +66,12 @@ class RowMachine(Machine):
         self,
         stage: StageDriver,
         loop: TriggerLoop,
-        ledger: Ledger,
+        journal: Journal,
         post: Callable[[Callable[[], object]], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__(post, clock)
-        self.stage, self._loop, self._ledger = stage, loop, ledger
+        self.stage, self._loop, self._journal = stage, loop, journal
         self.row: RunningRow | None = None
         self.homed = self.in_run = False
         self.fault = 0  # the first one; its reason is in `reason`
@@ -87,9 +86,9 @@ class RowMachine(Machine):
     def take_burst(self, sent: BurstSent) -> None:
         """A burst has ended."""
         row, r = self.row, sent.record
-        if row is None or sent.job != row.job or not r.pulses:
+        if row is None or sent.job is not row.job or not r.pulses:
             return
-        self.emit(
+        self._journal.add(
             m.Capture, row_index=row.row.index, take=row.take, point=sent.point, column=row.row.column(sent.point),
             edge_ns=sent.edge_ns, first_pulse_ns=r.first_ns, last_pulse_ns=r.last_ns, pulses=r.pulses,
             width_max_ns=r.width_max_ns, jitter_ns=r.jitter_ns,
@@ -103,7 +102,7 @@ class RowMachine(Machine):
         if fault.job is None:
             self._lines_dead = True
             self.happen("lasting fault", fault.number, fault.detail)
-        elif self.row is not None and fault.job == self.row.job:
+        elif self.row is not None and fault.job is self.row.job:
             self.happen("row fault", fault.number, fault.detail)
 
     def take_stage(self, reply: Reply) -> None:
@@ -142,16 +141,16 @@ class RowMachine(Machine):
         if self._rests >= RESTS:
             self._rests = 0
             try:
-                self.stage.ask_how_it_ended()
+                self.stage.link.repeat()  # how the motion ended is told again
             except StageLostError as e:
-                self.happen("stage lost", PiFault.STAGE_LOST, str(e))
+                self.happen("stage lost", e.number, str(e))
 
     def _tell_status(self, reply: Reply) -> None:
         now = self._clock()
         if now - self._status_told_s < (STATUS_EVENT_S if self.state in MOVING else 1.0):
             return
         self._status_told_s = now
-        self.emit(
+        self._journal.add(
             m.StageStatus, state=reply.fields.get("state", ""), x_mm=self.stage.x_mm, y_mm=self.stage.y_mm,
             points=max(0, _number(reply, "points")), alarm=max(0, min(_number(reply, "alarm"), 999)),
         )  # fmt: skip
@@ -162,7 +161,7 @@ class RowMachine(Machine):
         if self._lines_dead:
             remedy = "find out why, then start polysight-pi again"
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self.reason, remedy=remedy)
-        self.homed = self._homing_underway = self._ledger.broken = False
+        self.homed = self._homing_underway = self._journal.broken = False
         self.fault, self.reason = 0, ""
         self._post(self._home_now)
 
@@ -175,7 +174,7 @@ class RowMachine(Machine):
         except StageRefusedError as e:
             self.happen("stage lost", PiFault.STAGE_ALARM, str(e))
         except StageLostError as e:
-            self.happen("stage lost", PiFault.STAGE_LOST, str(e))
+            self.happen("stage lost", e.number, str(e))
 
     def _note_homed(self, reply: Reply) -> str:
         self.stage.at_rest()
@@ -187,38 +186,33 @@ class RowMachine(Machine):
 
     def _begin_run(self, heartbeat_ms: int) -> None:
         self.in_run = True
-        self.promise(heartbeat_ms)
+        self.watch_host(heartbeat_ms)
 
     def _end_run(self) -> None:
         self.in_run = False
 
     def _start_row(self, row: Row, take: int, spec: BurstSpec, speed_mm_s: float) -> None:
-        job = self._loop.arm(RowJob(row.index, take, row.points, spec))
+        job = self._loop.arm(row.points, spec)
         try:
-            sequence = self.stage.row(stage_row(row, self.stage.config, speed_mm_s))
-        except StageRefusedError as e:
+            sequence = self.stage.row(row, speed_mm_s)
+        except (StageRefusedError, StageLostError) as e:
             self._loop.disarm()
-            if e.number in NOT_ANY_MORE_HOMED:
+            if isinstance(e, StageLostError):
+                self.happen("stage lost", e.number, str(e))
+            elif e.number in NOT_ANY_MORE_HOMED:
                 self.happen("not homed")
-            raise RefusedError(e.number, e.what, e.why, e.remedy) from None
-        except StageLostError as e:
-            self._loop.disarm()
-            self.happen("stage lost", PiFault.STAGE_LOST, str(e))
-            raise RefusedError(PiFault.STAGE_LOST, e.what, e.why, e.remedy) from None
+            raise
         self.row = RunningRow(row, take, job, sequence)
         self.row_limit_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
         self._rests, self._watch = 0, TriggerWatch()
         self.fault, self.reason = 0, ""
-        self.emit(m.RowStarted, row=row, take=take)
+        self._journal.add(m.RowStarted, row=row, take=take)
 
-    def _hold(self, byte: Immediate = Immediate.HOLD) -> None:
-        try:
-            self.stage.send(byte)
-        except StageLostError as e:
-            raise RefusedError(PiFault.STAGE_LOST, e.what, e.why, e.remedy) from None
+    def _hold(self) -> None:
+        self.stage.link.send_byte(Immediate.HOLD)
 
     def _resume(self) -> None:
-        self._hold(Immediate.RESUME)
+        self.stage.link.send_byte(Immediate.RESUME)
 
     # --- actions: how a row ends ------------------------------------------------------------------------------------
 
@@ -234,7 +228,7 @@ class RowMachine(Machine):
         """Stop what moves. Returns `ending` for a row that cannot be stopped."""
         if self.state in ("homing", "running", "held"):
             try:
-                self.stage.send(Immediate.STOP)
+                self.stage.link.send_byte(Immediate.STOP)
             except StageLostError:
                 return "ending" if self.row else None
         return None
@@ -307,7 +301,7 @@ class RowMachine(Machine):
         except StageRefusedError as e:
             self.homed = self.homed and e.number not in NOT_ANY_MORE_HOMED
         except StageLostError as e:
-            self._post(partial(self.happen, "stage lost", PiFault.STAGE_LOST, str(e)))
+            self._post(partial(self.happen, "stage lost", e.number, str(e)))
 
     def _finish_row(self) -> str:
         row, counts = self._current, self._loop.disarm()
@@ -315,9 +309,9 @@ class RowMachine(Machine):
             row.judge(counts)
             if row.fault:
                 self._tell_fault(row.fault, row.reason)
-        self.emit(
+        self._journal.add(
             m.RowFinished, row_index=row.row.index, take=row.take, status=row.status, points=row.points,
-            **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by(row.job.spec),
+            **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by,
         )  # fmt: skip
         self.row = None
         return "fault" if row.lasting else "ready" if self.homed else "idle"
@@ -331,15 +325,16 @@ class RowMachine(Machine):
     # --- events -----------------------------------------------------------------------------------------------------
 
     def _tell_fault(self, number: int, reason: str) -> None:
-        table = explain(number)
+        e = explain(number)
         if not self.fault:
             self.fault, self.reason = int(number), reason
-        self.emit(m.Fault, number=int(number), what=f"{table.what}: {reason}", why=table.why, remedy=table.remedy)
+        self._journal.add(m.Fault, number=int(number), what=f"{e.what}: {reason}", why=e.why, remedy=e.remedy)
 
-    def emit(self, kind: Any, **fields: Any) -> None:
-        """Add an event to the ledger; words are cut to what a reader takes."""
-        fields = {k: v[: m.MOST_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
-        self._ledger.add(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
+
+def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
+    """About how long a row takes, the longest way to its first point included."""
+    travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
+    return travel_s + abs(row.step_mm) * row.points / speed_mm_s + 4 * speed_mm_s / stage.accel_mm_s2
 
 
 def _number(reply: Reply, key: str, absent: int = 0) -> int:

@@ -13,11 +13,11 @@ import time
 import traceback
 from pathlib import Path
 
+import msgspec
 import zmq
 
-from polysight.pi_controller.executor import HUNG_S, Executor, Request, Snapshot, refused
+from polysight.pi_controller.executor import HUNG_S, Executor, refused
 from polysight.pi_controller.keys import AllowedKeys
-from polysight.shared import __version__
 from polysight.shared import messages as m
 from polysight.shared.errors import PolysightError, ProtocolError, VersionError
 from polysight.shared.faults import PiFault
@@ -29,15 +29,13 @@ Envelope = tuple[bytes, ...]
 
 
 class Server:
-    """Binds both sockets; `backend`, the name of the trigger lines, is told in HelloReply.
+    """Binds both sockets.
 
     Raises ConfigError or DeviceError when an address is wrong, in use, or has no keys.
     """
 
-    def __init__(
-        self, command_address: str, event_address: str, key_dir: Path, heartbeat_ms: int, backend: str
-    ) -> None:
-        self._heartbeat_ms, self._backend = heartbeat_ms, backend
+    def __init__(self, command_address: str, event_address: str, key_dir: Path, heartbeat_ms: int) -> None:
+        self._heartbeat_ms = heartbeat_ms
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._allowed = AllowedKeys(key_dir)
         self._secret = not is_loopback(command_address)
@@ -57,8 +55,11 @@ class Server:
 
     def publish(self, events: list[bytes]) -> None:
         """Send packed events, in order. From any thread; returns at once."""
-        for raw in events:
-            self._out.put(((), raw))
+        self._hand_over(*(((), raw) for raw in events))
+
+    def _hand_over(self, *messages: tuple[Envelope, bytes]) -> None:
+        for message in messages:
+            self._out.put(message)
         os.eventfd_write(self._wake, 1)
 
     def stop(self) -> None:
@@ -146,37 +147,23 @@ class Server:
         if executor.stands_still_s > HUNG_S:
             return refused(PiFault.PROGRAM, f"the executor has stood still for {executor.stands_still_s:.0f} s")
         if isinstance(command, m.Hello):
-            return self._hello(executor.snapshot)
+            return msgspec.structs.replace(executor.hello, t_unix_ns=time.time_ns())
         if isinstance(command, m.Status):
-            return executor.snapshot.status
+            return executor.status
         if isinstance(command, m.Alive):
             return executor.host_alive(command.scan_id, command.owner)
-        if executor.full(command):
-            return refused(PiFault.NOT_READY, "too many commands wait to be carried out", "", "wait for replies")
-        executor.post(Request(command, lambda reply: self._answer(envelope, reply)))
-        return None
-
-    def _answer(self, envelope: Envelope, reply: m.AnyReply) -> None:
-        self._out.put((envelope, m.pack(reply)))
-        os.eventfd_write(self._wake, 1)
-
-    def _hello(self, snapshot: Snapshot) -> m.HelloReply:
-        status = snapshot.status
-        return m.HelloReply(
-            pi_release=__version__, firmware=snapshot.firmware, backend=self._backend, state=status.state,
-            scan_id=status.scan_id, last_seq=status.last_seq, t_unix_ns=time.time_ns(), in_run=snapshot.in_run,
-            stage=snapshot.placing,
-        )  # fmt: skip
+        if executor.submit(command, lambda reply: self._hand_over((envelope, m.pack(reply)))):
+            return None
+        return refused(PiFault.NOT_READY, "too many commands wait to be carried out", "", "wait for replies")
 
     def _beat(self, executor: Executor) -> None:
         """Tell that this program lives; while the executor hangs, it does not."""
         if executor.stands_still_s > HUNG_S:
             return
-        snapshot = executor.snapshot
-        # Everything up to the snapshot's number has been handed over before the snapshot was taken, so draining first
-        # keeps a heartbeat from announcing an event that has not been sent.
+        # Every event up to the status's number was handed over before the status was taken, so draining first keeps a
+        # heartbeat from announcing an event that has not been sent.
+        status = executor.status
         self.drain()
-        status = snapshot.status
         beat = m.Heartbeat(
             scan_id=status.scan_id, seq=status.last_seq, t_mono_ns=time.monotonic_ns(), state=status.state,
             period_ms=self._heartbeat_ms,

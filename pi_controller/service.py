@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from polysight.pi_controller import realtime
+from polysight.pi_controller import system
 from polysight.pi_controller.executor import Executor
-from polysight.pi_controller.journal import TAKE_OVER_KEY, JournalFolder, JournalFullError
-from polysight.pi_controller.ledger import Ledger
-from polysight.pi_controller.lines import TriggerLines
-from polysight.pi_controller.memory import MemoryWatch
+from polysight.pi_controller.journal import Journal, JournalFullError
+from polysight.pi_controller.lines import open_lines
 from polysight.pi_controller.server import Server
 from polysight.pi_controller.stage import StageDriver
-from polysight.pi_controller.stage_link import StageNews
-from polysight.pi_controller.trigger import BenchBurst, BurstSent, LoopFault, TriggerLoop
-from polysight.pi_controller.wiring import open_lines
+from polysight.pi_controller.trigger import TriggerLoop
 from polysight.shared.config import Instrument
-from polysight.shared.errors import DeviceError
+from polysight.shared.errors import ConfigError, DeviceError
 
 END_LIMIT_S = 0.8
-
-
-@dataclass(frozen=True)
-class Options:
-    """What the command line adds to the rig file, or replaces in it."""
-
-    wires: Path | None = None
-    stage_port: str | None = None
-    journal: Path | None = None
-    command_address: str | None = None
-    event_address: str | None = None
+TAKE_OVER_KEY = "take-over-key"  # file beside the journals: owner of every run, for the person at the Pi
 
 
 def log(text: str) -> None:
@@ -44,7 +31,7 @@ def log(text: str) -> None:
 
 
 class Service:
-    """The Pi half as a whole; `lines` are used instead of opening those of the rig.
+    """The Pi half as a whole, on GPIO or on simulated wires.
 
     Raises
     ------
@@ -52,43 +39,32 @@ class Service:
         when an address, a line, the journal or the stage cannot be had. What was opened before is closed again.
     """
 
-    def __init__(self, instrument: Instrument, options: Options, lines: TriggerLines | None = None) -> None:
-        pi, simulated = instrument.pi, options.wires is not None
+    def __init__(self, instrument: Instrument, wires: Path | None = None) -> None:
+        pi, folder = instrument.pi, Path(instrument.pi.journal_dir)
         with ExitStack() as opened:
-            folder = JournalFolder(options.journal or Path(pi.journal_dir))
-            opened.callback(folder.close)
-            lines = lines or open_lines(instrument, options.wires, log)
+            journal = Journal(folder, lambda events: self.server.publish(events), log)
+            opened.callback(_close, journal)
             # What is not permitted to its thread was not permitted to the process, which has said so.
-            prepare = (lambda: None) if simulated else realtime.prepare_thread
-            self._loop = TriggerLoop(lines, self._post, prepare)
+            prepare = system.prepare_thread if wires is None else lambda: None
+            self._loop = TriggerLoop(open_lines(instrument, wires), self._post, prepare)
             opened.callback(self._loop.stop)
-            addresses = options.command_address or pi.command_address, options.event_address or pi.event_address
-            self.server = Server(*addresses, Path(pi.key_dir), pi.heartbeat_ms, lines.name)
+            self.server = Server(pi.command_address, pi.event_address, Path(pi.key_dir), pi.heartbeat_ms)
             opened.callback(self.server.close)
-            self._ledger = Ledger(folder, self.server.publish, log)
-            opened.callback(self._close_ledger)
-            stage = StageDriver(instrument.stage, options.stage_port or instrument.stage.port, self._post)
+            stage = StageDriver(instrument.stage, self._post)
             opened.callback(stage.close)
-            turned = partial(realtime.notify_systemd, "WATCHDOG=1")
-            self.executor = Executor(stage, self._loop, self._ledger, not pi.one_shot, turned)
-            folder.write_secret(TAKE_OVER_KEY, self.executor.take_over_key)
+            self.executor = Executor(stage, self._loop, journal, partial(system.notify_systemd, "WATCHDOG=1"))
+            _write_secret(folder / TAKE_OVER_KEY, self.executor.take_over_key)
             stage.connect()
             self._opened = opened.pop_all()
 
-    def _post(self, item: StageNews | BurstSent | BenchBurst | LoopFault) -> None:
+    def _post(self, item: Any) -> None:
         self.executor.post(item)
-
-    def _close_ledger(self) -> None:
-        try:
-            self._ledger.close()
-        except JournalFullError as e:
-            log(str(e))
 
     def serve(self) -> None:
         """Serve until :meth:`stop`; then stop the stage and end the row. Raises DeviceError when a part failed."""
         self._loop.start()
         self.executor.start()
-        memory = MemoryWatch(self.server.ports, log)
+        memory = system.MemoryWatch(self.server.ports, log)
         memory.start()
         self.server.run(self.executor)
         memory.stop()
@@ -109,23 +85,40 @@ class Service:
         self._opened.close()
 
 
-def run(instrument: Instrument, options: Options) -> int:
+def _close(journal: Journal) -> None:
+    try:
+        journal.close()
+    except JournalFullError as e:
+        log(str(e))
+
+
+def _write_secret(path: Path, secret: str) -> None:
+    """Write a file that this program's user alone can read. Raises ConfigError."""
+    try:
+        path.unlink(missing_ok=True)
+        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as file:
+            file.write(secret)
+    except OSError as e:
+        raise ConfigError(f"{path}: {e.strerror}", "the disk is full or read-only", "free space there") from None
+
+
+def run(instrument: Instrument, wires: Path | None) -> int:
     """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout when it serves.
 
     Raises ConfigError or DeviceError when it cannot start.
     """
-    if options.wires is not None:
-        realtime.die_with_parent(signal.SIGTERM)
+    if wires is not None:
+        system.die_with_parent(signal.SIGTERM)
     else:
-        for sentence in realtime.prepare_process():
+        for sentence in system.prepare_process():
             log(sentence)
-    service = Service(instrument, options)
+    service = Service(instrument, wires)
     try:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: service.stop())
         sys.stdout.write(f"ready {service.server.command_address}\nevents {service.server.event_address}\n")
         sys.stdout.flush()
-        realtime.notify_systemd("READY=1")
+        system.notify_systemd("READY=1")
         service.serve()
     finally:
         service.close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from polysight.pi_controller.lines import DEFAULT_BUFSIZ, Edge, SpiBurst
+from polysight.pi_controller.bursts import DEFAULT_BUFSIZ, Edge, SpiBurst
 from polysight.shared.config import Pi
 from polysight.shared.messages import WIRES
 from polysight.shared.wires import WireClient, WireEdge
@@ -20,9 +20,10 @@ class WireLines:
 
     name: str = WIRES
 
-    def __init__(self, path: Path, pi: Pi, timeout_s: float = 10.0) -> None:
+    def __init__(self, path: Path, pi: Pi) -> None:
+        self.check_width = not pi.one_shot
         self._trigger, self._outputs = pi.trigger_in, pi.sync_out
-        self._client = WireClient(path, listen=(pi.trigger_in,), timeout_s=timeout_s)
+        self._client = WireClient(path, listen=(pi.trigger_in,))
         self._now_ns = self._seqno = 0
         self._active = False
         self._unsent: list[WireEdge] = []
@@ -36,7 +37,11 @@ class WireLines:
         self._now_ns = max(self._now_ns, t_ns)
 
     def wait_edge(self, limit_s: float) -> Edge | None:
-        """The next rising edge of the trigger line. Raises DeviceError when the hub is gone."""
+        """Send the edges of the last burst, and wait for the next rising edge of the trigger line.
+
+        Raises DeviceError when the hub is gone.
+        """
+        self._flush()
         deadline = time.monotonic() + limit_s
         while (left := deadline - time.monotonic()) > 0:
             message = self._client.receive(left)
@@ -47,21 +52,19 @@ class WireLines:
         return None
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
-        """Note a pulse on all output lines from wire time now on; :meth:`flush` sends it."""
+        """Make a pulse on all output lines from wire time now on."""
         begin_ns = self._now_ns
-        self.set_output(True)
+        self._set_output(True)
         self.sleep_until(begin_ns + width_ns)
-        self.set_output(False)
+        self._set_output(False)
         return begin_ns, self._now_ns
 
-    def set_output(self, active: bool) -> None:
-        """Note the change of all output lines at wire time now."""
+    def _set_output(self, active: bool) -> None:
         if active != self._active:
             self._active = active
             self._unsent += [WireEdge(self._now_ns, line, int(active)) for line in self._outputs]
 
-    def flush(self) -> None:
-        """Send all changes in one write. Raises DeviceError when the hub is gone."""
+    def _flush(self) -> None:
         if self._unsent:
             unsent, self._unsent = self._unsent, []
             self._client.send(*unsent)
@@ -69,8 +72,8 @@ class WireLines:
     def close(self) -> None:
         """Leave the wires, outputs low."""
         try:
-            self.set_output(False)
-            self.flush()
+            self._set_output(False)
+            self._flush()
         finally:
             self._client.close()
 
@@ -87,6 +90,6 @@ class SpiWireLines(WireLines):
             if byte or self._active:
                 for k in range(8):
                     self._now_ns = begin_ns + round((8 * i + k) * burst.bit_ns)
-                    self.set_output(bool(byte << k & 0x80))
+                    self._set_output(bool(byte << k & 0x80))
         self._now_ns = begin_ns + round(burst.duration_ns)
         return begin_ns, self._now_ns

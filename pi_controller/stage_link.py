@@ -18,19 +18,32 @@ from typing import NamedTuple
 import serial
 
 from polysight.shared.errors import DeviceError, ProtocolError
-from polysight.shared.faults import StageError, explain
-from polysight.shared.stage_line import MAX_LINE_BYTES, MAX_SEQUENCE, PROTOCOL_VERSION, Command, Immediate, Reply
+from polysight.shared.faults import PiFault, StageError, explain
+from polysight.shared.stage_line import (
+    MAX_LINE_BYTES,
+    MAX_SEQUENCE,
+    PROTOCOL_VERSION,
+    Command,
+    Immediate,
+    Reply,
+)
 
 # The first opening of the port resets an UNO: its boot loader takes up to 2 s before the sketch sends its banner.
 BANNER_LIMIT_S = 3.0
 # Longer than the longest line and its answer take at 115200 baud (14 ms), with room for a busy machine.
 ANSWER_LIMIT_S = 0.5
 TRIES = 4
-SEND_AGAIN = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
+RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
+STATUS_PER_HEARTBEAT = 4  # while moving
+# A status unanswered for so much of a heartbeat: the stage is lost. With the time to the next question and a look at
+# the port, a stage that falls silent is noticed before its own heartbeat stops it.
+SILENT_HEARTBEATS = 0.5
 
 
 class StageLostError(DeviceError):
     """The stage does not answer, or its port is gone."""
+
+    number = PiFault.STAGE_LOST
 
 
 class StageRefusedError(DeviceError):
@@ -54,9 +67,10 @@ StageNews = Reply | StageLost
 class StatusWatch:
     """When to ask the stage for its status, and when it has been silent for too long."""
 
-    def __init__(self, silence_s: float, now_s: float) -> None:
-        self._silence_s, self._asked_s = silence_s, now_s
+    def __init__(self, heartbeat_s: float, now_s: float) -> None:
+        self._silence_s, self._asked_s = SILENT_HEARTBEATS * heartbeat_s, now_s
         self._unanswered_since_s: float | None = None
+        self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)  # how often to ask `is_due` and `silent_s`
         self.interval_s = 0.0  # 0: it is not asked
 
     def is_due(self, now_s: float) -> bool:
@@ -78,13 +92,6 @@ class StatusWatch:
         return silent_s if silent_s > self._silence_s else 0.0
 
 
-def _keep_dtr(port: int) -> None:
-    """Let DTR stay up when the port is closed: its rise resets an UNO, which would forget where the stage stands."""
-    settings = termios.tcgetattr(port)
-    settings[2] &= ~termios.HUPCL
-    termios.tcsetattr(port, termios.TCSANOW, settings)
-
-
 class StageLink:
     """One open serial link to `port`. Every method raises StageLostError when the stage does not answer.
 
@@ -93,10 +100,8 @@ class StageLink:
     news
         Takes, from the reader thread, every reply that answers no line, every `ok` (it divides what came before a
         command from what came after), and one :class:`StageLost` when the link dies. Must return at once.
-    silence_s
-        The stage is lost when a status byte stays unanswered for this long.
-    read_slice_s
-        How often the reader looks whether a status byte is due.
+    heartbeat_s
+        Of the stage: its status, once asked for, is answered within half of it, or the stage is lost.
     banner_limit_s
         How long to wait for the banner of a stage that the opening reset; without one it is greeted all the same.
     """
@@ -106,15 +111,17 @@ class StageLink:
         port: str,
         baud: int,
         news: Callable[[StageNews], None],
-        silence_s: float = 1.0,
-        read_slice_s: float = 0.05,
+        heartbeat_s: float = 2.0,
         banner_limit_s: float = BANNER_LIMIT_S,
     ) -> None:
-        self.port = port
-        self._news = news
+        self.port, self._news = port, news
+        self._watch = StatusWatch(heartbeat_s, time.monotonic())
         try:
-            self._serial = serial.Serial(port, baud, timeout=read_slice_s, write_timeout=1.0, exclusive=True)
-            _keep_dtr(self._serial.fileno())
+            self._serial = serial.Serial(port, baud, timeout=self._watch.look_s, write_timeout=1.0, exclusive=True)
+            # DTR stays up when the port is closed: its rise resets an UNO, which would forget where the stage stands.
+            settings = termios.tcgetattr(self._serial.fileno())
+            settings[2] &= ~termios.HUPCL
+            termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, settings)
         except (OSError, ValueError, termios.error) as e:  # SerialException is an OSError
             reason = os.strerror(e.errno) if isinstance(e, OSError) and e.errno else str(e)
             raise StageLostError(
@@ -126,13 +133,10 @@ class StageLink:
         self._answers: queue.SimpleQueue[Reply | None] = queue.SimpleQueue()
         self._banner: Reply | None = None
         self._banner_seen = threading.Event()
-        self._greeted = False
-        self._sequence = 0
+        self._greeted = self._closing = False
+        self._sequence = self.bad_lines = 0
         self._last_line = b""
-        self._watch = StatusWatch(silence_s, time.monotonic())
         self.lost = ""  # why the link is dead
-        self._closing = False
-        self.bad_lines = 0
         self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
         self._reader.start()
         try:
@@ -171,13 +175,13 @@ class StageLink:
     def _exchange(self, verb: str, args: tuple[int, ...]) -> Reply:
         sequence = self._sequence
         self._sequence = sequence + 1 if sequence < MAX_SEQUENCE else 0
-        self._last_line = line = Command(sequence, verb, args).encode()
+        self._last_line = Command(sequence, verb, args).encode()
         while not self._answers.empty():
             self._answers.get()
         for _ in range(TRIES):
-            self._write(line)
+            self._write(self._last_line)
             answer = self._answer(sequence)
-            if answer is not None and answer.number not in SEND_AGAIN:
+            if answer is not None and answer.number not in RETRIED:
                 return answer
         raise StageLostError(
             f"stage at {self.port} does not answer {verb}" + (f": {self.lost}" if self.lost else ""),
@@ -192,21 +196,16 @@ class StageLink:
                 answer = self._answers.get(timeout=left)
             except queue.Empty:
                 return None
-            if answer is None:
-                return None
-            if answer.sequence == sequence or (answer.kind == "error" and answer.sequence is None):
+            if answer is None or answer.sequence == sequence or (answer.kind == "error" and answer.sequence is None):
                 return answer
         return None
 
     def send_byte(self, byte: Immediate) -> None:
-        """Send an immediate byte. Raises StageLostError when the port is gone."""
+        """Send an immediate byte."""
         self._write(byte.sent)
 
     def repeat(self) -> None:
-        """Send the last line again: the stage repeats its answer, and how the motion ended, without moving.
-
-        Raises StageLostError when the port is gone.
-        """
+        """Send the last line again: the stage repeats its answer, and how the motion ended, without moving."""
         self._write(self._last_line)
 
     def ask_status_every(self, interval_s: float) -> None:
@@ -230,9 +229,8 @@ class StageLink:
                 self._serial.write(data)
         except OSError as e:
             self._die(f"writing failed: {e}")
-            raise StageLostError(
-                f"stage at {self.port} is lost: {e}", "cable unplugged, or the board lost power", "check the USB cable"
-            ) from None
+            unplugged = "cable unplugged, or the board lost power"
+            raise StageLostError(f"stage at {self.port} is lost: {e}", unplugged, "check the USB cable") from None
 
     def _die(self, reason: str) -> None:
         if self.lost or self._closing:
@@ -282,10 +280,8 @@ class StageLink:
             return
         if reply.kind in ("ok", "error"):
             self._answers.put(reply)
-            if reply.kind == "ok" and self._greeted:
-                self._news(reply)
         elif reply.kind == "banner" and not self._greeted:
             self._banner = reply
             self._banner_seen.set()
-        elif self._greeted:
+        if self._greeted and reply.kind != "error":
             self._news(reply)

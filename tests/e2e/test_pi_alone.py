@@ -62,7 +62,7 @@ def test_help(arguments):
 
 def test_gpio_without_gpiod_is_one_message():
     code = (
-        "from polysight.pi_controller.gpio import load_gpiod\n"
+        "from polysight.pi_controller.lines import load_gpiod\n"
         "from polysight.shared.errors import PolysightError\n"
         "try:\n    load_gpiod()\nexcept PolysightError as e:\n    print(e)\n"
     )

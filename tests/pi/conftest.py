@@ -10,13 +10,13 @@ import msgspec
 import pytest
 import tomli_w
 
-from polysight.pi_controller.service import Options, Service
+from polysight.pi_controller.service import Service
 from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
 from tests.support.pi.fake_stage import FakeStage
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.mini_hub import MiniHub
-from tests.support.rigs import published_rig
+from tests.support.rigs import at_stage_port, published_rig
 
 
 @pytest.fixture
@@ -78,8 +78,8 @@ def stage(hub: Path, instrument: Instrument) -> Iterator[FakeStage]:
 class Running:
     """A service in a thread, and the host's end of its sockets."""
 
-    def __init__(self, instrument: Instrument, options: Options) -> None:
-        self.service = Service(instrument, options)
+    def __init__(self, instrument: Instrument, wires: Path) -> None:
+        self.service = Service(instrument, wires)
         self.thread = threading.Thread(target=self.service.serve)
         self.thread.start()
         server = self.service.server
@@ -95,6 +95,6 @@ class Running:
 @pytest.fixture
 def pi(instrument: Instrument, stage: FakeStage, hub: Path) -> Iterator[Running]:
     """The whole Pi half in this process, over real sockets, a pty and simulated wires."""
-    running = Running(instrument, Options(wires=hub, stage_port=stage.port))
+    running = Running(at_stage_port(instrument, stage.port), hub)
     yield running
     running.close()

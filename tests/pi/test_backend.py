@@ -7,15 +7,15 @@ import threading
 import msgspec
 import pytest
 
-from polysight.pi_controller import realtime
-from polysight.pi_controller import wiring as wirings
-from polysight.pi_controller.gpio import GpiodLines
-from polysight.pi_controller.service import Options, Service
+from polysight.pi_controller import lines as pi_lines
+from polysight.pi_controller import system
+from polysight.pi_controller.lines import GpiodLines, SpiLines
+from polysight.pi_controller.service import Service
 from polysight.pi_controller.sim_lines import WireLines
-from polysight.pi_controller.spi import SpiLines
 from polysight.shared import messages as m
 from polysight.shared.messages import is_simulated
 from tests.support.pi.host_side import HostSide
+from tests.support.rigs import at_stage_port
 
 
 def test_lines_of_pins_are_hardware_and_all_others_are_simulated():
@@ -40,11 +40,11 @@ def test_hello_tells_the_lines_that_are_driven(instrument, stage, hub, monkeypat
         return open_it
 
     rig = msgspec.structs.replace(instrument, pi=msgspec.structs.replace(instrument.pi, wiring=wiring))
-    monkeypatch.setattr(wirings, "GpiodLines", standing_in(GpiodLines))
-    monkeypatch.setattr(wirings, "SpiLines", standing_in(SpiLines))
-    monkeypatch.setattr(wirings, "load_gpiod", lambda: None)
-    monkeypatch.setattr(realtime, "prepare_thread", list)
-    running = Service(rig, Options(wires=hub if simulated else None, stage_port=stage.port))
+    monkeypatch.setattr(pi_lines, "GpiodLines", standing_in(GpiodLines))
+    monkeypatch.setattr(pi_lines, "SpiLines", standing_in(SpiLines))
+    monkeypatch.setattr(pi_lines, "load_gpiod", lambda: None)
+    monkeypatch.setattr(system, "prepare_thread", list)
+    running = Service(at_stage_port(rig, stage.port), hub if simulated else None)
     thread = threading.Thread(target=running.serve)
     thread.start()
     host = HostSide(running.server.command_address, running.server.event_address, rig)

@@ -7,15 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.pi_controller.lines import BurstSpec, Edge
+from polysight.pi_controller.bursts import BurstSpec, Edge, send_burst
 from polysight.pi_controller.trigger import (
     FIRST_PULSE_DELAY_NS,
     BurstSent,
     Counts,
     LoopFault,
-    RowJob,
     TriggerLoop,
-    send_burst,
 )
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import MIN_PERIOD_NS
@@ -60,7 +58,9 @@ def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
     assert sent.width_max_ns == worst
     assert sent.fault == (PiFault.PULSE_TOO_LONG if worst > 4000 else 0)
     assert sent.pulses == (k + 1 if worst > 4000 else 16)
-    free = send_burst(FakeLines(long=lines.long), SPEC._replace(check_width=False), 1_000)
+    lines = FakeLines(long=lines.long)
+    lines.check_width = False
+    free = send_burst(lines, SPEC, 1_000)
     assert (free.fault, free.pulses) == (0, 16)
 
 
@@ -84,7 +84,7 @@ class Loop:
     def __init__(self, points=3, lines=None):
         self.lines, self.posted = lines or FakeLines(), queue.SimpleQueue()
         self.loop = TriggerLoop(self.lines, self.posted.put, lambda: None)
-        self.job = self.loop.arm(RowJob(0, 1, points, SPEC))
+        self.job = self.loop.arm(points, SPEC)
         self.loop.start()
 
     def edge(self, t_ms, seqno):
@@ -155,7 +155,7 @@ def test_edges_from_before_arming_or_while_disarmed_are_no_points():
         x.edge(100, 1)
         while not x.loop.strays:
             pass
-        job = x.loop.arm(RowJob(1, 1, 3, SPEC))
+        job = x.loop.arm(3, SPEC)
         assert job.armed_ns == 100_000_000
         x.edge(100, 2)
         x.edge(200, 3)

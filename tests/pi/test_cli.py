@@ -7,8 +7,8 @@ import socket
 
 import pytest
 
+from polysight.pi_controller.bursts import BurstRecord
 from polysight.pi_controller.cli import main
-from polysight.pi_controller.trigger import BurstRecord
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from polysight.simulators.loopback import on_free_subnet
@@ -132,7 +132,7 @@ def test_check_names_every_hop(config, hub, stage):
     done = run("check", "--config", config, "--wires", hub, "--stage-port", stage.port, "--json")
     findings = {f["name"]: f for f in json.loads(done.stdout)}
     assert done.returncode == 0, findings
-    assert {"plan", "clock", "simulated wires", "stage port", "stage", "journal", "command address"} <= set(findings)
+    assert {"plan", "simulated wires", "stage", "journal", "command address"} <= set(findings)
     done = run("check", "--config", config, "--wires", hub)
     assert done.returncode == 1
     assert "fail  stage" in done.stdout
@@ -173,10 +173,10 @@ def test_no_speed_is_not_taken_for_another_one(config, speed, capsys):
 
 def test_pulse_says_why_it_did_not_work(config, monkeypatch, capsys):
     late = BurstRecord(2, 0, 1, 2, 1000, 900, PiFault.PERIOD_TOO_SHORT)
-    monkeypatch.setattr("polysight.pi_controller.wiring.open_lines", lambda *_: FakeLines())
-    monkeypatch.setattr("polysight.pi_controller.trigger.send_bursts", lambda *_: [late, late._replace(fault=0), late])
-    monkeypatch.setattr("polysight.pi_controller.realtime.prepare_process", list)
-    monkeypatch.setattr("polysight.pi_controller.realtime.prepare_thread", list)
+    monkeypatch.setattr("polysight.pi_controller.lines.open_lines", lambda *_: FakeLines())
+    monkeypatch.setattr("polysight.pi_controller.bursts.send_bursts", lambda *_: [late, late._replace(fault=0), late])
+    monkeypatch.setattr("polysight.pi_controller.system.prepare_process", list)
+    monkeypatch.setattr("polysight.pi_controller.system.prepare_thread", list)
     assert main(["pulse", "--config", str(config)]) == 1
     said = capsys.readouterr().err
     assert "fault 106 in 2 of 3 bursts" in said

@@ -15,10 +15,9 @@ from polysight.pi_controller.journal import (
     MAGIC,
     SPARE_BYTES,
     Journal,
-    JournalFolder,
+    JournalFile,
     JournalFullError,
 )
-from polysight.pi_controller.ledger import Ledger
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 from polysight.shared.messages import RunStopped, unpack_event
 from polysight.shared.raster import RasterPlan
@@ -28,14 +27,14 @@ payloads = st.lists(st.binary(max_size=40), max_size=12)
 
 def written(path, records):
     path.unlink(missing_ok=True)
-    j = Journal(path)
+    j = JournalFile(path)
     j.write(records)
     j.close()
     return path.read_bytes()
 
 
 def reopened(path):
-    j = Journal(path)
+    j = JournalFile(path)
     found = j.read(1, 10**6)
     j.close()
     return found
@@ -81,34 +80,33 @@ def test_a_damaged_byte_loses_only_what_lies_behind_it(tmp_path_factory, records
 def test_replay_from_any_sequence_over_a_restart(tmp_path_factory, first, second, seq, limit):
     path = tmp_path_factory.mktemp("j") / "a.journal"
     written(path, first)
-    j = Journal(path)
+    j = JournalFile(path)
     assert j.last_seq == len(first)
     j.write(second)
     assert j.last_seq == len(first + second)
     assert j.read(seq, limit) == (first + second)[seq - 1 : seq - 1 + limit]
     j.close()
-    folder = JournalFolder(path.parent)
+    folder = Journal(path.parent)
     assert folder.read("a", seq, limit) == ((first + second)[seq - 1 : seq - 1 + limit], len(first + second))
     folder.close()
 
 
 def test_what_is_in_the_batch_is_neither_kept_nor_published_until_committed(tmp_path):
-    folder, published = JournalFolder(tmp_path), []
-    ledger = Ledger(folder, published.extend)
-    ledger.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    published = []
+    journal = Journal(tmp_path, published.extend)
+    journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
     for _ in range(2):
-        ledger.add(RunStopped(scan_id="", seq=0, t_mono_ns=0, exit_status="abort"))
-    assert (ledger.last_seq, ledger.replay("s", 1, 9).events, published) == (2, [], [])
-    ledger.commit()
-    assert [e.seq for e in ledger.replay("s", 1, 9).events] == [1, 2]
+        journal.add(RunStopped, exit_status="abort")
+    assert (journal.last_seq, journal.read("s", 1, 9)[0], published) == (2, [], [])
+    journal.commit()
+    assert [unpack_event(raw).seq for raw in journal.read("s", 1, 9)[0]] == [1, 2]
     assert [unpack_event(raw).seq for raw in published] == [1, 2]
-    ledger.close()
-    folder.close()
+    journal.close()
 
 
 @pytest.mark.parametrize("room", [0, 1, 13, 25])
 def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
-    j = Journal(tmp_path / "a.journal")
+    j = JournalFile(tmp_path / "a.journal")
     j.write([b"kept"])
     real, left = os.pwrite, [room]
 
@@ -134,19 +132,19 @@ def test_a_stranger_file_is_refused_and_kept(tmp_path):
     path = tmp_path / "a.journal"
     path.write_bytes(b"somebody's notes")
     with pytest.raises(DataError):
-        Journal(path)
+        JournalFile(path)
     assert path.read_bytes() == b"somebody's notes"
 
 
 def test_one_process_a_folder(tmp_path):
-    folder = JournalFolder(tmp_path / "j")
+    folder = Journal(tmp_path / "j")
     with pytest.raises(DeviceError, match="in use"):
-        JournalFolder(tmp_path / "j")
+        Journal(tmp_path / "j")
     folder.close()
-    JournalFolder(tmp_path / "j").close()
+    Journal(tmp_path / "j").close()
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError):
-        JournalFolder(tmp_path / "file" / "j")
+        Journal(tmp_path / "file" / "j")
 
 
 @given(first=payloads, passed=st.integers(0, 40), second=payloads, seq=st.integers(1, 60), limit=st.integers(1, 30))
@@ -155,23 +153,23 @@ def test_numbers_go_on_behind_what_the_host_has(tmp_path_factory, first, passed,
     """Whatever the journal has lost, no number is used twice, also after another restart."""
     path = tmp_path_factory.mktemp("j") / "a.journal"
     written(path, first)
-    j = Journal(path)
+    j = JournalFile(path)
     assert j.number_behind(passed) == max(0, passed - len(first))
     begin = max(passed, len(first)) + 1
     j.write(second)
     j.close()
-    j = Journal(path)
+    j = JournalFile(path)
     numbered = {i + 1: r for i, r in enumerate(first)} | {begin + i: r for i, r in enumerate(second)}
     assert j.last_seq == max(numbered, default=0)
     assert j.read(seq, limit) == [r for n, r in numbered.items() if n >= seq][:limit]
     j.close()
 
 
-@pytest.mark.parametrize("left", [b"", MAGIC[:3], bytes(8), bytes(4096)])
+@pytest.mark.parametrize("left", [b"", MAGIC[:3], MAGIC[:3] + bytes(5), MAGIC[:1] + bytes(1), bytes(8), bytes(4096)])
 def test_what_a_power_cut_leaves_of_a_new_journal_is_an_empty_one(tmp_path, left):
     path = tmp_path / "a.journal"
     path.write_bytes(left)
-    j = Journal(path)
+    j = JournalFile(path)
     assert (j.last_seq, path.read_bytes()) == (0, MAGIC)
     j.write([b"x"])
     assert j.last_seq == 1
@@ -186,7 +184,7 @@ def test_damage_in_the_middle_is_told_and_the_file_as_it_was_is_kept(tmp_path):
     for number in ("", "2"):  # a second damage does not replace the first one's copy
         raw[at] ^= 1
         path.write_bytes(raw)
-        j = Journal(path)
+        j = JournalFile(path)
         copy = path.with_name(path.name + DAMAGED + number)
         assert (j.last_seq, j.read(1, 9), copy.read_bytes()) == (1, [b"one"], bytes(raw))
         assert str(copy) in j.damage
@@ -201,30 +199,29 @@ def test_what_a_power_cut_leaves_is_no_damage(tmp_path_factory, records, data):
     path = tmp_path_factory.mktemp("j") / "a.journal"
     raw = written(path, records)
     path.write_bytes(raw[: data.draw(st.integers(0, len(raw)))] + bytes(data.draw(st.sampled_from([0, 1, 4096]))))
-    j = Journal(path)
+    j = JournalFile(path)
     assert j.damage == ""
     j.close()
     assert not list(path.parent.glob("*" + DAMAGED + "*"))
 
 
 def test_a_damaged_journal_is_a_line_of_the_log(tmp_path):
-    folder = JournalFolder(tmp_path)
     said: list[str] = []
-    ledger = Ledger(folder, lambda _: None, said.append)
-    ledger.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
-    ledger.close()
-    path = folder.path_of("s")
+    journal = Journal(tmp_path, warn=said.append)
+    journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    journal.close()
+    path = journal.path_of("s")
     raw = written(path, [b"one", b"two", b"three"]).replace(b"one", b"0ne")
     path.write_bytes(raw)
-    ledger.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
+    journal = Journal(tmp_path, warn=said.append)
+    journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
     assert len(said) == 1, "the log has a line of it"
     assert DAMAGED in said[0]
-    ledger.close()
-    folder.close()
+    journal.close()
 
 
 def test_no_scan_begins_without_room_for_its_journal(tmp_path, monkeypatch):
-    folder = JournalFolder(tmp_path)
+    folder = Journal(tmp_path)
     folder.check_room("scan", 70_000)
     free = SPARE_BYTES + 70_000 * CAPTURE_BYTES
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
@@ -235,7 +232,7 @@ def test_no_scan_begins_without_room_for_its_journal(tmp_path, monkeypatch):
 
 
 def test_a_scan_that_goes_on_needs_room_for_the_rest_only(tmp_path, monkeypatch):
-    folder = JournalFolder(tmp_path)
+    folder = Journal(tmp_path)
     folder.path_of("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
     free = SPARE_BYTES + 1_000 * CAPTURE_BYTES
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))

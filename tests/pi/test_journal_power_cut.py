@@ -2,42 +2,35 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import pytest
 
-from polysight.pi_controller.journal import JournalFolder
-from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.journal import Journal
 from polysight.shared import messages as m
 from polysight.shared.raster import RasterPlan
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 
 PLAN = RasterPlan(3, 2, 1.0, 1.0)
-NEW: dict[str, Any] = {"scan_id": "", "seq": 0, "t_mono_ns": 0}
 
 
-def events() -> list[m.AnyEvent]:
+def events() -> list[tuple[type[m.AnyEvent], dict[str, Any]]]:
     """Two rows, and the scan's end."""
-    scan: list[m.AnyEvent] = [m.RunStarted(**NEW, plan=PLAN)]
+    scan: list[tuple[type[m.AnyEvent], dict[str, Any]]] = [(m.RunStarted, {"plan": PLAN})]
     for row in PLAN:
-        scan.append(m.RowStarted(**NEW, row=row, take=1))
-        scan += [
-            m.Capture(
-                **NEW, row_index=row.index, take=1, point=k, column=k, edge_ns=k, first_pulse_ns=k, last_pulse_ns=k,
-                pulses=1, width_max_ns=1, jitter_ns=0,
-            )
-            for k in range(row.points)
-        ]  # fmt: skip
-        scan.append(
-            m.RowFinished(
-                **NEW, row_index=row.index, take=1, status="done", points=3, edges=3, bursts=3, pulses=3
-            )
-        )  # fmt: skip
-    return [*scan, m.RunStopped(**NEW, exit_status="success")]
+        scan.append((m.RowStarted, {"row": row, "take": 1}))
+        for k in range(row.points):
+            places = {"point": k, "column": k, "edge_ns": k, "first_pulse_ns": k, "last_pulse_ns": k}
+            burst = {"pulses": 1, "width_max_ns": 1, "jitter_ns": 0}
+            scan.append((m.Capture, {"row_index": row.index, "take": 1, **places, **burst}))
+        counts = dict.fromkeys(("points", "edges", "bursts", "pulses"), 3)
+        scan.append((m.RowFinished, {"row_index": row.index, "take": 1, "status": "done", **counts}))
+    return [*scan, (m.RunStopped, {"exit_status": "success"})]
 
 
-def same(event: m.AnyEvent, other: m.AnyEvent) -> bool:
-    return type(event) is type(other) and getattr(event, "point", 0) == getattr(other, "point", 0)
+def same(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, Any]]) -> bool:
+    return type(event) is other[0] and getattr(event, "point", 0) == other[1].get("point", 0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -46,28 +39,29 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
     while not ended:
         at += 1
         path = tmp_path / str(at)
-        folder, published = JournalFolder(path), []
-        ledger = Ledger(folder, lambda raws, told=published: told.extend(map(m.unpack_event, raws)))
+        published = []
+        journal = Journal(path, lambda raws, told=published: told.extend(map(m.unpack_event, raws)))
         try:
             with FaultyDisk(path, "power cut", at, seed)():
-                ledger.open("s", PLAN, 0)
+                journal.open("s", PLAN, 0)
                 for event in added:
-                    ledger.add(event)
-                    ledger.commit()
-                ledger.close()
+                    journal.add(event[0], **event[1])
+                    journal.commit()
+                journal.close()
             ended = True
         except Killed:
             pass
-        again = Ledger(folder, lambda _: None)
+        if not ended:
+            os.close(journal._lock)  # as its end would
+        again = Journal(path)
         again.open("s", PLAN, 0)
-        kept = again.replay("s", 1, 1000).events
+        kept = [m.unpack_event(raw) for raw in again.read("s", 1, 1000)[0]]
         assert [e.seq for e in kept] == list(range(1, len(kept) + 1))
         assert all(map(same, kept, added)), "a prefix of what was added"
         synced = max((e.seq for e in published if not isinstance(e, m.Capture)), default=0)
         assert len(kept) >= synced, "what was published as synced is on the disk"
-        again.add(added[-1])
+        again.add(added[-1][0], **added[-1][1])
         again.commit()
         assert again.last_seq == len(kept) + 1
         again.close()
-        folder.close()
     assert at > 20

@@ -16,7 +16,6 @@ from polysight.host.acquisition.pi_client import PiClient
 from polysight.pi_controller import checks
 from polysight.pi_controller.checks import attempt
 from polysight.pi_controller.cli import main
-from polysight.pi_controller.executor import Snapshot
 from polysight.pi_controller.keys import COPY, allow, make_keys, read_allowed, revoke
 from polysight.pi_controller.server import Server
 from polysight.shared import messages as m
@@ -36,18 +35,14 @@ class Door:
 
     crash = None
     stands_still_s = 0.0
-    snapshot = Snapshot(
-        m.StatusReply(
-            state="idle", homed=False, x_mm=0.0, y_mm=0.0, scan_id="", row_index=-1, take=0, points=0, pulses=0,
-            last_seq=0, fault=0, reason="",
-        ), "fake", False, {},
+    status = m.StatusReply(
+        state="idle", homed=False, x_mm=0.0, y_mm=0.0, scan_id="", row_index=-1, take=0, points=0, pulses=0,
+        last_seq=0, fault=0, reason="",
     )  # fmt: skip
+    hello = m.HelloReply(pi_release="1", firmware="fake", backend="wires", state="idle", scan_id="", last_seq=0)
 
-    def full(self):
-        return False
-
-    def post(self, item):
-        raise AssertionError(item)
+    def submit(self, command, answer):
+        raise AssertionError(command, answer)
 
     def host_alive(self, scan_id, owner):
         raise AssertionError(scan_id + owner)
@@ -58,7 +53,7 @@ def served(tmp_path):
     """A Pi's sockets on all addresses, with keys in `keys`; they serve until the test's end."""
     make_keys(tmp_path / "keys")
     make_keys(tmp_path / "other")
-    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 50, "wires")
+    server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 50)
     thread = threading.Thread(target=server.run, args=(Door(),))
     thread.start()
     yield server
@@ -241,10 +236,10 @@ def test_an_ordinary_user_is_told_whose_keys_they_are(config, monkeypatch, capsy
         return stat(path, **more)
 
     monkeypatch.setattr(Path, "stat", refuse)
-    assert main(["keys", "--config", str(config)]) == 2
+    assert main(["keys", "--config", str(config)]) == 5
     said = capsys.readouterr().err
     assert "Permission denied" in said
     assert "sudo -u polysight" in said
-    found = attempt("keys", lambda: checks._keys(config.parent / "keys", (ELSEWHERE,)))
+    found = attempt("keys", checks._keys, config.parent / "keys", (ELSEWHERE,))
     assert (found.verdict, "sudo -u polysight" in found.remedy) == ("fail", True)
     assert "pi.key_secret: Permission denied" in found.found

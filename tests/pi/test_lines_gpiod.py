@@ -7,10 +7,11 @@ pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip in
 
 from gpiod import line
 
-from polysight.pi_controller.gpio import EVENT_BUFFER, GpiodLines, find_chip, load_gpiod
-from polysight.pi_controller.lines import BurstSpec
-from polysight.pi_controller.trigger import FIRST_PULSE_DELAY_NS, Counts, RowJob, TriggerLoop, send_burst
-from polysight.shared.errors import DeviceError
+from polysight.pi_controller.bursts import BurstSpec, send_burst
+from polysight.pi_controller.lines import EVENT_BUFFER, GpiodLines, find_chip, load_gpiod, open_lines
+from polysight.pi_controller.trigger import FIRST_PULSE_DELAY_NS, Counts, TriggerLoop
+from polysight.shared.config import Pi
+from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.faults import PiFault
 from tests.support.pi.fake_gpiod import FakeChip
 from tests.support.rigs import timed_by_the_program
@@ -60,21 +61,24 @@ def test_an_edge_and_its_burst(chip, lines, width_ns, made_ns):
     assert (sent.pulses, sent.width_max_ns) == (4, made_ns)
 
 
-def test_wiring_lines_sets_all_outputs_in_one_request(chip, instrument):
-    pi = msgspec.structs.replace(instrument.pi, sync_out=(22, 23, 24), wiring="lines")
-    lines = GpiodLines(pi, chip.module, chip.path, clock=chip, ioctl=chip.ioctl)
-    assert len({chip.owner[n] for n in pi.sync_out}) == 1
-    lines.pulse(2000)
-    assert chip.log == [(t, n, v) for t, v in ((0, 1), (2000, 0)) for n in pi.sync_out]
-    lines.close()
-    assert chip.level[22:25] == [0, 0, 0]
+@pytest.mark.parametrize(("wiring", "sync_out"), [("lines", (22, 23, 24)), ("gpiomem", (22,))])
+def test_what_is_not_driven_any_more_is_refused_before_a_line_is_touched(instrument, wiring, sync_out):
+    pi = msgspec.structs.replace(instrument.pi, wiring=wiring, sync_out=sync_out)
+    with pytest.raises(ConfigError, match=wiring) as e:
+        open_lines(msgspec.structs.replace(instrument, pi=pi))
+    assert "fanout" in e.value.remedy
+
+
+def test_lines_of_another_register_are_refused_in_the_rig_file():
+    with pytest.raises(ValueError, match=r"lines 0\.\.31"):
+        Pi(wiring="gpiomem", sync_out=(22, 32))
 
 
 def test_a_buffer_that_ran_over_is_seen_in_the_numbers(chip, instrument):
     lines = GpiodLines(instrument.pi, chip.module, chip.path, clock=chip, ioctl=chip.ioctl)
     posted = []
     loop = TriggerLoop(lines, posted.append, lambda: None)
-    loop.arm(RowJob(0, 1, 5000, SPEC))
+    loop.arm(5000, SPEC)
     for i in range(EVENT_BUFFER + 3):
         chip.drive(26, 1, 10_000_000 * (i + 1))
         chip.drive(26, 0, 10_000_000 * (i + 1) + 20_000)

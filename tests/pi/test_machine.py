@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.pi_controller.lines import BurstSpec, Edge
-from polysight.pi_controller.machine import LIMITS_S, RULES, TOLD, State
+from polysight.pi_controller.bursts import BurstSpec, Edge
+from polysight.pi_controller.machine import LIMITS_S, RULES, TOLD, RefusedError, State
 from polysight.pi_controller.row_machine import RowMachine
-from polysight.pi_controller.rows import RefusedError
-from polysight.pi_controller.stage import SILENT_HEARTBEATS, STATUS_PER_HEARTBEAT, read_slice_s
-from polysight.pi_controller.stage_link import StatusWatch
+from polysight.pi_controller.stage_link import STATUS_PER_HEARTBEAT, StatusWatch
 from polysight.pi_controller.trigger import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop, TriggerWatch
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault, StageError
@@ -31,13 +29,13 @@ ROW_STATES = ("running", "held", "stopping", "done", "ending")
 SPEC_PAGE = (REPO / "docs/spec/wire.md").read_text(encoding="utf-8").split("## State machine\n")[1].split("\n## ")[0]
 
 
-class FakeLedger:
+class FakeJournal:
     def __init__(self) -> None:
         self.events: list[Any] = []
         self.broken = False
 
-    def add(self, event: Any) -> None:
-        self.events.append(event)
+    def add(self, kind: type, **fields: Any) -> None:
+        self.events.append(kind(scan_id="", seq=0, t_mono_ns=0, **fields))
 
 
 class Bench:
@@ -45,10 +43,10 @@ class Bench:
 
     def __init__(self) -> None:
         self.t = 100.0
-        self.lines, self.stage, self.ledger = FakeLines(), FakeDriver(), FakeLedger()
+        self.lines, self.stage, self.journal = FakeLines(), FakeDriver(), FakeJournal()
         self.posted: list[Any] = []
         self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
-        parts: Any = (self.stage, self.loop, self.ledger, self.posted.append, lambda: self.t)
+        parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)
         self.machine = RowMachine(*parts)
         self.seqno = 0
 
@@ -103,7 +101,7 @@ class Bench:
         return self.loop._job is not None
 
     def of(self, kind: type) -> list[Any]:
-        return [e for e in self.ledger.events if isinstance(e, kind)]
+        return [e for e in self.journal.events if isinstance(e, kind)]
 
 
 def test_a_row_passes_every_state(monkeypatch):
@@ -184,11 +182,11 @@ def test_a_host_that_promises_nothing_is_not_watched():
 def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat_ms):
     """The link's loop in virtual time: it looks every slice; from some moment on no answer comes."""
     heartbeat_s = heartbeat_ms / 1e3
-    watch = StatusWatch(SILENT_HEARTBEATS * heartbeat_s, 0.0)
+    watch = StatusWatch(heartbeat_s, 0.0)
     watch.interval_s = heartbeat_s / STATUS_PER_HEARTBEAT
     dead_s, t, answers = 2.0 + phase * heartbeat_s, 0.0, []
     while True:
-        t += read_slice_s(heartbeat_s)
+        t += watch.look_s
         if answers and answers[0] <= t:
             answers.pop(0)
             watch.heard()

@@ -6,13 +6,17 @@ The client speaks ZMTP 3.0 (RFC 23) by hand, byte by byte.
 from __future__ import annotations
 
 import os
+import select
 import socket
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from polysight.pi_controller.executor import REPLAYS_WAITING
+from polysight.pi_controller.system import MOST_BYTES
 from polysight.shared import messages as m
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.program import Process
@@ -37,6 +41,14 @@ def connected(address: str, kind: bytes) -> socket.socket:
     peer.recv(len(GREETING), socket.MSG_WAITALL)
     peer.sendall(frame(b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind, COMMAND))
     return peer
+
+
+def is_cut(peer: socket.socket) -> bool:
+    """Whether the other end has ended the connection."""
+    while select.select([peer], [], [], 0)[0]:
+        if not peer.recv(1 << 16):
+            return True
+    return False
 
 
 def resident_mb(pid: int) -> int:
@@ -67,15 +79,16 @@ def test_a_client_without_end_is_cut_off(instrument, write_config, stage, hub, a
 
         watcher = threading.Thread(target=watch)
         watcher.start()
-        with connected((p.ready[1], p.events[1])[which], kind) as peer:
-            sent, part = 0, b""
-            try:
-                while sent < ENOUGH_BYTES:
-                    part = more()
-                    peer.sendall(part)
-                    sent += len(part)
-            except OSError:
-                pass  # cut off
+        sent = 0
+        while highest[0] << 20 < MOST_BYTES and sent < ENOUGH_BYTES:  # ZeroMQ itself ends some of these connections
+            with connected((p.ready[1], p.events[1])[which], kind) as peer, suppress(ConnectionError):
+                peer.settimeout(0.1)  # a connection that was cut may be read no more, without being closed yet
+                left = b""
+                while sent < ENOUGH_BYTES and not is_cut(peer):
+                    with suppress(TimeoutError):
+                        left = left or more()
+                        taken = peer.send(left)
+                        sent, left = sent + taken, left[taken:]
         cut_ns = time.monotonic_ns()
         ended.set()
         watcher.join()
@@ -88,7 +101,7 @@ def test_a_client_without_end_is_cut_off(instrument, write_config, stage, hub, a
             time.sleep(0.1)
         status, _, err = p.end()
         assert status == 0
-        assert "connections were cut" in err
+        assert "connections were cut" in err, (sent, highest)
         host.close()
 
 
@@ -96,12 +109,12 @@ def test_a_queue_that_never_empties_is_no_executor_that_hangs(pi):
     """It turns all the while, however much waits: the watchdog and `Alive` go by its turns."""
     longest = 0.0
     done = threading.Event()
-    for _ in range(40):
+    for _ in range(16):
         pi.service.executor.post(lambda: time.sleep(0.25))
     pi.service.executor.post(done.set)
     while not done.wait(0.05):
         longest = max(longest, pi.service.executor.stands_still_s)
-    assert longest < 5.0
+    assert longest < 3.0
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
 
 
@@ -110,7 +123,7 @@ def test_replays_do_not_keep_other_commands_waiting(pi):
     slow = threading.Event()
     pi.service.executor.post(lambda: slow.wait(60))
     replay = m.Replay(scan_id="scan", from_seq=1)
-    full = [pi.service.executor.full(replay) for _ in range(10)]
-    assert full == [False] * full.index(True) + [True] * (10 - full.index(True))
-    assert not pi.service.executor.full(m.Abort())
+    taken = [pi.service.executor.submit(replay, lambda _: None) for _ in range(10)]
+    assert taken == [True] * REPLAYS_WAITING + [False] * (10 - REPLAYS_WAITING)
+    assert pi.service.executor.submit(m.Abort(), lambda _: None)
     slow.set()

@@ -13,9 +13,9 @@ import msgspec
 import pytest
 
 from polysight.pi_controller import executor as executors
-from polysight.pi_controller import realtime
+from polysight.pi_controller import system
 from polysight.pi_controller.client import take_over
-from polysight.pi_controller.journal import TAKE_OVER_KEY
+from polysight.pi_controller.service import TAKE_OVER_KEY
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 
@@ -53,12 +53,12 @@ def test_a_person_at_the_pi_takes_over(pi, stage, instrument):
     server = pi.service.server
     replace = msgspec.structs.replace
     here = replace(instrument, pi=replace(instrument.pi, command_address=server.command_address))
-    assert take_over(here, "hold", journal) == "held"
-    assert take_over(here, "resume", journal) == "running"
-    take_over(here, "abort", journal)
+    assert take_over(here, "hold") == "held"
+    assert take_over(here, "resume") == "running"
+    take_over(here, "abort")
     assert pi.host.wait(m.RowFinished).status == "aborted"
     pi.host.until_state("ready")
-    assert take_over(here, "end", journal) == "homed"
+    assert take_over(here, "end") == "homed"
 
 
 def test_a_dead_hosts_run_is_anybodys(pi):
@@ -71,12 +71,9 @@ def test_a_dead_hosts_run_is_anybodys(pi):
 
 
 def test_a_hanging_executor_does_not_look_alive(pi, monkeypatch):
-    monkeypatch.setattr(executors, "HUNG_S", 0.5)
-    monkeypatch.setattr("polysight.pi_controller.server.HUNG_S", 0.5)
     host, released = pi.host, threading.Event()
+    monkeypatch.setattr("polysight.pi_controller.server.HUNG_S", 0.5)
     monkeypatch.setattr(executors, "TURN_S", 0.05)
-    host.ask(m.Home())
-    host.until_state("homed", "idle")
     pi.service.executor.post(lambda: released.wait(60))
     deadline = time.monotonic() + 60
     while not isinstance(reply := host.ask(m.Status()), m.Refused) and time.monotonic() < deadline:
@@ -110,8 +107,9 @@ def test_the_watchdog_is_fed_by_the_executor_alone(pi, monkeypatch, tmp_path):
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     listener.bind(str(tmp_path / "notify"))
     listener.settimeout(60)
+    monkeypatch.setattr(executors, "TURN_S", 0.2)
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-    realtime.notify_systemd("READY=1")
+    system.notify_systemd("READY=1")
     assert listener.recv(100) == b"READY=1"
     assert {listener.recv(100) for _ in range(2)} == {b"WATCHDOG=1"}
     released, hangs = threading.Event(), threading.Event()

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from polysight.pi_controller.realtime import OTHERS_PRIORITY, PRIORITY
+from polysight.pi_controller.system import OTHERS_PRIORITY, PRIORITY
 from polysight.simulators import gpio
 from tests.support.paths import REPO
 from tests.support.pi.program import PROGRAM, Process

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.host.plan.timing import row_motion_s
-from polysight.pi_controller.rows import RefusedError, check_pulses, check_run
+from polysight.pi_controller.executor import burst_of, check_run
+from polysight.pi_controller.machine import RefusedError
 from polysight.shared import messages as m
 from polysight.shared.config import Burst
 from polysight.shared.faults import PiFault
@@ -72,7 +73,7 @@ def test_the_run_up_is_what_the_host_counts_with():
 def test_the_pi_sends_the_pulses_that_the_rig_file_may_hold(period, width):
     def sent() -> bool:
         try:
-            return bool(check_pulses(1, period, width))
+            return bool(burst_of(m.Pulse(pulses=1, period_us=period, width_us=width)))
         except RefusedError:
             return False
 

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.pi_controller.executor import REPLAYED_IN_A_ROW, Executor, Request
-from polysight.pi_controller.journal import JournalFolder
-from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.journal import Journal
 from polysight.pi_controller.trigger import TriggerLoop
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
@@ -34,9 +33,9 @@ class SlowDriver(FakeDriver):
         super().__init__()
         self.bench, self.row_takes_s = bench, 0.0
 
-    def row(self, _: Any) -> int:
+    def row(self, *_: Any) -> int:
         self.bench.t += self.row_takes_s
-        return super().row(_)
+        return super().row(*_)
 
 
 class Bench:
@@ -44,13 +43,12 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.t = 100.0
-        self.journals = JournalFolder(folder)
         self.events: list[Any] = []
         self.stage = SlowDriver(self)
         loop = TriggerLoop(FakeLines(), lambda _: None, lambda: None)  # not started: no edge comes
-        ledger = Ledger(self.journals, lambda raws: self.events.extend(map(m.unpack_event, raws)))
+        self.journal = Journal(folder, lambda raws: self.events.extend(map(m.unpack_event, raws)))
         stage: Any = self.stage
-        self.executor = Executor(stage, loop, ledger)
+        self.executor = Executor(stage, loop, self.journal)
         self.executor._machine._clock = lambda: self.t
 
     def turn(self, *items: Any) -> None:
@@ -74,7 +72,7 @@ class Bench:
         assert isinstance(self.begin(), m.Accepted)
         self.ask(m.Home())
         self.turn(Reply("ok", self.stage.number), Reply("done", self.stage.number))
-        assert self.executor.snapshot.status.state == "ready"
+        assert self.executor.status.state == "ready"
         return self
 
     def run_row(self) -> Any:
@@ -85,14 +83,14 @@ class Bench:
 
     @property
     def state(self) -> str:
-        return self.executor.snapshot.status.state
+        return self.executor.status.state
 
 
 @pytest.fixture
 def bench(tmp_path):
     bench = Bench(tmp_path / "journal")
     yield bench
-    bench.journals.close()
+    bench.journal.close()
 
 
 def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
@@ -123,7 +121,7 @@ def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory
             bench.ask(m.RunRow(scan_id="another", row_index=0, take=1))
             assert isinstance(bench.executor.host_alive("another", ""), m.Refused)
     assert bench.of(m.Fault)[0].number == PiFault.HOST_LOST
-    bench.journals.close()
+    bench.journal.close()
 
 
 def test_another_machine_does_not_take_a_pi_whose_host_lives(bench):
@@ -131,7 +129,7 @@ def test_another_machine_does_not_take_a_pi_whose_host_lives(bench):
     bench.t += HEARTBEAT_S
     refused = bench.begin("other")
     assert (refused.number, "host lives" in refused.what, bool(refused.remedy)) == (PiFault.NOT_READY, True, True)
-    assert (bench.state, bench.executor.snapshot.status.scan_id) == ("ready", "s"), "nothing has changed"
+    assert (bench.state, bench.executor.status.scan_id) == ("ready", "s"), "nothing has changed"
     assert isinstance(bench.begin("s"), m.Accepted), "its own host may begin anew"
     bench.t += LIMIT_S
     assert isinstance(bench.begin("other"), m.Accepted), "a host that died keeps nobody out"

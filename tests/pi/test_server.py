@@ -6,13 +6,14 @@ import msgspec
 import pytest
 
 from polysight.host.acquisition.pi_client import HostHeartbeat
-from polysight.pi_controller.service import Options, Service
+from polysight.pi_controller.service import Service
 from polysight.shared import messages as m
 from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault, StageError
 from polysight.shared.stage_line import Immediate
 from polysight.shared.wires import WireClient, WireEdge
 from tests.support.pi.host_side import HostSide
+from tests.support.rigs import at_stage_port
 
 
 def test_a_row_is_captured_completely_and_in_order(pi, hub, instrument):
@@ -50,7 +51,7 @@ def test_a_row_is_captured_completely_and_in_order(pi, hub, instrument):
 def test_stage_gets_the_row_in_steps_and_a_heartbeat(pi, stage):
     host = pi.host
     host.accepted(host.begin())
-    stage.pace_s = 0.05
+    stage.pace_s = 0.1  # the row takes longer than two quarters of a heartbeat
     host.home()
     host.row(0)
     row = next(c for c in stage.seen if c.verb == "ROW")
@@ -331,7 +332,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(inst
 
     monkeypatch.setattr("threading.excepthook", lambda _: None)
     monkeypatch.setattr("polysight.pi_controller.row_machine.RowMachine.take_burst", fail)
-    service = Service(instrument, Options(wires=hub, stage_port=stage.port))
+    service = Service(at_stage_port(instrument, stage.port), hub)
     with ThreadPoolExecutor(1) as pool:
         served = pool.submit(service.serve)
         host = HostSide(service.server.command_address, service.server.event_address, instrument)

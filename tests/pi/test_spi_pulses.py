@@ -11,10 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.pi_controller.lines import FASTEST_HZ, SHORTEST_BYTES, SLOWEST_HZ, BurstSpec, SpiBurst, spi_burst
-from polysight.pi_controller.service import Options, Service
+from polysight.pi_controller.bursts import (
+    FASTEST_HZ,
+    SHORTEST_BYTES,
+    SLOWEST_HZ,
+    BurstSpec,
+    SpiBurst,
+    send_burst,
+    spi_burst,
+)
+from polysight.pi_controller.service import Service
 from polysight.pi_controller.sim_lines import SpiWireLines
-from polysight.pi_controller.trigger import send_burst
 from polysight.shared import messages as m
 from polysight.shared.config import Pi
 from polysight.shared.errors import ConfigError
@@ -22,7 +29,7 @@ from polysight.shared.faults import PiFault
 from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
 from polysight.shared.wires import WireClient, WireEdge
 from tests.support.pi.host_side import HostSide
-from tests.support.rigs import published_rig
+from tests.support.rigs import at_stage_port, published_rig
 
 bursts = st.tuples(st.integers(1, 256), st.integers(MIN_PERIOD_NS, 20_000_000), st.integers(MIN_WIDTH_NS, MAX_WIDTH_NS))
 ROOMY = 1 << 22
@@ -54,7 +61,7 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
 @given(bursts, st.integers(SHORTEST_BYTES, 65_536))
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
     needed = len(spi_burst(BurstSpec(*burst), ROOMY).data)
-    slowest = len(spi_burst(BurstSpec(*burst[:2], 2000), ROOMY).data)
+    slowest = len(spi_burst(BurstSpec(burst[0], burst[1], 2000), ROOMY).data)
     if slowest > bufsiz:
         with pytest.raises(ConfigError) as e:
             spi_burst(BurstSpec(*burst), bufsiz)
@@ -77,6 +84,7 @@ class Controller:
     """An SPI controller with a clock of its own: `rate` times the one asked for, `late_ns` until it begins."""
 
     name = "fake"
+    check_width = True
 
     def __init__(self, rate: float = 1.0, late_ns: int = 30_000, bufsiz: int = 4096) -> None:
         self.t, self.rate, self.late_ns, self.bufsiz = 0, rate, late_ns, bufsiz
@@ -89,7 +97,6 @@ class Controller:
         self.t = max(self.t, t_ns)
 
     def wait_edge(self, limit_s: float) -> None: ...
-    def flush(self) -> None: ...
     def close(self) -> None: ...
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
@@ -152,7 +159,7 @@ def test_a_row_of_the_shipped_rig_file_plays_the_wire_of_an_spi_controller(instr
     assert instrument.pi.wiring == "spi"
     radar = WireClient(hub, listen=instrument.pi.sync_out)
 
-    running = Service(instrument, Options(wires=hub, stage_port=stage.port))
+    running = Service(at_stage_port(instrument, stage.port), hub)
     thread = threading.Thread(target=running.serve)
     thread.start()
     host = HostSide(running.server.command_address, running.server.event_address, instrument)

@@ -9,6 +9,7 @@ from polysight.pi_controller.stage_link import StageLink, StageLost, StageLostEr
 from polysight.shared.faults import StageError
 from polysight.shared.stage_line import Command, Immediate, Reply
 from tests.support.pi.fake_stage import FakeStage
+from tests.support.rigs import at_stage_port
 
 
 @pytest.fixture
@@ -77,7 +78,7 @@ def test_answers_are_told_apart_from_what_comes_by_itself(dry_stage):
 
 
 def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage):
-    link, news = connect(dry_stage, silence_s=0.1)
+    link, news = connect(dry_stage, heartbeat_s=0.2)
     link.ask_status_every(0.02)
     assert news.get(timeout=5).kind == "status"
     dry_stage.deaf = True
@@ -110,14 +111,14 @@ def test_other_steps_per_mm_are_refused_before_anything_moves(dry_stage, instrum
     dry_stage.steps = "160"
     with (
         pytest.raises(StageLostError, match="160 steps per mm, the rig file says 200"),
-        bench_stage(instrument.stage, dry_stage.port),
+        bench_stage(at_stage_port(instrument, dry_stage.port).stage),
     ):
         pass
     assert [c.verb for c in dry_stage.seen] == ["HELLO"]
 
 
 def test_jog_and_home_by_hand(dry_stage, instrument):
-    with bench_stage(instrument.stage, dry_stage.port) as stage:
+    with bench_stage(at_stage_port(instrument, dry_stage.port).stage) as stage:
         with pytest.raises(StageRefusedError):
             stage.jog(1, 1, 20)
         assert stage.home() == (0.0, 0.0)

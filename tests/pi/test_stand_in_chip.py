@@ -184,8 +184,8 @@ def test_a_chip_that_vanishes_is_fault_107(rig, write_config, stage, wires, chip
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("busy:22", "line 22 is held by 'another-program'"),
-        ("busy:26", "line 26 is held by 'another-program'"),
+        ("busy:22", "it is held by 'another-program'"),
+        ("busy:26", "it is held by 'another-program'"),
         ("no-edges", "reports no edges"),
         ("denied", "no permission"),
     ],
@@ -226,7 +226,7 @@ import os, sys
 from datetime import timedelta
 from pathlib import Path
 import gpiod, msgspec
-from polysight.pi_controller.gpio import GpiodLines, find_chip
+from polysight.pi_controller.lines import GpiodLines, find_chip
 from polysight.shared.config import load_instrument
 chip = Path(os.environ["GPIOSHIM_CHIP"])
 assert find_chip("pinctrl-bcm2835", gpiod, chip.parent) == str(chip)

@@ -7,11 +7,12 @@ from itertools import pairwise
 
 import pytest
 
-from polysight.pi_controller.service import Options, Service
+from polysight.pi_controller.service import Service
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
 from tests.support.paths import REPO
 from tests.support.pi.host_side import HostSide
+from tests.support.rigs import at_stage_port
 
 pytest.importorskip("polysight.simulators.stage", reason="the simulated stage is not installed")
 
@@ -39,7 +40,7 @@ def simulated(tmp_path):
 
 def test_rows_abort_hold_and_retake(simulated, instrument):
     hub, port = simulated
-    service = Service(instrument, Options(wires=hub, stage_port=str(port)))
+    service = Service(at_stage_port(instrument, str(port)), hub)
     thread = threading.Thread(target=service.serve)
     thread.start()
     host = HostSide(service.server.command_address, service.server.event_address, instrument)

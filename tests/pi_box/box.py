@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 MEMORY_WRITE = "memory_region_ops_write"
 GPIO_BASE = 0x3F200000
+FTDI = "0403"  # vendor of the stage's USB serial chip
 SELECT, SET, CLEAR, LEVEL = 0x00, 0x1C, 0x28, 0x34  # offsets of registers, BCM2835 ARM Peripherals, 6.1
 # Only what hangs reaches these: a busy computer has needed 5 minutes to boot.
 BOOT_LIMIT_S = 3600.0
@@ -109,7 +110,7 @@ class Box:
         try:
             self.wait(lambda: (work / "qmp").exists(), "QEMU has a monitor")
             self.monitor = Monitor(work / "qmp")
-            self.plug()
+            self.monitor.do("device_add", driver="usb-serial", id="uno", chardev="stage")
             self.boot_s = self._boot()
         except BaseException:
             self._process.kill()
@@ -151,11 +152,15 @@ class Box:
 
     def plug(self) -> None:
         """Plug in the stage's USB cable."""
-        self.monitor.do("device_add", driver="usb-serial", id="uno", chardev="stage")
+        self._authorize_stage(1)
 
     def unplug(self) -> None:
-        """Pull it."""
-        self.monitor.do("device_del", id="uno")
+        """Pull it, for the Pi's kernel: the device goes. QEMU's own `device_del` crashes its USB controller."""
+        self._authorize_stage(0)
+
+    def _authorize_stage(self, value: int) -> None:
+        find = f"grep -l {FTDI} /sys/bus/usb/devices/*/idVendor"
+        self.run(f"echo {value} | sudo tee $(dirname $({find}))/authorized >/dev/null")
 
     def register(self, offset: int) -> int:
         """A register of the GPIO block, read past the Pi's processor."""

@@ -35,6 +35,7 @@ def rig_of_the_box() -> Instrument:
     replace = msgspec.structs.replace
     return replace(
         rig,
+        limits=replace(rig.limits, command_timeout_s=120.0),
         stage=replace(rig.stage, port="/dev/polysight-stage", heartbeat_ms=5000),
         pi=replace(rig.pi, one_shot=True, command_address="tcp://0.0.0.0:5601", event_address="tcp://0.0.0.0:5602"),
     )

@@ -162,7 +162,7 @@ def test_check_finds_everything_that_is_there(bench: InstalledPi):
     tell("check: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
     assert "fail" not in verdicts.values(), findings
     # Rights of the unit, which a shell lacks; and Debian's driver does not say what dead programs' lines become.
-    assert {n for n, v in verdicts.items() if v == "warn"} <= {"schedule right", "locked memory", "line release"}
+    assert {n for n, v in verdicts.items() if v == "warn"} <= {"real time", "line release"}
     assert findings["GPIO chip"]["found"].endswith("is 'pinctrl-bcm2835'")
     assert verdicts["keys"] == verdicts["stage"] == "ok"
 

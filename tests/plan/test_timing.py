@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from polysight.host.plan import Changes, row_motion_s, scan_time, straight_move_s
 from polysight.host.plan.timing import TAIL_S, tail_s, turn_s, whole_packets
-from polysight.pi_controller.rows import stage_row
+from polysight.pi_controller.stage import row_in_steps
 from polysight.shared.config import Instrument
 from polysight.shared.raster import plan_raster
 from polysight.shared.stage_line import Command, Parameter
@@ -56,7 +56,9 @@ class Stage:
 def scanned(rig: Instrument) -> tuple[float, list[int]]:
     """Seconds of motion of a whole scan from the home corner, and the times of its triggers, ns."""
     stage = Stage(rig)
-    total = sum(stage.seconds("ROW", *stage_row(row, rig.stage, rig.stage.speed_mm_s)) for row in plan_raster(rig.grid))
+    total = sum(
+        stage.seconds("ROW", *row_in_steps(row, rig.stage, rig.stage.speed_mm_s)) for row in plan_raster(rig.grid)
+    )
     edges = [w.t_ns for w in stage.board.wires if isinstance(w, WireEdge) and w.value]
     return total, edges
 

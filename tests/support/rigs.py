@@ -44,6 +44,11 @@ def rig_with(change: Change | None = None, **tables: dict[str, Any]) -> Instrume
     return decode(table, Instrument, "test")
 
 
+def at_stage_port(rig: Instrument, port: str) -> Instrument:
+    """The rig with its stage at another serial port."""
+    return msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, port=port))
+
+
 def programmed_rig(offset_hz: float = MID_BAND_OFFSET_HZ, **tables: dict[str, Any]) -> Instrument:
     """As :func:`rig_with`, with this start offset of every receiver; by default the direct path is mid-band."""
 

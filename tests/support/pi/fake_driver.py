@@ -17,20 +17,21 @@ class FakeDriver:
         self.x_mm = self.y_mm = 0.0
         self.firmware = "fake"
         self.number = 0
+        self.link = self  # what it asks of an open link
 
     def connect(self) -> None: ...
     def clear(self) -> None: ...
     def at_rest(self) -> None: ...
-    def ask_how_it_ended(self) -> None: ...
+    def repeat(self) -> None: ...
     def note_position(self, _: Reply) -> None: ...
 
-    def send(self, byte: Immediate) -> None:
+    def send_byte(self, byte: Immediate) -> None:
         self.sent.append(byte)
 
     def home(self) -> int:
         self.number += 1
         return self.number
 
-    def row(self, _: Any) -> int:
+    def row(self, *_: Any) -> int:
         self.number += 1
         return self.number

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 from collections.abc import Callable
 
-from polysight.pi_controller.lines import Edge
+from polysight.pi_controller.bursts import Edge
 from polysight.shared.errors import DeviceError
 
 
@@ -16,6 +16,7 @@ class FakeLines:
 
     def __init__(self, late: Callable[[int], int] = lambda _: 0, long: Callable[[int], int] = lambda _: 0) -> None:
         self.t, self.late, self.long = 0, late, long
+        self.check_width = True
         self.sleeps = 0
         self.changes: list[tuple[int, bool]] = []
         self.level = False
@@ -51,8 +52,6 @@ class FakeLines:
         self.t += self.long(len(self.changes))
         self.changes.append((self.t, active))
         self.level = active
-
-    def flush(self) -> None: ...
 
     def close(self) -> None:
         self.set_output(False)

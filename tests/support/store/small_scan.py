@@ -1,4 +1,4 @@
-"""A scan without processes: the host's own run and resume, the Pi's own ledger and journal, and simulated samples.
+"""A scan without processes: the host's own run and resume, the Pi's own journal, and simulated samples.
 
 Everything that is written to a disk is written by the code that writes it in the instrument; only wires, sockets and
 time are left out. A whole scan takes some milliseconds.
@@ -27,8 +27,7 @@ from polysight.host.capture.segment import Segment, write_index
 from polysight.host.pipeline import Pipeline
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, PART, ScanFolder
-from polysight.pi_controller.journal import JournalFolder, JournalFullError
-from polysight.pi_controller.ledger import Ledger
+from polysight.pi_controller.journal import Journal, JournalFullError
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
@@ -63,13 +62,12 @@ class Samples:
 
 
 class SmallPi:
-    """The Pi's ledger and journal, and rows that are over at once. Stands for PiClient."""
+    """The Pi's journal, and rows that are over at once. Stands for PiClient."""
 
     def __init__(self, instrument: Instrument, folder: Path) -> None:
         self._instrument = instrument
-        self._journals = JournalFolder(folder)
         self.published: list[bytes] = []
-        self._ledger = Ledger(self._journals, self.published.extend)
+        self._journal = Journal(folder, self.published.extend)
         self._plan = plan_raster(instrument.grid)
         self._scan_id, self._seen = "", 0
         self._take: Any = None
@@ -81,50 +79,50 @@ class SmallPi:
     def follow(self, scan_id: str, last_seq: int, on_event: Any) -> None:
         self._scan_id, self._seen, self._take = scan_id, last_seq, on_event
 
-    def _commit(self, *events: m.AnyEvent) -> None:
+    def _commit(self, kind: type[m.AnyEvent], *events: dict[str, Any]) -> None:
         """As the executor does: what cannot be journalled puts the Pi into fault."""
         for event in events:
-            self._ledger.add(event)
+            self._journal.add(kind, **event)
         try:
-            self._ledger.commit()
+            self._journal.commit()
         except JournalFullError as e:
             self.state, self.fault = "fault", str(e)
 
     def begin_run(self, run: m.BeginRun) -> None:
         try:
-            resumed, lost = self._ledger.open(run.scan_id, run.plan, run.last_seq)
+            resumed, lost = self._journal.open(run.scan_id, run.plan, run.last_seq)
         except PolysightError as e:
             raise host_run.ScanError(f"the Pi refused BeginRun: {e.what}", e.why, e.remedy) from None
-        self._commit(m.RunStarted(**NEW, plan=run.plan, resumed=resumed, lost=lost))
+        self._commit(m.RunStarted, {"plan": run.plan, "resumed": resumed, "lost": lost})
 
     def status(self) -> m.StatusReply:
         return m.StatusReply(
             state=self.state, homed=True, x_mm=0, y_mm=0, scan_id=self._scan_id, row_index=-1, take=0, points=0,
-            pulses=0, last_seq=self._ledger.last_seq, fault=109 if self.state == "fault" else 0, reason=self.fault,
+            pulses=0, last_seq=self._journal.last_seq, fault=109 if self.state == "fault" else 0, reason=self.fault,
         )  # fmt: skip
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
         assert scan_id == self._scan_id
         row, n = self._plan.row(row_index), self._instrument.burst.pulses
-        self._commit(m.RowStarted(**NEW, row=row, take=take))
+        self._commit(m.RowStarted, {"row": row, "take": take})
         points = [
-            m.Capture(
-                **NEW, row_index=row.index, take=take, point=i, column=row.column(i), edge_ns=i, first_pulse_ns=i,
+            dict[str, Any](
+                row_index=row.index, take=take, point=i, column=row.column(i), edge_ns=i, first_pulse_ns=i,
                 last_pulse_ns=i, pulses=n, width_max_ns=1, jitter_ns=1,
             )
             for i in range(row.points)
         ]  # fmt: skip
-        self._commit(*points)
-        end = m.RowFinished(
-            **NEW, row_index=row.index, take=take, status="done", points=row.points, edges=row.points,
+        self._commit(m.Capture, *points)
+        end = dict[str, Any](
+            row_index=row.index, take=take, status="done", points=row.points, edges=row.points,
             bursts=row.points, pulses=row.points * n,
         )  # fmt: skip
         if self.state != "fault":
-            self._commit(end)
+            self._commit(m.RowFinished, end)
 
     def events(self) -> list[m.AnyEvent]:
         """What is in the journal and was not seen yet."""
-        found = self._ledger.replay(self._scan_id, self._seen + 1, 10000).events
+        found = [m.unpack_event(raw) for raw in self._journal.read(self._scan_id, self._seen + 1, 10000)[0]]
         for event in found:
             assert event.seq == self._seen + 1, "the sequence has a gap"
             self._seen = event.seq
@@ -136,11 +134,11 @@ class SmallPi:
 
     def end_run(self, scan_id: str, exit_status: m.ExitStatus, reason: str) -> None:
         assert scan_id == self._scan_id
-        self._commit(m.RunStopped(**NEW, exit_status=exit_status, reason=reason))
+        self._commit(m.RunStopped, {"exit_status": exit_status, "reason": reason})
         self.events()
 
     def home(self) -> None:
-        self.state, self.fault, self._ledger.broken = "ready", "", False
+        self.state, self.fault, self._journal.broken = "ready", "", False
 
     def come_to_rest(self, reason: str) -> None:
         """Nothing moves."""
@@ -151,7 +149,7 @@ class SmallPi:
     def lose(self) -> None:
         """The program is gone; its files stay as they are."""
         os.close(self.event_socket)
-        self._journals.close()
+        os.close(self._journal._lock)
 
 
 class SmallRig:

@@ -116,7 +116,7 @@ class Scans:
             good = good and name == self.only
         path = self.root / PurePosixPath(name) if good else self.root
         try:
-            good = good and path.resolve().is_relative_to(self.root.resolve())
+            good = good and path.resolve() == self.root.resolve() / name  # no link on the way
             there = good and (new or name == self.only or _is_scan(path))
         except (OSError, ValueError):
             there = False

@@ -16,13 +16,13 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from polysight.host.acquisition import Wish
-from polysight.host.catalogue import PROGRAM, Notes, write_notes
+from polysight.host.catalogue import PROGRAM, Notes, Summary, write_notes
 from polysight.host.jobs.label import save_labels
 from polysight.host.materials import Labels
 from polysight.host.plan import Changes, forecast, numbers
 from polysight.host.products import find_labels, label_place, read_products
 from polysight.host.serve.guard import cookie_name, refused
-from polysight.host.serve.programs import Programs
+from polysight.host.serve.programs import Programs, program_of
 from polysight.host.serve.site import LIBRARIES, Site
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, DeviceError, ScanError
@@ -191,6 +191,7 @@ async def _plan(site: Site, request: Request, wanted: PlanRequest) -> dict[str, 
 
 async def _doctor(site: Site, request: Request, wanted: Request_) -> dict[str, Any]:
     del request, wanted
+    _check_free(site)
     site.logs.mkdir(exist_ok=True)
     words = ["doctor", "--config", _config(site), "--out", site.scans.root]
     await site.act(_programs(site).start, site.logs, "doctor", words)
@@ -204,9 +205,7 @@ async def _start(site: Site, request: Request, wanted: StartRequest) -> dict[str
     if folder.exists() and any(p.name != PROGRAM for p in folder.iterdir()):
         raise ConfigError(f"{wanted.name} is there already", "scans are never overwritten", "give another name")
     rig = wanted.of(config)
-    running = [s.name for s in site.scans.list() if s.state in ("running", "paused")]
-    if running:
-        raise ScanError(f"{running[0]} is being scanned", "a rig does one scan at a time", "wait for it, or stop it")
+    await site.act(_check_free, site)
     words: list[str | Path] = ["scan", "--out", folder]
     if wanted.given:
         config = _write_rig(folder, rig)
@@ -220,6 +219,22 @@ async def _start(site: Site, request: Request, wanted: StartRequest) -> dict[str
     return {"what": "started", "scan": wanted.name}
 
 
+def _check_free(site: Site) -> None:
+    """Refuse what needs the rig while a program that is known here has it. Raises ScanError."""
+    running = [s.name for s in site.scans.list() if s.state in ("running", "paused") or _starting(site, s)]
+    if running:
+        raise ScanError(f"{running[0]} is being scanned", "a rig does one thing at a time", "wait for it, or stop it")
+    doctor = program_of(site.logs, "doctor")
+    if doctor is not None and doctor.running:
+        raise ScanError("the doctor looks at the rig", "a rig does one thing at a time", "wait until it has ended")
+
+
+def _starting(site: Site, s: Summary) -> bool:
+    """Whether the program of a scan lives though it has not come to its first sign of life, or is processing."""
+    program = program_of(site.scans.root / s.name, "scan") if s.state in ("begun", "lost") else None
+    return program is not None and program.running
+
+
 def _write_rig(folder: Path, rig: Instrument) -> Path:
     """The rig file of a scan that differs from the usual one, where its program finds it."""
     path = folder / PROGRAM / RIG
@@ -231,8 +246,7 @@ def _write_rig(folder: Path, rig: Instrument) -> Path:
 async def _resume(site: Site, request: Request, wanted: ResumeRequest) -> dict[str, Any]:
     name = site.name(request)
     folder = site.scans.folder(name)
-    if site.scans.summary(name).state in ("running", "paused"):
-        raise ScanError(f"{name} is being scanned", "its program lives", "pause or stop it first")
+    await site.act(_check_free, site)
     words: list[str | Path] = ["resume", folder.absolute(), *_material_words(site, wanted.library, None)]
     if wanted.keep_incomplete:
         words.append("--keep-incomplete")

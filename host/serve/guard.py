@@ -21,6 +21,8 @@ from starlette.requests import cookie_parser
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from polysight.host.serve.connections import HEAD_BYTES
+
 TOKEN_HEADER = "X-Polysight-Token"
 BODY_BYTES, BODY_S = 1 << 16, 10.0
 TRIES, TRIES_A_SECOND = 20.0, 5.0
@@ -135,16 +137,18 @@ class Guard:
             return
         refusal = self._refusal(scope, Headers(scope=scope))
         if refusal is not None:
-            await refusal(scope, receive, _with_headers(send))
+            await _closing(refusal)(scope, receive, _with_headers(send))
             return
         try:
             await self._app(scope, _limited(receive), _with_headers(send))
         except BodyError as e:
-            await refused(e.status, e.what, "send less, or sooner")(scope, receive, _with_headers(send))
+            await _closing(refused(e.status, e.what, "send less, or sooner"))(scope, receive, _with_headers(send))
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
         """Why a request is not let in."""
         method, path = scope["method"], scope["path"]
+        if sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
+            return refused(431, f"The head is longer than {HEAD_BYTES} bytes", "send less")
         if not self._access.knows_host(headers.get("host", "")):
             return refused(
                 400, "This server has another name", "open the address that it printed; --allow-host NAME adds one"
@@ -186,6 +190,12 @@ class Guard:
 def refused(status: int, what: str, do: str, why: str = "") -> Response:
     """An answer in the three parts of every error."""
     return JSONResponse({"what": what, "why": why, "do": do}, status)
+
+
+def _closing(answer: Response) -> Response:
+    """The same on a connection that ends with it: what is left of the request is not read."""
+    answer.headers["Connection"] = "close"
+    return answer
 
 
 def length_of(headers: Headers) -> int:

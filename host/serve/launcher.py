@@ -1,4 +1,4 @@
-"""Starts programs for the server, from a small process of its own: `python -m polysight.host.serve.launcher`.
+"""Starts programs for the server, from a small process of its own, which loads nothing else of this package.
 
 The server has stepped back (low priority, first to go when memory runs out), and whatever it started would inherit
 that; a scan must not. So this is started before, and forks for it. Each line of stdin is a request (`words`, `cwd`,

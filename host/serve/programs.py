@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from polysight.host.catalogue import PROGRAM
+from polysight.host.serve import launcher
 from polysight.host.serve.launcher import started_ticks
 from polysight.shared.errors import DeviceError, ScanError
 
@@ -60,7 +61,7 @@ class Programs:
     """
 
     def __init__(self) -> None:
-        command = [sys.executable, "-m", "polysight.host.serve.launcher"]
+        command = [sys.executable, "-I", str(Path(launcher.__file__))]  # as a module it would load all of this server
         self._launcher = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )

@@ -80,7 +80,8 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
     programs = Programs() if control else None
     step_back()
     access = _access(place, listener, control)
-    site = Site(Scans(root), access, Watches(control), programs, config)
+    config = None if config is None else config.absolute()
+    site = Site(Scans(root.absolute()), access, Watches(control), programs, config)
     return _run(site, place, listener, f"scans in {root}", "")
 
 

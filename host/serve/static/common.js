@@ -121,6 +121,14 @@ export const STATES = {
 };
 export const VERDICTS = { good: ["good", "good"], care: ["usable with care", "warn"], none: ["no result", "bad"], damaged: ["products damaged", "bad"] };
 
+/** How a program of `polysight` stands: 7 is the exit status of a scan that supports no result. */
+export function ending({ running, status }) {
+  if (running) return "runs";
+  if (status === 0) return "has ended";
+  if (status === 7) return "has ended without a result";
+  return `has failed${status === null ? ": it was killed" : ` (exit status ${status})`}`;
+}
+
 export function badge([text, level]) {
   return make("span", text, "badge", { "data-level": level });
 }

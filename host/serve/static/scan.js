@@ -1,6 +1,6 @@
 // One scan: its images, what was found in them, and what can be done with it.
 import { ImageView, caption, outline } from "./view.js";
-import { badge, begin, by, bytes, address, complain, day, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
+import { badge, begin, by, bytes, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
 import { Labels } from "./label.js";
 import { showProbe } from "./probe.js";
 
@@ -117,8 +117,7 @@ async function follow() {
   const [program] = summary.programs;
   by("program").hidden = !program || (!program.running && program.status === 0 && running === "");
   if (program) {
-    const how = program.running ? "runs" : program.status === 0 ? "has ended" : `has failed${program.status === null ? "" : ` (status ${program.status})`}`;
-    by("program-title").textContent = `polysight ${program.kind} ${how}`;
+    by("program-title").textContent = `polysight ${program.kind} ${ending(program)}`;
     if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "It has said nothing yet.";
   }
   const was = running;

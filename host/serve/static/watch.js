@@ -1,5 +1,5 @@
 // The live view's page: hears the newest state from the server, shows it, and asks for what a button says.
-import { address, begin, by, clock, complain, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell } from "./common.js";
+import { address, begin, by, clock, complain, ending, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell } from "./common.js";
 import { plot, raster } from "./plots.js";
 
 const SILENT_MS = 7000; // the server says something every two seconds
@@ -281,10 +281,10 @@ async function showProgram() {
   by("to-result").hidden = !summary.processed;
   by("to-result").href = pageOf("scan", name);
   const program = summary.programs.find((p) => p.kind === "scan");
-  const ill = program && !program.running && program.status !== 0;
+  const ill = program && !program.running && ![0, 7].includes(program.status) && !summary.processed;
   by("program").hidden = !program || !(program.running || ill) || (program.running && Boolean(state?.scan) && !ill);
   if (by("program").hidden) return;
-  by("program-title").textContent = program.running ? "The program is starting" : `The program ended${program.status === null ? "" : ` with status ${program.status}`}`;
+  by("program-title").textContent = program.running ? "The program is starting" : `polysight scan ${ending(program)}`;
   if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "It has said nothing yet.";
   if (state) showButtons();
 }

@@ -14,7 +14,7 @@ from polysight.host.page.watch import Watch
 from polysight.host.serve.app import make_app
 from polysight.host.serve.guard import Access
 from polysight.host.serve.programs import Programs
-from polysight.host.serve.server import server
+from polysight.host.serve.server import Place, server
 from polysight.host.serve.site import Site
 from polysight.host.serve.watches import Watches
 from polysight.host.store import manifest
@@ -63,9 +63,9 @@ class GrowingScan:
 class Served:
     """A site on a port that is free, or where it is told to be."""
 
-    def __init__(self, site: Site, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, site: Site, host: str = "127.0.0.1", port: int = 0, place: Place | None = None) -> None:
         self.site = site
-        self._server = server(make_app(site), site)
+        self._server = server(make_app(site), site, place)
         self._server.config.host, self._server.config.port = host, port
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
@@ -100,6 +100,17 @@ def served_folder(
     access = access or Access(token, control=bool(token))
     programs = Programs() if config is not None else None
     made = Served(Site(Scans(root), access, Watches(access.control), programs, config))
+    try:
+        yield made
+    finally:
+        made.close()
+        made.site.close()
+
+
+@contextmanager
+def served_place(root: Path, place: Place, access: Access) -> Iterator[Served]:
+    """The same at a place with a certificate."""
+    made = Served(Site(Scans(root), access, Watches(access.control)), place=place)
     try:
         yield made
     finally:

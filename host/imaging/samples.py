@@ -311,6 +311,21 @@ class BoardSamples:
         footprint: Any = imager.constant(mirror.astype(np.complex64), self.weights) / self.count
         return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
 
+    def range_profile(self, point_m: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDArray[np.complex64]:
+        """The matched filter of a place, and of paths longer by `shifts_m`, complex64 [shift].
+
+        All positions are focused on the place, `point_m` [3] in the rig frame; what lies there has its peak at 0, what
+        lies behind it a positive shift.
+        """
+        at = point_m - self._offsets.reshape(-1, 3)
+        weights = (self.weights / self.count).ravel()
+        excess = self._antennas.excess_m(at[:, 0], at[:, 1], at[:, 2])
+        f, gains = self._reduction.frequencies_hz, 1 / self.rx_calibration()
+        cube = self._cube.reshape(*self._cube.shape[:2], -1) * weights
+        turned = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * f[None, :, None] * excess[:, None, :])
+        focused = (gains[:, None] * (cube * turned).sum(axis=-1)).sum(axis=0)
+        return (np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(shifts_m, f)) @ focused).astype(np.complex64)
+
     def range_slope(self) -> tuple[Image, Image]:
         """Derivative of image and footprint by range (the excess path of all pixels), carrier taken out; 1 / m.
 

@@ -136,32 +136,51 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
             raise ConfigError("nothing was changed", "yes was asked for", "options edit boxes: polysight label --help")
         labels, left_out = asked(found, ask), []
     place = label_place(products.folder)
-    return _save(place, products, replace(labels, by_hand=True), left_out)
+    return _save(place, products, labels, left_out)
 
 
 def _save(place: Path, products: SavedProducts, labels: Labels, left_out: Sequence[str]) -> int:
     """Check, write and tell the boxes; 0."""
+    checked, notes = save_labels(place, products, labels)
+    sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
+    if left_out:
+        sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
+    sys.stdout.write("".join(f"note: {note}\n" for note in notes))
+    sys.stdout.write(f"labels:   {place / LABELS}\npicture:  {place / LABELS_PICTURE}\n")
+    return 0
+
+
+def save_labels(place: Path, products: SavedProducts, labels: Labels) -> tuple[Labels, list[str]]:
+    """Check the boxes a person drew on products, and write them with their picture into `place`.
+
+    Returns
+    -------
+    labels, notes
+        as written, and what the person should know.
+
+    Raises
+    ------
+    DataError
+        when there is none, or one is refused; nothing was written then.
+    """
     if not labels.boxes:
         raise DataError(
             "no box is left", "every patch was left out, or every box removed", f"to have none, delete {place / LABELS}"
         )
     checked = check_labels(labels, products.x_m, products.y_m, products.valid)
-    checked = replace(checked, description=f"boxes of scan {products.scan_id}, in mm from the image centre")
+    checked = replace(
+        checked, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
+    )
     write_atomically(place / LABELS, pack_labels(checked))
     write_atomically(place / LABELS_PICTURE, label_figure(products, checked.boxes, checked.metal))
-    sys.stdout.write("".join(f"{line}\n" for line in _table(checked)))
-    if left_out:
-        sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
     few = [name for name, mask in masks.items() if (mask & products.valid).sum() < FEW]
-    if few:
-        sys.stdout.write(f"note: fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few\n")
+    notes = [f"fewer than {FEW} pixels: {', '.join(few)}; speckle decides what is learnt of so few"] if few else []
     if dark := _dark(products, masks):
-        sys.stdout.write(f"note: dark, as where nothing lies: {', '.join(dark)}; look at the picture\n")
+        notes.append(f"dark, as where nothing lies: {', '.join(dark)}; look at the picture")
     if checked.metal is None:
-        sys.stdout.write("note: no box is metal; train then needs a rig with `polysight calibrate metal`\n")
-    sys.stdout.write(f"labels:   {place / LABELS}\npicture:  {place / LABELS_PICTURE}\n")
-    return 0
+        notes.append("no box is metal; train then needs a rig with `polysight calibrate metal`")
+    return checked, notes
 
 
 def _dark(products: SavedProducts, masks: Mapping[str, npt.NDArray[np.bool_]]) -> list[str]:

@@ -39,6 +39,8 @@ from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError, PolysightError, ScanError, advice
 
 PRODUCTS = "products"
+_BESIDE = ("program", "operator.json")
+"""What a page or a person may have put into a folder before its scan begins: a program's log, notes."""
 Take = Callable[[OnRow | None, OnProgress, StopRequest], ScanResult]
 
 
@@ -191,7 +193,7 @@ def _check_new(folder: Path) -> None:
             "scans are never overwritten",
             f"`polysight resume {folder}` goes on with it; or give another --out",
         )
-    if not folder.is_dir() or any(p.name != MANIFEST for p in folder.iterdir()):
+    if not folder.is_dir() or any(p.name not in (MANIFEST, *_BESIDE) for p in folder.iterdir()):
         raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")
 
 

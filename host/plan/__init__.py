@@ -7,7 +7,7 @@
 from polysight.host.plan.field import FieldLimits, field_limits
 from polysight.host.plan.forecast import Forecast, Noise, forecast
 from polysight.host.plan.search import Changes, propose
-from polysight.host.plan.text import Wanted, plan
+from polysight.host.plan.text import Wanted, numbers, plan
 from polysight.host.plan.timing import ScanTime, row_motion_s, scan_time, straight_move_s
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Wanted",
     "field_limits",
     "forecast",
+    "numbers",
     "plan",
     "propose",
     "row_motion_s",

@@ -9,8 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from polysight.host.acquisition.control import ALIVE, CONTROL
-from polysight.host.page.server import make_app, server
+from polysight.host.catalogue import Scans
 from polysight.host.page.watch import Watch
+from polysight.host.serve.app import make_app
+from polysight.host.serve.guard import Access
+from polysight.host.serve.programs import Programs
+from polysight.host.serve.server import Place, server
+from polysight.host.serve.site import Site
+from polysight.host.serve.watches import Watches
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import EVENTS, MANIFEST, utc_now
 from tests.support.processes import LIMIT_S, wait_for
@@ -55,10 +61,11 @@ class GrowingScan:
 
 
 class Served:
-    """A live view: on a port of loopback that is free, or where it is told to be."""
+    """A site on a port that is free, or where it is told to be."""
 
-    def __init__(self, watch: Watch, token: str, host: str = "127.0.0.1", port: int = 0) -> None:
-        self._server = server(make_app(watch, token, loopback=host == "127.0.0.1"))
+    def __init__(self, site: Site, host: str = "127.0.0.1", port: int = 0, place: Place | None = None) -> None:
+        self.site = site
+        self._server = server(make_app(site), site, place)
         self._server.config.host, self._server.config.port = host, port
         self._thread = threading.Thread(target=self._server.run)
         self._thread.start()
@@ -75,9 +82,37 @@ class Served:
 
 @contextmanager
 def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0) -> Iterator[Served]:
-    """A server for the block."""
-    made = Served(watch, token, host, port)
+    """A server of one live view for the block."""
+    access = Access(token, loopback=host == "127.0.0.1", control=bool(token))
+    scans = Scans(watch.folder.parent, watch.folder.name)
+    made = Served(Site(scans, access, Watches(bool(token), {watch.folder.name: watch})), host, port)
     try:
         yield made
     finally:
         made.close()
+
+
+@contextmanager
+def served_folder(
+    root: Path, token: str = "", access: Access | None = None, config: Path | None = None
+) -> Iterator[Served]:
+    """A server of all scans under a folder for the block; with a rig file it starts programs."""
+    access = access or Access(token, control=bool(token))
+    programs = Programs() if config is not None else None
+    made = Served(Site(Scans(root), access, Watches(access.control), programs, config))
+    try:
+        yield made
+    finally:
+        made.close()
+        made.site.close()
+
+
+@contextmanager
+def served_place(root: Path, place: Place, access: Access) -> Iterator[Served]:
+    """The same at a place with a certificate."""
+    made = Served(Site(Scans(root), access, Watches(access.control)), place=place)
+    try:
+        yield made
+    finally:
+        made.close()
+        made.site.close()

@@ -1,4 +1,5 @@
 // The live view's page: hears the newest state from the server, shows it, and asks for what a button says.
+import { address, begin, by, clock, complain, ending, get, grouped, make, pageOf, post, rich, scanName, signed, span, tell } from "./common.js";
 import { plot, raster } from "./plots.js";
 
 const SILENT_MS = 7000; // the server says something every two seconds
@@ -6,46 +7,8 @@ const SIGNS = { good: "✓", done: "✓", warn: "!", bad: "✕", wait: "…" };
 const CHANNELS = [["h", "H", "s-polarised"], ["v", "V", "p-polarised"], ["p", "P = H / V", "not referenced to metal yet"]];
 const FEW = 4;
 
-const by = (id) => document.getElementById(id);
-const token = readToken();
 let state = null, motion = {}, source = null, heardAt = 0, allNotices = false, toldNotices = "", revision = -1;
-
-function readToken() {
-  const given = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (given) {
-    sessionStorage.setItem("token", given);
-    history.replaceState(null, "", location.pathname); // not left where a screenshot shows it
-  }
-  return sessionStorage.getItem("token") ?? "";
-}
-
-function make(name, text, className) {
-  const node = document.createElement(name);
-  if (text !== undefined) node.textContent = text;
-  if (className) node.className = className;
-  return node;
-}
-
-/** Text with `commands` in it, as nodes. */
-function rich(text) {
-  return text.split("`").map((part, i) => (i % 2 ? make("code", part) : document.createTextNode(part)));
-}
-
-function tell(id, text) {
-  if (by(id).textContent === text.replaceAll("`", "") && by(id).hidden === !text) return; // screen readers read changes
-  by(id).replaceChildren(...rich(text));
-  by(id).hidden = !text;
-}
-
-export function span(seconds) {
-  if (seconds < 100) return `${Math.round(seconds)} s`;
-  const minutes = Math.round(seconds / 60);
-  return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
-}
-
-const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
-const signed = (n) => String(Math.round(n)).replace("-", "−");
-const grouped = (n) => n.toLocaleString("en").replaceAll(",", "\u202f");
+let server = {}, name = scanName, summary = {};
 
 // --- what is shown ---
 
@@ -99,7 +62,12 @@ function showResult() {
 
 function showButtons() {
   const { enabled, running, paused, asked } = state.control;
-  by("buttons").hidden = !enabled || !running;
+  const open = state.progress && state.progress.committed < state.progress.rows;
+  const resumes = Boolean(server.starts && open && !running && !asked && !summary.programs?.some((p) => p.kind === "scan" && p.running));
+  by("buttons").hidden = !(enabled && running) && !resumes;
+  by("resume").hidden = !resumes;
+  for (const id of ["pause", "continue", "stop", "abort"]) by(id).hidden = !running;
+  if (!running) return;
   by("pause").hidden = paused || asked === "pause";
   by("continue").hidden = !(paused || asked === "pause");
   const ending = asked === "stop" || asked === "abort";
@@ -122,7 +90,7 @@ function buildChannels() {
       picture.hidden = true;
       view.append(make("span", "after the first row"), picture);
       const bar = make("img");
-      bar.src = `api/bar/${kind}`;
+      bar.src = address(`bar/${kind}`);
       bar.alt = "";
       caption.append(make("span", kind), bar, make("span", ""));
       figure.append(view, caption);
@@ -140,9 +108,9 @@ function showImages() {
   by("images-note").textContent = `${p.rows} rows in${waiting}; ${p.width_mm} × ${p.height_mm} mm${early}`;
   if (p.revision === revision) return;
   revision = p.revision;
-  for (const [name, { low, high, unit }] of Object.entries(p.items)) {
-    const picture = by(name), caption = picture.closest("figure").querySelector("figcaption");
-    picture.src = `api/picture/${name}?${revision}`;
+  for (const [key, { low, high, unit }] of Object.entries(p.items)) {
+    const picture = by(key), caption = picture.closest("figure").querySelector("figcaption");
+    picture.src = address(`picture/${key}`, { scan: name, revision });
     picture.hidden = false;
     picture.parentNode.classList.add("filled");
     caption.lastChild.textContent = `${signed(low)} to ${signed(high)}${unit === "°" ? "°" : ` ${unit}`}`;
@@ -266,7 +234,7 @@ function showAll() {
 function connect() {
   source?.close();
   heardAt = Date.now();
-  source = new EventSource("api/events");
+  source = new EventSource(address("events", { scan: name }));
   const heard = (take) => (event) => {
     heardAt = Date.now();
     document.body.classList.remove("lost");
@@ -288,13 +256,13 @@ function lost() {
   by("sign").textContent = "?";
   by("headline").textContent = "This page has lost the live view";
   tell("detail", "It tries again by itself. The scan does not depend on it.");
-  tell("why", "Likely: `polysight preview` was ended, or the network is gone.");
+  tell("why", "Likely: the server was ended, or the network is gone.");
   tell("do", "");
   document.title = "? · polysight";
 }
 
 setInterval(() => {
-  if (Date.now() - heardAt < SILENT_MS) return;
+  if (!source || Date.now() - heardAt < SILENT_MS) return;
   lost();
   connect();
 }, 1000);
@@ -302,17 +270,42 @@ setInterval(() => {
 async function ask(wish) {
   by("answer").textContent = "…";
   try {
-    const reply = await fetch(`api/control/${wish}`, { method: "POST", headers: { "X-Polysight-Token": token } });
-    const told = await reply.json();
-    by("answer").textContent = reply.ok ? "" : [told.what, told.why, told.do && `Do: ${told.do}`].filter(Boolean).join(". ");
-  } catch {
-    by("answer").textContent = "The live view did not answer; nothing was asked of the scan.";
-  }
+    await post(`control/${wish}`, { scan: name });
+    complain("answer");
+  } catch (error) { complain("answer", error); }
 }
 
+/** The program that a page started for this scan: what it says when it has not come as far as the manifest. */
+async function showProgram() {
+  try { summary = await get("scan", { scan: name }); } catch { return; } // not there yet, or gone for a moment
+  by("to-result").hidden = !summary.processed;
+  by("to-result").href = pageOf("scan", name);
+  const program = summary.programs.find((p) => p.kind === "scan");
+  const ill = program && !program.running && ![0, 7].includes(program.status) && !summary.processed;
+  by("program").hidden = !program || !(program.running || ill) || (program.running && Boolean(state?.scan) && !ill);
+  if (by("program").hidden) return;
+  by("program-title").textContent = program.running ? "The program is starting" : `polysight scan ${ending(program)}`;
+  if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "It has said nothing yet.";
+  if (state) showButtons();
+}
+
+async function resume() {
+  by("answer").textContent = "…";
+  try {
+    await post("resume", { scan: name });
+    by("answer").textContent = "The program starts; this takes some seconds.";
+    await showProgram();
+  } catch (error) { complain("answer", error); }
+}
+
+by("resume").addEventListener("click", resume);
 for (const wish of ["pause", "continue", "stop"]) by(wish).addEventListener("click", () => ask(wish));
 by("abort").addEventListener("click", () => by("confirm").showModal());
 by("confirm").addEventListener("close", () => { if (by("confirm").returnValue === "yes") ask("abort"); });
 by("more").addEventListener("click", () => { allNotices = !allNotices; showNotices(); });
 new ResizeObserver(() => { if (state?.scan) { showStage(); showPlots(); } }).observe(document.body);
+server = await begin();
+name = scanName || server.only || "";
 connect();
+showProgram();
+setInterval(showProgram, 3000);

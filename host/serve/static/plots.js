@@ -25,7 +25,7 @@ export function ticks(low, high, n) {
  */
 export function plot(place, what) {
   const width = place.clientWidth || 320, height = place.clientHeight || 230;
-  const left = 42, right = width - 8, top = 22, bottom = height - 34;
+  const left = 42, right = width - 14, top = 22, bottom = height - 34;
   const at = (v, [a, b], from, to) => from + ((v - a) / (b - a)) * (to - from);
   const px = (v) => at(v, what.x, left, right), py = (v) => at(v, what.y, bottom, top);
   const svg = document.createElementNS(SVG, "svg");

@@ -1,0 +1,74 @@
+"""The operator's words about a scan: `operator.json` beside its rows, notes and tags, read and written whole."""
+
+from __future__ import annotations
+
+import json
+import unicodedata
+from pathlib import Path
+
+import msgspec
+
+from polysight.host.products import write_atomically
+from polysight.shared.errors import ConfigError, DataError
+
+NOTES = "operator.json"
+LONGEST_NOTES, LONGEST_TAG, MOST_TAGS = 10_000, 40, 20
+_MOST_BYTES = 1 << 17
+
+
+class Notes(msgspec.Struct, frozen=True):
+    """`notes`, free text, and `tags`, short words, of one scan."""
+
+    notes: str = ""
+    tags: tuple[str, ...] = ()
+
+
+def read_notes(folder: Path) -> Notes:
+    """The notes of a scan; empty where there are none.
+
+    Raises
+    ------
+    DataError
+        when the file is damaged.
+    """
+    path = folder / NOTES
+    try:
+        with path.open("rb") as f:
+            raw = f.read(_MOST_BYTES + 1)
+        return Notes() if len(raw) > _MOST_BYTES else msgspec.json.decode(raw, type=Notes)
+    except FileNotFoundError:
+        return Notes()
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as e:
+        raise DataError(
+            f"{path}: cannot be read: {e}", "it was edited or damaged", "correct it, or remove it"
+        ) from None
+
+
+def write_notes(folder: Path, notes: Notes) -> Notes:
+    """Check and write the notes of a scan; returns them as written.
+
+    Raises
+    ------
+    ConfigError
+        when a text is too long, or there are too many tags.
+    """
+    text = _shown(notes.notes, keep="\n")
+    tags = tuple(dict.fromkeys(tag for tag in (_shown(t).strip() for t in notes.tags) if tag))
+    wrong = ""
+    if len(text) > LONGEST_NOTES:
+        wrong = f"the notes have {len(text)} characters, {LONGEST_NOTES} are possible"
+    elif len(tags) > MOST_TAGS:
+        wrong = f"{len(tags)} tags, {MOST_TAGS} are possible"
+    elif long := next((tag for tag in tags if len(tag) > LONGEST_TAG), ""):
+        wrong = f"the tag {long[:LONGEST_TAG]!r}... has {len(long)} characters, {LONGEST_TAG} are possible"
+    if wrong:
+        raise ConfigError(wrong, "lists have to stay readable", "shorten it; longer texts go into a file of their own")
+    content = {"notes": text, "tags": list(tags)}
+    write_atomically(folder / NOTES, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
+    return Notes(text, tags)
+
+
+def _shown(text: str, keep: str = "") -> str:
+    """Without control, direction and half characters, which lists and terminals cannot show."""
+    bad = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    return "".join(c for c in unicodedata.normalize("NFC", text) if c in keep or unicodedata.category(c) not in bad)

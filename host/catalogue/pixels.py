@@ -1,0 +1,142 @@
+"""The pixels of a processed scan with what follows from them: place in millimetres, permittivity, and their errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polysight.host.materials import axis_mm
+from polysight.host.polarimetry import permittivity_from_ratio, specular_incidence_rad
+from polysight.host.products import SavedProducts
+from polysight.shared.config import Instrument
+from polysight.shared.errors import DataError
+from polysight.shared.tables import decode
+
+Real = NDArray[np.float64]
+_FAINT_DB = -26.0  # below the brightest: what is fainter says nothing
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Images of saved products. Arrays are [ny, nx], row 0 the smallest y.
+
+    Attributes
+    ----------
+    products
+        The folder they come from.
+    """
+
+    products: SavedProducts
+
+    @property
+    def h(self) -> NDArray[np.complex64]:
+        """s-polarised channel."""
+        return self.products.h
+
+    @property
+    def v(self) -> NDArray[np.complex64]:
+        """p-polarised channel."""
+        return self.products.v
+
+    @property
+    def p(self) -> NDArray[np.complex64]:
+        """Their ratio."""
+        return self.products.p
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Pixels that the scan illuminates."""
+        return self.products.valid
+
+    @property
+    def referenced(self) -> bool:
+        """Whether the images are relative to metal, and a result may be shown."""
+        verdict = self.products.verdict
+        return bool(self.products.materials) and (verdict is None or verdict.usable)
+
+    @cached_property
+    def clear(self) -> NDArray[np.bool_]:
+        """Pixels bright enough in both channels for their ratio to say something."""
+        out = self.valid & np.isfinite(self.h) & np.isfinite(self.v)
+        for channel in (np.abs(self.h), np.abs(self.v)):
+            top = float(np.percentile(channel[out], 99.5)) if out.any() else 0.0
+            out = out & (channel > top * 10 ** (_FAINT_DB / 20))
+        return out
+
+    @cached_property
+    def x_mm(self) -> Real:
+        """Pixel centres from the middle of the image, [nx]."""
+        return axis_mm(self.products.x_m)
+
+    @cached_property
+    def y_mm(self) -> Real:
+        """The same, [ny]."""
+        return axis_mm(self.products.y_m)
+
+    @property
+    def extent_mm(self) -> tuple[float, float, float, float]:
+        """Left, right, lower and upper edge of the image."""
+        x, y = self.x_mm, self.y_mm
+        hx, hy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
+        return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
+
+    @cached_property
+    def p_sigma(self) -> Real:
+        """Standard deviation of each part of P; not a number where it is not known."""
+        sigma = self.products.p_sigma
+        return np.full(self.valid.shape, np.nan) if sigma is None else np.asarray(sigma, np.float64)
+
+    @cached_property
+    def theta_rad(self) -> float:
+        """Incidence angle, of the error budget where it says. Raises DataError."""
+        budget = self.products.materials.get("error_budget") or {}
+        try:
+            return float(np.radians(budget["incidence"]["deg"]))
+        except (KeyError, TypeError):
+            pass
+        if "instrument" not in self.products.scan:
+            raise DataError(
+                f"{self.products.folder}: the incidence angle is not known", "an earlier release made these products",
+                "process the scan again",
+            )  # fmt: skip
+        rig = decode(self.products.scan["instrument"], Instrument, f"{self.products.folder}/scan.json: instrument")
+        return specular_incidence_rad(rig)
+
+    @cached_property
+    def permittivity(self) -> NDArray[np.complex128]:
+        """Permittivity eps' - j eps'' as a half space; not a number where P is too close to metal, or says nothing."""
+        p = np.where(self.clear & np.isfinite(self.p), self.p, np.nan).astype(np.complex128)
+        eps = permittivity_from_ratio(p, self.theta_rad)
+        return np.where(np.isfinite(eps), eps, complex(np.nan, np.nan))
+
+    @cached_property
+    def permittivity_sigma(self) -> Real:
+        """Standard deviation of each of its parts from that of P: the map is analytic, so one slope says it."""
+        p = np.asarray(self.p, np.complex128)
+        with np.errstate(invalid="ignore", over="ignore"):
+            near = permittivity_from_ratio(p + _STEP, self.theta_rad)
+            slope = np.abs((near - permittivity_from_ratio(p, self.theta_rad)) / _STEP)
+            return np.where(np.isfinite(slope), slope, np.nan) * self.p_sigma
+
+    @cached_property
+    def metal_like(self) -> NDArray[np.bool_]:
+        """Pixels so close to metal that their permittivity says nothing but that it is large."""
+        size = np.abs(self.permittivity)
+        with np.errstate(invalid="ignore"):
+            unsure = np.isfinite(self.p_sigma) & (self.permittivity_sigma > 0.5 * size)
+            return unsure | (np.abs(self.p - 1) < 0.2) | ~np.isfinite(size)
+
+    def nearest(self, x_mm: float, y_mm: float) -> tuple[int, int]:
+        """Row and column of the pixel at a place. Raises DataError outside the image."""
+        left, right, low, high = self.extent_mm
+        if not (left <= x_mm <= right and low <= y_mm <= high):
+            raise DataError(
+                f"x = {x_mm:.1f} mm, y = {y_mm:.1f} mm lies outside the image",
+                f"it reaches from x {left:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
+                "give a place in it, in mm from its centre",
+            )
+        return int(np.abs(self.y_mm - y_mm).argmin()), int(np.abs(self.x_mm - x_mm).argmin())

@@ -1,0 +1,87 @@
+"""What a processed scan shows, as plain data for a page: verdict, pictures, patches, quality and files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from polysight.host.catalogue.pictures import MAPS
+from polysight.host.catalogue.pixels import Pixels
+from polysight.host.products import find_labels, label_place, read_products
+from polysight.shared.errors import PolysightError
+
+EXPORT = "export"
+"""Folder of a scan that a page has exports written into."""
+FILES = ("report.html", "image.npz", "materials.json", "quality.json", "scan.json", "patches.npz")
+EXPORTS = (".h5", ".hdf5", ".mat", ".csv", ".nc", ".cphd", ".png", ".pgw")
+_KEYS = (
+    "label", "name", "confidence", "probabilities", "why", "metal_reference", "metal_like", "box_mm", "outline_mm",
+    "pixels", "incidence_deg", "ratio", "permittivity", "refused", "box", "truth", "bands", "tilt_across_deg",
+)  # fmt: skip
+_NO_PERMITTIVITY = ("p_sigma", "permittivity", "loss")
+
+
+def result_of(folder: Path) -> dict[str, Any]:
+    """The products of a scan folder, or of a folder of products.
+
+    Raises
+    ------
+    DataError
+        when there are none, or one is damaged.
+    """
+    products = read_products(folder)
+    pixels, verdict = Pixels(products), products.verdict
+    left, right, low, high = pixels.extent_mm
+    names = [n for n in MAPS if pixels.referenced or n not in _NO_PERMITTIVITY]
+    return {
+        "folder": str(products.folder),
+        "scan_id": products.scan_id,
+        "simulated": products.simulated,
+        "processed_utc": products.scan.get("processed_utc", ""),
+        "extent_mm": [left, right, low, high],
+        "shape": list(pixels.valid.shape),
+        "pictures": [{"name": n, "title": MAPS[n].title, "colours": MAPS[n].colours} for n in names],
+        "referenced": pixels.referenced,
+        "metal_reference": products.materials.get("metal_reference", {}),
+        "library": products.materials.get("library", ""),
+        "budget": products.materials.get("error_budget") or {},
+        "verdict": None if verdict is None else {**verdict.to_dict(), "text": verdict.text},
+        "patches": [{key: s[key] for key in _KEYS if key in s} for s in products.segments],
+        "coverage": products.quality.get("coverage", {}),
+        "labels": labels_of(folder, pixels),
+        "files": files_of(folder),
+    }
+
+
+def labels_of(folder: Path, pixels: Pixels) -> dict[str, Any] | None:
+    """Boxes that a person drew, in millimetres; None where nobody did, and what is wrong with a file that is."""
+    try:
+        found = find_labels(folder)
+        if found is None:
+            return None
+        path, labels = found
+        labels = labels.in_mm(pixels.products.x_m, pixels.products.y_m)
+    except PolysightError as e:
+        return {"boxes": {}, "metal": None, "specimens": {}, "file": str(label_place(folder)), "problem": e.what}
+    boxes = {name: list(box) for name, box in labels.boxes.items()}
+    return {
+        "boxes": boxes,
+        "metal": labels.metal,
+        "specimens": dict(labels.specimens),
+        "file": str(path),
+        "problem": "",
+    }
+
+
+def files_of(folder: Path) -> list[dict[str, Any]]:
+    """Files of a scan's products and exports that somebody may want to have: `of` which, `name`, `bytes`."""
+    products = read_products(folder).folder
+    found = []
+    for of, where in (("products", products), (EXPORT, folder / EXPORT)):
+        if where.is_symlink() or not where.is_dir():
+            continue
+        for path in sorted(where.iterdir()):
+            wanted = path.name in FILES or path.suffix in EXPORTS
+            if wanted and path.is_file() and not path.is_symlink():
+                found.append({"of": of, "name": path.name, "bytes": path.stat().st_size})
+    return found

@@ -1,0 +1,209 @@
+"""The operator's page and what it does, as commands: serve, preview, scans, note, ask, probe, compare."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from polysight.host.cli.options import RIG, Add
+from polysight.shared.errors import ConfigError
+
+if TYPE_CHECKING:
+    from polysight.host.serve import Place
+
+WISHES = ("pause", "continue", "stop", "abort")
+
+
+def add_commands(add: Add) -> None:
+    """Register the commands."""
+    _add_serve(add)
+    _add_lists(add)
+    _add_results(add)
+
+
+def _serve(args: argparse.Namespace) -> int:
+    _check_extra()
+    from polysight.host.serve import serve
+
+    config = args.config if args.config is not None else RIG if RIG.exists() else None
+    if config is not None and not config.is_file():
+        raise ConfigError(f"{config}: no such file", "--config names it", "give a rig file, or leave it out")
+    return serve(args.scans, _place(args), config, not args.read_only)
+
+
+def _preview(args: argparse.Namespace) -> int:
+    _check_extra()
+    if args.folder.exists() and not args.folder.is_dir():
+        raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
+    from polysight.host.serve import preview
+
+    return preview(args.folder, _place(args), args.control)
+
+
+def _check_extra() -> None:
+    if any(importlib.util.find_spec(name) is None for name in ("starlette", "uvicorn")):
+        raise ConfigError(
+            "starlette and uvicorn are not installed",
+            "the page is an extra of the host half",
+            "pip install '.[serve]', from the repository",
+        )
+
+
+def _place(args: argparse.Namespace) -> Place:
+    from polysight.host.serve import Place
+
+    return Place(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
+
+
+def _port(text: str) -> int:
+    """A TCP port, 0 for any that is free."""
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port, 0..65535")
+    return int(text)
+
+
+def _add_serve(add: Add) -> None:
+    sub = add(
+        "serve",
+        _serve,
+        "the operator's page: all scans under a folder; plan, start, watch, probe, compare and label them in a browser",
+        "polysight serve scans --config instrument.toml        # then open the address that it prints",
+    )
+    sub.add_argument(
+        "scans", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help="folder of scans (default: scans)"
+    )
+    sub.add_argument(
+        "--config", type=Path, metavar="FILE", help="rig file of new scans (default: instrument.toml, if it is here)"
+    )
+    sub.add_argument("--read-only", action="store_true", help="show scans, start and ask for nothing")
+    _add_place(sub)
+    sub = add(
+        "preview",
+        _preview,
+        "the page of one running or finished scan: time left, images row by row, faults in words",
+        "polysight preview scans/one                           # then open http://127.0.0.1:8080/\n"
+        "  polysight preview scans/one --control --port 8081     # with buttons to pause and stop",
+    )
+    sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; it may not be there yet")
+    _add_place(sub)
+    sub.add_argument(
+        "--control",
+        action="store_true",
+        help="let who opens the printed address pause and stop the scan (default: read-only)",
+    )
+
+
+def _add_place(sub: argparse.ArgumentParser) -> None:
+    """Where the server is reached."""
+    sub.add_argument("--port", type=_port, default=8080, help="TCP port (default: 8080; 0: any that is free)")
+    sub.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="address to serve on (default: this machine only; 0.0.0.0: the whole network, for who has the token)",
+    )
+    sub.add_argument(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="answer to this name too, as a browser sends it",
+    )
+    sub.add_argument("--certificate", type=Path, metavar="FILE", help="certificate of TLS (PEM), with --key")
+    sub.add_argument("--key", type=Path, metavar="FILE", help="its private key (PEM)")
+
+
+def _scans(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.scans import scans
+
+    return scans(args.scans, args.tag, args.find, args.json)
+
+
+def _note(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.scans import note
+
+    return note(args.scan, args.text, args.tag, args.untag)
+
+
+def _ask(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.scans import ask_scan
+
+    return ask_scan(args.scan, args.wish)
+
+
+def _add_lists(add: Add) -> None:
+    sub = add(
+        "scans", _scans, "list the scans under a folder: state, verdict, names, tags, size", "polysight scans scans"
+    )
+    sub.add_argument(
+        "scans", type=Path, nargs="?", default=Path("scans"), metavar="SCANS", help="folder of scans (default: scans)"
+    )
+    sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="only scans with this tag")
+    sub.add_argument(
+        "--find", default="", metavar="TEXT", help="only scans whose name, notes, tags or materials hold it"
+    )
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    sub = add(
+        "note",
+        _note,
+        "write notes and tags of a scan, kept beside its rows; print them",
+        "polysight note scans/one --text 'oak, second board' --tag oak",
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument("--text", metavar="TEXT", help="the notes, in place of those that are there")
+    sub.add_argument("--tag", action="append", default=[], metavar="TAG", help="add a tag")
+    sub.add_argument("--untag", action="append", default=[], metavar="TAG", help="remove a tag")
+    sub = add("ask", _ask, "ask a running scan to pause, continue, stop or abort", "polysight ask scans/one pause")
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
+    sub.add_argument(
+        "wish",
+        choices=WISHES,
+        help="pause: before the next row; stop: after this row; abort: now, this row is lost; continue: after a pause",
+    )
+
+
+def _probe(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.scans import probe_scan
+
+    return probe_scan(args.data, args.at, args.library, args.json)
+
+
+def _compare(args: argparse.Namespace) -> int:
+    from polysight.host.jobs.scans import compare_scans
+
+    return compare_scans(args.first, args.second, args.png, args.json)
+
+
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form X,Y in mm, e.g. 45,0") from None
+    return x, y
+
+
+def _add_results(add: Add) -> None:
+    sub = add(
+        "probe",
+        _probe,
+        "one place of a processed scan: H, V, P with its error, permittivity, nearest materials, range profile",
+        "polysight probe scans/one 45,0",
+    )
+    sub.add_argument("data", type=Path, metavar="DATA", help="scan folder, or a folder that polysight process wrote")
+    sub.add_argument("at", type=_point, metavar="X,Y", help="place, mm from the image's centre")
+    sub.add_argument(
+        "--library", type=Path, metavar="FILE", help="materials to compare with (default: the simulated ones)"
+    )
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")
+    sub = add(
+        "compare",
+        _compare,
+        "differences of two processed scans: P and permittivity, in standard deviations",
+        "polysight compare scans/one scans/two --png difference.png",
+    )
+    for name in ("first", "second"):
+        sub.add_argument(name, type=Path, metavar="DATA", help="scan folder, or a folder of products")
+    sub.add_argument("--png", type=Path, metavar="FILE", help="draw where P differs, in standard deviations")
+    sub.add_argument("--json", action="store_true", help="print JSON, for programs")

@@ -1,0 +1,125 @@
+"""Commands that look at scans that are there, as the operator's page does: scans, note, ask, probe, compare."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from polysight.host.acquisition import Wish, ask
+from polysight.host.catalogue import Notes, Scans, Summary, compare, folder_bytes, probe, read_notes, write_notes
+from polysight.shared.errors import DataError, no_such
+
+
+def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
+    """Print the scans under a folder, the newest first; returns 0. Raises DataError when there is no such folder."""
+    if not root.is_dir():
+        raise no_such(root)
+    found = [s for s in Scans(root).list() if set(tags) <= set(s.tags) and text.casefold() in _words(s)]
+    if as_json:
+        rows = [asdict(s) | {"bytes": folder_bytes(root / s.name)} for s in found]
+        sys.stdout.write(json.dumps({"scans": rows}, indent=1, ensure_ascii=False) + "\n")
+        return 0
+    width = max((len(s.name) for s in found), default=0)
+    for s in found:
+        size = folder_bytes(root / s.name) / 1e6
+        told = [s.state, f"{s.committed}/{s.rows} rows" if s.rows else "", s.verdict, ", ".join(s.materials)]
+        told += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
+        sys.stdout.write(f"{s.name:{width}}  {size:8.1f} MB  {'  '.join(t for t in told if t)}\n")
+    sys.stdout.write(f"{len(found)} scans under {root}\n")
+    return 0
+
+
+def _words(s: Summary) -> str:
+    return " ".join((s.name, s.scan_id, s.rig, s.state, s.notes, *s.tags, *s.materials)).casefold()
+
+
+def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> int:
+    """Change or print the operator's notes and tags of a scan; returns 0. Raises PolysightError."""
+    if not folder.is_dir():
+        raise no_such(folder)
+    notes = read_notes(folder)
+    if text is not None or add or remove:
+        tags = tuple(t for t in dict.fromkeys((*notes.tags, *add)) if t not in remove)
+        notes = write_notes(folder, Notes(notes.notes if text is None else text, tags))
+    sys.stdout.write(f"{notes.notes}\n" if notes.notes else "")
+    sys.stdout.write(f"tags: {', '.join(notes.tags) or 'none'}\n")
+    return 0
+
+
+def ask_scan(folder: Path, wish: str) -> int:
+    """Ask a running scan for something; returns 0 when it has heard. Raises ScanError."""
+    if not folder.is_dir():
+        raise no_such(folder)
+    ask(folder, Wish(wish))
+    sys.stdout.write(f"{folder}: heard {wish}\n")
+    return 0
+
+
+def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None, as_json: bool) -> int:
+    """Print what a processed scan says of one place; returns 0. Raises DataError."""
+    found = probe(folder, *place_mm, library)
+    if as_json:
+        sys.stdout.write(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
+        return 0
+    lines = [f"x {found['place_mm'][0]:g} mm, y {found['place_mm'][1]:g} mm from the image's centre"]
+    if not found["lit"]:
+        lines.append("the scan does not light this place")
+    lines.append(f"|H| {_value(found['h_db'])} dB, |V| {_value(found['v_db'])} dB")
+    lines.append(f"P = {_complex(found['p'])} +- {_value(found['p_sigma'])} a part")
+    if found["permittivity"]:
+        error = _value(found["permittivity_sigma"])
+        lines.append(f"permittivity {_complex(found['permittivity'])} +- {error} a part, as a half space")
+    else:
+        lines.append(f"no permittivity: {found['why']}")
+    if (patch := found["patch"]) is not None:
+        lines.append(f"in patch {patch['label']}: {patch.get('name') or 'not named'}")
+    lines += [f"  {n['sigmas']:g} standard deviations from {n['name']}" for n in found["nearest"]]
+    lines.append(found["profile_why"] or "range profile: --json")
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    return 0
+
+
+def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool) -> int:
+    """Print the differences of two processed scans; returns 0. Raises DataError."""
+    found = compare(first, second)
+    told = found.to_dict()
+    if picture is not None:
+        from polysight.host.catalogue import draw_comparison
+
+        try:
+            picture.write_bytes(draw_comparison(found, "sigmas").png)
+        except OSError as e:
+            raise DataError(f"{picture}: cannot be written: {e.strerror}", "no such folder, or no permission") from None
+    if as_json:
+        sys.stdout.write(json.dumps(told, indent=1, ensure_ascii=False) + "\n")
+        return 0
+    lines = [f"{first} minus {second}: {told['compared']} pixels", *(f"note: {n}" for n in told["notes"])]
+    if told["significant_share"] is not None:
+        share = f"{100 * told['significant_share']:.1f} %"
+        lines.append(f"P differs by more than {told['significant_sigmas']:g} standard deviations in {share} of them")
+    for pair in told["patches"]:
+        names = " and ".join(name or "not named" for name in pair["names"])
+        where = f"x {pair['place_mm'][0]:g}, y {pair['place_mm'][1]:g} mm ({names})"
+        d = pair["difference"]
+        if d is None:
+            lines.append(f"{where}: no permittivity in one of them")
+            continue
+        sure = "" if pair["sigmas"] is None else f": {pair['sigmas']:g} standard deviations"
+        lines.append(f"{where}: permittivity differs by {_complex(d)}{sure}")
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    return 0
+
+
+def _value(value: float | None) -> str:
+    return "not known" if value is None else f"{value:.3g}"
+
+
+def _complex(parts: dict[str, Any]) -> str:
+    """`3.1 - 0.2j`."""
+    real, imag = parts["real"], parts["imag"]
+    if real is None or imag is None:
+        return "not known"
+    return f"{real:.3g} {'-' if imag < 0 else '+'} {abs(imag):.3g}j"

@@ -1,0 +1,78 @@
+"""The application: pages, what they read and what they ask for, behind the guard."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, RedirectResponse, Response
+from starlette.routing import Route
+
+from polysight.host.serve.control import control_routes
+from polysight.host.serve.guard import Guard, refused
+from polysight.host.serve.reading import reading_routes
+from polysight.host.serve.site import Site
+from polysight.shared.errors import ConfigError, DataError, PolysightError
+
+STATIC = Path(__file__).parent / "static"
+PAGES = {
+    "/": "catalogue.html",
+    "/scan": "scan.html",
+    "/watch": "watch.html",
+    "/new": "new.html",
+    "/compare": "compare.html",
+}
+
+
+def make_app(site: Site) -> Starlette:
+    """The application of a site."""
+
+    async def page(request: Request) -> Response:
+        if request.url.path == "/" and site.scans.only is not None:
+            return RedirectResponse("/watch")  # a browser keeps the fragment, and the token in it
+        return FileResponse(STATIC / PAGES[request.url.path])
+
+    files = {path.name for path in STATIC.iterdir() if path.suffix in (".js", ".css", ".svg")}
+    routes = [Route(path, page) for path in PAGES]
+    routes += [Route(f"/{name}", _static(name)) for name in sorted(files)]
+    routes += reading_routes(site) + control_routes(site)
+    return Starlette(
+        routes=routes,
+        middleware=[Middleware(Guard, access=site.access)],
+        exception_handlers={PolysightError: _told, LookupError: _unknown, 404: _nothing, Exception: _fault},
+    )
+
+
+def _static(name: str) -> Callable[[Request], Awaitable[Response]]:
+    async def file(request: Request) -> Response:
+        del request
+        return FileResponse(STATIC / name)
+
+    return file
+
+
+async def _told(request: Request, e: Exception) -> Response:
+    """An error in its three parts."""
+    del request
+    if not isinstance(e, PolysightError):
+        raise e
+    status = 400 if isinstance(e, ConfigError) else 404 if isinstance(e, DataError) else 409
+    return refused(status, e.what, e.remedy, e.why)
+
+
+async def _unknown(request: Request, e: Exception) -> Response:
+    del request
+    return refused(404, "There is no such wish", str(e))
+
+
+async def _nothing(request: Request, e: Exception) -> Response:
+    del request, e
+    return refused(404, "Nothing is here", "begin at the list of scans")
+
+
+async def _fault(request: Request, e: Exception) -> Response:
+    del request
+    return refused(500, f"A fault of the server: {type(e).__name__}", "report it, with what its terminal says")

@@ -1,0 +1,258 @@
+"""Who may ask what: names of the host, origin, token, rate of wrong tokens, size and time of a body; and safe headers.
+
+One middleware before everything else. Reading needs the token too unless the server is bound to loopback. The token
+comes in a header, which no form, link or image of another page can send; what reads (images, event streams) may bring
+the session's cookie instead, which allows nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import ipaddress
+import secrets
+import time
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import cookie_parser
+from starlette.responses import JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from polysight.host.serve.connections import HEAD_BYTES
+
+TOKEN_HEADER = "X-Polysight-Token"
+BODY_BYTES, BODY_S = 1 << 16, 10.0
+TRIES, TRIES_A_SECOND = 20.0, 5.0
+"""Wrong tokens of one address that are compared at once, and each second; a session that was opened is not counted."""
+_ADDRESSES = 4096  # that are remembered
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none';"
+    " form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+    "Cache-Control": "no-store",
+}
+_OPEN_PATHS = ("/api/session", "/api/page")  # what a page needs to find out that it lacks the token
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who is let in.
+
+    Attributes
+    ----------
+    token
+        For control, and for reading unless `loopback`; "" where nobody may control and everybody may read.
+    loopback
+        Whether the server is bound to this machine alone.
+    hosts
+        Further names the server answers to, as `Host` has them.
+    control
+        Whether anything may be asked for.
+    secure
+        Whether it speaks TLS.
+    session
+        The cookie's secret, of this start of the server.
+    """
+
+    token: str = ""
+    loopback: bool = True
+    hosts: tuple[str, ...] = ()
+    control: bool = False
+    secure: bool = False
+    session: str = field(default_factory=lambda: secrets.token_urlsafe(18))
+
+    def knows_host(self, host: str) -> bool:
+        """Whether a `Host` is a name of this server: a name of somebody else that points here is not."""
+        name = _name_of(host)
+        if name in ("localhost", *self.hosts):
+            return True
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return address.is_loopback or not self.loopback  # who gives an address was not sent here by a foreign name
+
+    def holds_token(self, headers: Headers) -> bool:
+        """Whether the request brings the token; compared in constant time."""
+        given = headers.get(TOKEN_HEADER, "")
+        return bool(self.token) and hmac.compare_digest(given.encode(), self.token.encode())
+
+    def holds_session(self, headers: Headers, port: int) -> bool:
+        """Whether it brings the cookie of an opened session."""
+        given = cookie_parser(headers.get("cookie", "")).get(cookie_name(port), "")
+        return hmac.compare_digest(given.encode(), self.session.encode())
+
+
+def cookie_name(port: int) -> str:
+    """Of the session: servers on other ports of a machine share its cookies."""
+    return f"polysight-{port}"
+
+
+def _name_of(host: str) -> str:
+    """`Host` without its port."""
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.rpartition(":")[0] if ":" in host else host
+
+
+class WrongTokens:
+    """Counts wrong tokens by address: each has a bucket of tries that fills again."""
+
+    def __init__(self) -> None:
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def spent(self, address: str) -> bool:
+        """Whether this address has to wait."""
+        return self._left(address) < 1
+
+    def note(self, address: str) -> None:
+        """One more wrong token."""
+        self._buckets[address] = (self._left(address) - 1, time.monotonic())
+        self._buckets.move_to_end(address)
+        while len(self._buckets) > _ADDRESSES:
+            self._buckets.popitem(last=False)
+
+    def _left(self, address: str) -> float:
+        left, at = self._buckets.get(address, (TRIES, 0.0))
+        return min(TRIES, left + (time.monotonic() - at) * TRIES_A_SECOND)
+
+
+class Guard:
+    """The middleware; `app` sees nothing that does not pass."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app, self._access = app, access
+        self._wrong = WrongTokens()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse, or pass on."""
+        if scope["type"] != "http":
+            return
+        refusal = self._refusal(scope, Headers(scope=scope))
+        if refusal is not None:
+            await _closing(refusal)(scope, receive, _with_headers(send))
+            return
+        try:
+            await self._app(scope, _limited(receive), _with_headers(send))
+        except BodyError as e:
+            await _closing(refused(e.status, e.what, "send less, or sooner"))(scope, receive, _with_headers(send))
+
+    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
+        """Why a request is not let in."""
+        method, path = scope["method"], scope["path"]
+        if sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
+            return refused(431, f"The head is longer than {HEAD_BYTES} bytes", "send less")
+        if not self._access.knows_host(headers.get("host", "")):
+            return refused(
+                400, "This server has another name", "open the address that it printed; --allow-host NAME adds one"
+            )
+        if method not in ("GET", "HEAD", "POST"):
+            return refused(405, "This cannot be asked", "GET or POST")
+        if not path.startswith("/api/"):
+            return None if method != "POST" else refused(405, "Nothing can be asked here", "GET it")
+        if not _same_site(headers, scope.get("scheme", "http"), writes=method == "POST"):
+            return refused(403, "Another site asks", "use the page that this server serves")
+        if length_of(headers) > BODY_BYTES:
+            return refused(413, f"More than {BODY_BYTES} bytes", "send less")
+        return self._unknown(scope, headers)
+
+    def _unknown(self, scope: Scope, headers: Headers) -> Response | None:
+        """Whether token or session are missing for what is asked."""
+        access, writes = self._access, scope["method"] == "POST"
+        if writes and not access.control and scope["path"] != "/api/session":
+            return refused(403, "This view is read-only", "start it with --control to have buttons")
+        if not writes and (access.loopback or not access.token or scope["path"] in _OPEN_PATHS):
+            return None
+        port, client = int((scope.get("server") or ("", 0))[1] or 0), str((scope.get("client") or ("",))[0])
+        session = access.holds_session(headers, port)
+        if not writes and session:
+            return None
+        if not session and self._wrong.spent(client):
+            answer = refused(429, "Too many wrong tokens came from your address", "try again in a second")
+            answer.headers["Retry-After"] = "1"
+            return answer
+        if access.holds_token(headers):
+            return None
+        self._wrong.note(client)
+        status = 403 if writes else 401
+        return refused(
+            status, "The token is wrong or missing", "open the address that the server printed when it started"
+        )
+
+
+def refused(status: int, what: str, do: str, why: str = "") -> Response:
+    """An answer in the three parts of every error."""
+    return JSONResponse({"what": what, "why": why, "do": do}, status)
+
+
+def _closing(answer: Response) -> Response:
+    """The same on a connection that ends with it: what is left of the request is not read."""
+    answer.headers["Connection"] = "close"
+    return answer
+
+
+def length_of(headers: Headers) -> int:
+    """Bytes of the body as the request says; 0 where it does not."""
+    text = headers.get("content-length", "0")
+    return int(text) if text.isdecimal() and len(text) < 19 else 0
+
+
+def _same_site(headers: Headers, scheme: str, writes: bool) -> bool:
+    """Whether the request comes from a page of this server, or from no page at all."""
+    if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
+        return False
+    origin = headers.get("origin")
+    if origin is None:
+        return True
+    told = urlsplit(origin)
+    same = told.netloc == headers.get("host", "") and told.scheme == scheme
+    return same if writes else same or "sec-fetch-site" in headers
+
+
+class BodyError(Exception):
+    """A body that is too large or too slow."""
+
+    def __init__(self, status: int, what: str) -> None:
+        super().__init__(what)
+        self.status, self.what = status, what
+
+
+def _limited(receive: Receive) -> Receive:
+    """The same body, refused when it grows beyond the limit or takes too long."""
+    taken, begun, whole = 0, time.monotonic(), False
+
+    async def limited() -> Message:
+        nonlocal taken, whole
+        if whole:
+            return await receive()  # a stream waits here for its page to go
+        try:
+            message = await asyncio.wait_for(receive(), max(0.05, BODY_S - (time.monotonic() - begun)))
+        except TimeoutError:
+            raise BodyError(408, f"The body did not come within {BODY_S:g} s") from None
+        taken += len(message.get("body", b""))
+        if taken > BODY_BYTES:
+            raise BodyError(413, f"More than {BODY_BYTES} bytes")
+        whole = not message.get("more_body", False)
+        return message
+
+    return limited
+
+
+def _with_headers(send: Send) -> Send:
+    """Every answer with the headers that keep other sites out."""
+
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                headers.setdefault(name, value)
+        await send(message)
+
+    return sending

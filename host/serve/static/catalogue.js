@@ -1,0 +1,119 @@
+// The list of scans: what there is, how it stands; search, order, and what several scans are chosen for.
+import { address, badge, begin, by, bytes, complain, day, get, make, nest, pageOf, post, STATES, VERDICTS } from "./common.js";
+
+const LOOK_MS = 4000;
+const ORDER = { good: 0, care: 1, "": 2, none: 3, damaged: 4 };
+const cards = new Map(), chosen = new Set();
+let server = {}, told = { scans: [] }, seen = "";
+
+const words = (s) => [s.name, s.scan_id, s.rig, s.state, s.notes, s.started_utc, ...s.tags, ...s.materials].join(" ").toLowerCase();
+
+function card(s) {
+  const item = make("li"), [state, level] = STATES[s.state] ?? [s.state, "warn"];
+  const box = make("input", null, null, { type: "checkbox", checked: chosen.has(s.name), onchange: () => choosing(s.name), "aria-label": `Choose ${s.name}` });
+  const choose = nest(make("label", null, "choose"), box);
+  const live = ["running", "paused", "lost", "begun"].includes(s.state) || !s.processed;
+  const link = make("a", s.name, "name", { href: pageOf(live ? "watch" : "scan", s.name) });
+  const picture = s.processed
+    ? make("img", null, "thumb", { loading: "lazy", decoding: "async", alt: "", src: address("thumbnail", { scan: s.name, at: s.seconds }) })
+    : make("div", s.state === "running" ? "being scanned" : "not processed", "thumb none");
+  picture.addEventListener("error", () => picture.replaceWith(make("div", "no picture", "thumb none")));
+  const badges = make("div", null, "badges");
+  badges.append(badge([state, level]));
+  if (s.verdict) badges.append(badge(VERDICTS[s.verdict] ?? [s.verdict, "warn"]));
+  if (s.simulated) badges.append(make("span", "simulated", "stamp"));
+  const rows = s.rows ? `${s.committed} of ${s.rows} rows · ` : "";
+  const facts = make("div", `${s.seconds ? day(s.seconds) : ""} · ${rows}${bytes(s.bytes)}${s.rig ? ` · ${s.rig}` : ""}`, "facts");
+  const found = s.materials.length ? make("div", s.materials.join(", "), "facts") : "";
+  item.append(picture, link, choose, badges, facts, found, s.notes ? make("div", s.notes, "words") : "");
+  if (s.tags.length) item.append(nest(make("div", null, "badges"), ...s.tags.map((t) => make("span", t, "tag"))));
+  item.classList.toggle("chosen", chosen.has(s.name));
+  return item;
+}
+
+function choosing(name) {
+  if (!chosen.delete(name)) chosen.add(name);
+  cards.get(name)?.node.classList.toggle("chosen", chosen.has(name));
+  showChoice();
+}
+
+function showChoice() {
+  const names = [...chosen];
+  by("compare").hidden = names.length !== 2;
+  if (names.length === 2) by("compare").href = `/compare?${new URLSearchParams({ a: names[0], b: names[1] })}`;
+  by("train-open").hidden = !(server.starts && names.length);
+  if (!names.length) by("train").hidden = true;
+}
+
+function wanted() {
+  const text = by("find").value.trim().toLowerCase(), state = by("state").value, tag = by("tag").value;
+  const found = told.scans.filter((s) => (!state || s.state === state) && (!tag || s.tags.includes(tag)) && text.split(/\s+/).every((w) => words(s).includes(w)));
+  const by_ = {
+    new: (a, b) => b.seconds - a.seconds, old: (a, b) => a.seconds - b.seconds, bytes: (a, b) => (b.bytes ?? 0) - (a.bytes ?? 0),
+    verdict: (a, b) => (ORDER[a.verdict] ?? 5) - (ORDER[b.verdict] ?? 5),
+  };
+  return found.sort((a, b) => by_[by("sort").value]?.(a, b) || a.name.localeCompare(b.name));
+}
+
+function options(id, values, name = (v) => v) {
+  const select = by(id), now = select.value;
+  select.replaceChildren(select.options[0], ...values.map((v) => make("option", name(v), null, { value: v })));
+  select.value = values.includes(now) ? now : "";
+}
+
+function show() {
+  const found = wanted();
+  for (const s of found) {
+    const made = JSON.stringify(s), old = cards.get(s.name);
+    if (old?.made !== made) {
+      const node = card(s);
+      old?.node.replaceWith(node);
+      cards.set(s.name, { made, node });
+    }
+  }
+  const nodes = found.map((s) => cards.get(s.name).node), now = [...by("list").children];
+  if (nodes.length !== now.length || nodes.some((node, i) => node !== now[i])) by("list").replaceChildren(...nodes);
+  const all = told.scans.length;
+  by("count").textContent = `${found.length === all ? "" : `${found.length} of `}${all} scan${all === 1 ? "" : "s"}`
+    + (told.free_bytes ? ` · ${bytes(told.free_bytes)} free` : "");
+  if (!all) by("told").textContent = server.starts ? "No scan is here yet: begin with New scan." : "No scan is here yet.";
+  else if (!by("told").classList.contains("wrong")) by("told").textContent = found.length ? "" : "None of them matches.";
+}
+
+async function look() {
+  try {
+    const now = await get("scans"), text = JSON.stringify(now);
+    complain("told");
+    if (text !== seen) {
+      [told, seen] = [now, text];
+      options("state", [...new Set(now.scans.map((s) => s.state))], (v) => STATES[v]?.[0] ?? v);
+      options("tag", [...new Set(now.scans.flatMap((s) => s.tags))].sort());
+    }
+    show();
+  } catch (error) { complain("told", error); }
+}
+
+async function showTraining() {
+  const program = await get("program/train");
+  by("train-log").hidden = !program;
+  if (!program) return;
+  by("train-log").textContent = program.log;
+  by("train-told").textContent = program.running ? "It learns…" : program.status === 0 ? "The library is made." : "No library was made:";
+  if (program.running) setTimeout(showTraining, 1000);
+}
+
+by("train-open").addEventListener("click", () => { by("train").hidden = false; by("train-name").focus(); });
+by("train").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  try {
+    await post("train", {}, { name: by("train-name").value, scans: [...chosen] });
+    complain("train-told");
+    await showTraining();
+  } catch (error) { complain("train-told", error); }
+});
+by("tools").addEventListener("submit", (event) => event.preventDefault());
+for (const id of ["find", "state", "tag", "sort"]) by(id).addEventListener("input", show);
+
+server = await begin("Scans");
+await look();
+setInterval(() => { if (!document.hidden) look(); }, LOOK_MS);

@@ -1,0 +1,181 @@
+// What all pages share: the token, asking the server, and making elements. No text from the server is ever taken as HTML.
+const KEY = "polysight-token";
+
+export const by = (id) => document.getElementById(id);
+export const query = new URLSearchParams(location.search);
+export const scanName = query.get("scan") ?? "";
+
+/** The token of the printed address, kept for this address alone and taken out of what a screenshot shows. */
+function readToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (given) {
+    localStorage.setItem(KEY, given);
+    history.replaceState(null, "", location.pathname + location.search);
+  }
+  return localStorage.getItem(KEY) ?? "";
+}
+
+export let token = readToken();
+
+export class Refused extends Error {
+  constructor(told, status) {
+    super([told.what, told.why, told.do].filter(Boolean).join(". "));
+    Object.assign(this, { what: told.what, why: told.why, do: told.do, status });
+  }
+}
+
+export const address = (path, given = {}) => {
+  const words = new URLSearchParams(Object.entries(given).filter(([, v]) => v !== undefined && v !== null && v !== ""));
+  const text = words.toString();
+  return `/api/${path}${text ? `?${text}` : ""}`;
+};
+
+async function answer(path, given, options) {
+  let reply;
+  try {
+    reply = await fetch(address(path, given), { ...options, headers: { ...options?.headers, "X-Polysight-Token": token } });
+  } catch {
+    throw new Refused({ what: "The server does not answer", why: "`polysight serve` was ended, or the network is gone", do: "start it again; scans go on regardless" }, 0);
+  }
+  if (reply.status === 429) {
+    await new Promise((go) => setTimeout(go, 1100));
+    return answer(path, given, options);
+  }
+  if (!reply.ok) {
+    const told = await reply.json().catch(() => ({ what: `The server answered ${reply.status}` }));
+    if (reply.status === 401 || (reply.status === 403 && told.what?.startsWith("The token"))) askForToken();
+    throw new Refused(told, reply.status);
+  }
+  return reply;
+}
+
+export const get = async (path, given) => (await answer(path, given)).json();
+export const reach = (path, given) => answer(path, given);
+export const post = async (path, given, body = {}) =>
+  (await answer(path, given, { method: "POST", body: JSON.stringify(body), headers: { "Content-Type": "application/json" } })).json();
+
+/** A picture, and what the ends of its colours mean. */
+export async function picture(path, given) {
+  const reply = await answer(path, given);
+  const unit = { deg: "°" }[reply.headers.get("X-Unit")] ?? reply.headers.get("X-Unit") ?? "";
+  return { image: await createImageBitmap(await reply.blob()), low: +reply.headers.get("X-Low"), high: +reply.headers.get("X-High"), unit };
+}
+
+export function make(name, text, className, more = {}) {
+  const node = document.createElement(name);
+  if (text !== undefined && text !== null) node.textContent = text;
+  if (className) node.className = className;
+  for (const [key, value] of Object.entries(more)) {
+    if (key.startsWith("on")) node.addEventListener(key.slice(2), value);
+    else if (key in node && key !== "list") node[key] = value;
+    else node.setAttribute(key, value);
+  }
+  return node;
+}
+
+export const nest = (node, ...children) => { node.append(...children); return node; };
+
+/** Text with `commands` in it, as nodes. */
+export const rich = (text) =>
+  String(text).split("`").map((part, i) => (i % 2 ? make("code", part) : document.createTextNode(part)));
+
+export function tell(id, text) {
+  const node = by(id);
+  if (node.textContent === text.replaceAll("`", "") && node.hidden === !text) return; // screen readers read changes
+  node.replaceChildren(...rich(text));
+  node.hidden = !text;
+}
+
+/** An error where it belongs, or nothing. */
+export function complain(id, error) {
+  const node = by(id);
+  node.classList.toggle("wrong", Boolean(error));
+  if (!error) { node.replaceChildren(); return; }
+  if (!(error instanceof Refused)) throw error;
+  node.replaceChildren(...rich([error.what, error.why].filter(Boolean).join(": ")), ...rich(error.do ? `. To do: ${error.do}.` : "."));
+}
+
+export function span(seconds) {
+  if (seconds < 100) return `${Math.round(seconds)} s`;
+  const minutes = Math.round(seconds / 60);
+  return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${String(minutes % 60).padStart(2, "0")} min`;
+}
+
+export const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
+export const day = (seconds) => new Date(seconds * 1000).toLocaleString([], { year: "numeric", month: "short", day: "numeric", hour: "2-digit", minute: "2-digit" });
+export const signed = (n, digits = 0) => n.toFixed(digits).replace("-", "−");
+export const grouped = (n) => n.toLocaleString("en").replaceAll(",", "\u202f");
+export const bytes = (n) => (n === null || n === undefined ? "…" : n < 1e6 ? `${(n / 1e3).toFixed(0)} kB` : n < 1e9 ? `${(n / 1e6).toFixed(0)} MB` : `${(n / 1e9).toFixed(1)} GB`);
+export const pageOf = (page, scan) => `/${page}?${new URLSearchParams({ scan })}`;
+
+/** eps' − j eps″ with errors, as tables show it. */
+export function permittivity(p) {
+  if (!p || p.real === null || p.real === undefined) return "–";
+  const error = (std) => (std ? ` ± ${std.toPrecision(2)}` : "");
+  return `${p.real.toFixed(2)}${error(p.real_std)} − j (${(-p.imag).toFixed(2)}${error(p.imag_std)})`;
+}
+
+export const STATES = {
+  running: ["is being scanned", "wait"], paused: ["paused", "wait"], finished: ["finished", "good"], stopped: ["stopped", "warn"],
+  failed: ["failed", "bad"], lost: ["interrupted", "bad"], begun: ["not begun", "warn"], products: ["products only", "good"], damaged: ["damaged", "bad"],
+};
+export const VERDICTS = { good: ["good", "good"], care: ["usable with care", "warn"], none: ["no result", "bad"], damaged: ["products damaged", "bad"] };
+
+/** How a program of `polysight` stands: 7 is the exit status of a scan that supports no result. */
+export function ending({ running, status }) {
+  if (running) return "runs";
+  if (status === 0) return "has ended";
+  if (status === 7) return "has ended without a result";
+  return `has failed${status === null ? ": it was killed" : ` (exit status ${status})`}`;
+}
+
+export function badge([text, level]) {
+  return make("span", text, "badge", { "data-level": level });
+}
+
+/** The bar at the top, and what the server allows. */
+export async function begin(title) {
+  const bar = make("header", null, "bar"), nav = make("nav", null, null, { "aria-label": "Pages" });
+  bar.append(make("a", "polysight", "brand", { href: "/" }), nav);
+  document.body.prepend(make("a", "Skip to the content", "skip", { href: "#main" }), bar);
+  const told = await get("page");
+  if (!told.only) {
+    for (const [text, href] of [["Scans", "/"], ["New scan", "/new"], ["Compare", "/compare"]]) {
+      if (href === "/new" && !told.starts) continue;
+      nav.append(make("a", text, null, { href, ...(location.pathname === href ? { "aria-current": "page" } : {}) }));
+    }
+  }
+  if (title) document.title = `${title} · polysight`;
+  if (token) openSession(told);
+  else if (!told.known) askForToken();
+  return told;
+}
+
+async function openSession(told) {
+  try {
+    await post("session");
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    if (told.known && error.status === 403 && !told.control) return; // nothing here needs a token
+  }
+}
+
+/** Where the token can be typed: another tab, another phone, a server that was started anew. */
+export function askForToken() {
+  if (by("token-bar")) return;
+  const field = make("input", null, null, { id: "token-field", type: "password", autocomplete: "off", required: true });
+  const form = make("form", null, "token-bar", { id: "token-bar" });
+  form.append(make("label", "This server asks for its token: what follows #token= in the address that it printed.", null, { htmlFor: "token-field" }),
+    field, make("button", "Use it"));
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const given = field.value.trim().replace(/^.*#token=/, "");
+    token = given;
+    try {
+      await post("session");
+      localStorage.setItem(KEY, given);
+      location.reload();
+    } catch { field.setAttribute("aria-invalid", "true"); }
+  });
+  document.querySelector(".bar").after(form);
+}

@@ -1,0 +1,219 @@
+// One scan: its images, what was found in them, and what can be done with it.
+import { ImageView, caption, outline } from "./view.js";
+import { badge, begin, by, bytes, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
+import { Labels } from "./label.js";
+import { showProbe } from "./probe.js";
+
+const scan = { scan: scanName };
+let server = {}, summary = {}, result = null, view = null, labels = null, shown = "h_amplitude", running = "";
+
+// --- the head ---
+
+function showHead() {
+  by("name").textContent = scanName;
+  const [state, level] = STATES[summary.state] ?? [summary.state, "warn"];
+  const verdict = VERDICTS[summary.verdict];
+  by("badges").replaceChildren(badge([state, level]), ...(verdict ? [badge(verdict)] : []), ...(summary.simulated ? [make("span", "simulated", "stamp")] : []));
+  if (verdict) by("head").dataset.level = verdict[1];
+  const rows = summary.rows ? `${summary.committed} of ${summary.rows} rows` : "";
+  by("facts").textContent = [summary.seconds && day(summary.seconds), summary.rig, rows, bytes(summary.bytes), summary.folder].filter(Boolean).join(" · ");
+  const recorded = summary.rows > 0, live = ["running", "paused"].includes(summary.state);
+  by("watch").hidden = !recorded && summary.state !== "begun";
+  by("watch").href = pageOf("watch", scanName);
+  by("with").href = `/compare?${new URLSearchParams({ a: scanName })}`;
+  by("with").hidden = Boolean(server.only) || !result?.referenced;
+  by("resume").hidden = !(server.starts && recorded && !live && summary.committed < summary.rows);
+  by("process-open").hidden = !(server.starts && recorded && !live);
+  by("report").hidden = !result?.files.some((f) => f.name === "report.html");
+  by("report").href = address("file/report.html", scan);
+}
+
+function showReasons() {
+  by("reasons").replaceChildren(...(result?.verdict?.reasons ?? []).map((r) => {
+    const item = nest(make("li"), ...rich(r.what));
+    if (r.why) item.append(nest(make("span", ": ", "why"), ...rich(r.why)));
+    if (r.do) item.append(nest(make("span", "→ ", "do"), ...rich(r.do)));
+    return item;
+  }));
+}
+
+// --- the images ---
+
+function buildMaps() {
+  by("maps").replaceChildren(...result.pictures.map((p) => make("button", p.title, null, { type: "button", value: p.name, "aria-pressed": String(p.name === shown), onclick: () => showMap(p.name) })));
+}
+
+async function showMap(name) {
+  shown = name;
+  for (const button of by("maps").children) button.setAttribute("aria-pressed", String(button.value === name));
+  try {
+    const made = await picture(`map/${name}`, { ...scan, at: result.processed_utc });
+    if (shown !== name) return; // another was asked for meanwhile
+    view.show({ image: made.image });
+    by("scale").replaceChildren(...scale(result.pictures.find((p) => p.name === name), made));
+  } catch (error) { complain("told", error); }
+}
+
+export function scale(map, made) {
+  const digits = made.unit ? 1 : 3, bar = make("img", null, null, { src: address(`bar/${map.colours}`), alt: "" });
+  return [make("span", signed(made.low, digits)), bar, make("span", signed(made.high, digits)), make("span", made.unit, "soft")];
+}
+
+/** Outlines of the patches and boxes drawn by hand, over the image. */
+function overlay(pen, at) {
+  for (const patch of labels?.open ? [] : result.patches) {
+    outline(pen, () => {
+      pen.beginPath();
+      patch.outline_mm.forEach(([x, y], i) => pen[i ? "lineTo" : "moveTo"](...at(x, y)));
+      pen.closePath();
+      pen.stroke();
+    }, patch.metal_reference ? "#f2b632" : "#ffffff");
+    const [x0, y0, x1, y1] = patch.box_mm, [x, y] = at((x0 + x1) / 2, y1 - 0.25 * (y1 - y0));
+    caption(pen, `${patch.label} ${patchName(patch)}`, x, y);
+  }
+  labels?.overlay(pen, at);
+}
+
+const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "not judged" : p.name === "unknown" ? "not in the library" : p.name ?? "not named");
+
+function showPatches() {
+  by("patches").hidden = !result.patches.length;
+  by("patches-note").textContent = result.metal_reference.how ? `metal reference: ${result.metal_reference.how}` : "";
+  by("rows").replaceChildren(...result.patches.map((p) => {
+    const row = make("tr", null, null, { id: `patch-${p.label}` });
+    const sure = p.confidence === null || p.confidence === undefined ? "" : ` ${Math.round(100 * p.confidence)} %`;
+    const dominated = p.permittivity?.dominated_by ?? "", why = p.refused ? `${p.refused.what}: ${p.refused.why}` : p.why ?? "";
+    const name = nest(make("td", `${patchName(p)}${p.metal_reference ? "" : sure}`), ...(p.box ? [make("div", `drawn as ${p.box}`, "soft")] : []));
+    const error = nest(make("td", dominated), ...(p.permittivity?.do ? [make("div", p.permittivity.do, "soft")] : []));
+    row.append(make("td", String(p.label)), name, make("td", permittivity(p.permittivity)), error, make("td", String(p.pixels), "n"), make("td", why));
+    return row;
+  }));
+}
+
+async function pick(x, y) {
+  if (labels?.open) return;
+  const found = await showProbe(scan, x, y, by("library").value);
+  for (const row of by("rows").children) row.classList.toggle("here", row.id === `patch-${found?.patch?.label}`);
+}
+
+// --- files ---
+
+function showFiles() {
+  const files = result?.files ?? [];
+  by("files").hidden = !files.length;
+  by("file-list").replaceChildren(...files.map((f) => nest(make("li"), make("a", f.name, null, { href: address(`file/${f.name}`, { ...scan, of: f.of }) }), make("span", ` ${bytes(f.bytes)}`, "soft"))));
+  by("export").hidden = !(server.starts && files.length);
+  const path = JSON.stringify(summary.folder ?? "");
+  by("code").textContent = `from polysight import open_scan\n\nscan = open_scan(${path})\nscan.materials()\nscan.plot()`;
+}
+
+// --- what runs ---
+
+/** The programs that a page started for this scan; when one ends, everything is looked at again. */
+async function follow() {
+  let now;
+  try { now = await get("scan", scan); } catch (error) { complain("told", error); return; }
+  summary = now;
+  const [program] = summary.programs;
+  by("program").hidden = !program || (!program.running && program.status === 0 && running === "");
+  if (program) {
+    by("program-title").textContent = `polysight ${program.kind} ${ending(program)}`;
+    if (by("program-log").textContent !== program.log) by("program-log").textContent = program.log || "It has said nothing yet.";
+  }
+  const was = running;
+  running = program?.running ? program.kind : "";
+  showHead();
+  if (was && !running) await load();
+  if (running) by("told").textContent = "";
+}
+
+async function run(path, body) {
+  complain("told");
+  try {
+    by("told").textContent = "It starts…";
+    await post(path, scan, body);
+    running = path;
+    await follow();
+  } catch (error) { by("told").textContent = ""; complain("told", error); }
+}
+
+// --- notes ---
+
+async function saveNotes() {
+  try {
+    const tags = by("tags").value.split(",").map((t) => t.trim()).filter(Boolean);
+    const told = await post("notes", scan, { notes: by("notes-text").value, tags });
+    by("tags").value = told.tags.join(", ");
+    complain("notes-told");
+    by("notes-told").textContent = "Saved.";
+  } catch (error) { complain("notes-told", error); }
+}
+
+// --- begin ---
+
+async function load() {
+  try { result = summary.processed ? await get("result", scan) : null; } catch (error) { complain("told", error); result = null; }
+  showHead();
+  showReasons();
+  showFiles();
+  for (const id of ["images", "probe", "patches"]) by(id).hidden = !result;
+  by("label-open").hidden = !(result && server.control);
+  if (!result) {
+    if (!by("told").textContent) by("told").textContent = summary.rows ? "This scan was not processed yet." : "";
+    return;
+  }
+  by("use-labels").disabled = !result.labels;
+  by("use-labels").checked = Boolean(result.labels);
+  if (!view || String(view.extent) !== String(result.extent_mm)) {
+    view = new ImageView(by("view"), { extent: result.extent_mm, label: "Image of the scan", overlay, onpick: pick, onbox: (box) => labels.add(box) });
+  }
+  labels ??= new Labels(scan, () => view.draw(), (open) => {
+    view.drawing = open;
+    by("view").classList.toggle("drawing", open);
+    by("label-open").setAttribute("aria-pressed", String(open));
+    view.draw();
+  });
+  labels.load(result);
+  buildMaps();
+  showPatches();
+  await showMap(result.pictures.some((p) => p.name === shown) ? shown : "h_amplitude");
+}
+
+by("resume").addEventListener("click", async () => {
+  await run("resume", {});
+  if (running) location.href = pageOf("watch", scanName);
+});
+by("label-open").addEventListener("click", () => labels.toggle());
+by("process-open").addEventListener("click", () => {
+  by("process").hidden = !by("process").hidden;
+  by("process-open").setAttribute("aria-expanded", String(!by("process").hidden));
+});
+by("process").addEventListener("submit", (event) => {
+  event.preventDefault();
+  by("process").hidden = true;
+  run("process", { library: by("library").value, labels: by("use-labels").checked });
+});
+by("export").addEventListener("submit", (event) => {
+  event.preventDefault();
+  run("export", { formats: [...by("export").querySelectorAll("input:checked")].map((i) => i.name) });
+});
+by("save-notes").addEventListener("click", saveNotes);
+by("copy").addEventListener("click", async () => {
+  try { await navigator.clipboard.writeText(by("code").textContent); by("copied").textContent = "Copied."; } catch { by("copied").textContent = "Select it and copy."; }
+});
+
+server = await begin(scanName || "Scan");
+try {
+  summary = await get("scan", scan);
+  if (server.starts) {
+    const { libraries } = await get("scans");
+    by("library").append(...libraries.map((name) => make("option", name, null, { value: name })));
+  }
+  by("notes-text").value = summary.notes;
+  by("tags").value = summary.tags.join(", ");
+  by("save-notes").hidden = !server.control;
+  by("notes-text").readOnly = by("tags").readOnly = !server.control;
+  await load();
+  await follow();
+  setInterval(() => { if (!document.hidden) follow(); }, 2000);
+} catch (error) { complain("told", error); }

@@ -1,0 +1,105 @@
+"""The live views that are open: one `Watch` a scan, as long as a page looks on."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import contextmanager
+from pathlib import Path
+
+from polysight.host.page import Watch
+from polysight.shared.errors import DeviceError
+
+STREAMS = 48
+_MOST, _LINGER_S = 4, 30.0
+_LOOK_S = 0.1
+_ALIVE_S = 2.0  # a page that hears nothing for some of these tries to connect anew
+
+
+class Watches:
+    """Opens a watch when a page asks for a scan, and closes it some time after the last page has gone.
+
+    Parameters
+    ----------
+    control
+        Whether wishes may be asked.
+    kept
+        Watches that were opened before and stay, by name.
+    """
+
+    def __init__(self, control: bool, kept: dict[str, Watch] | None = None) -> None:
+        self._control, self._kept = control, dict(kept or {})
+        self._open: dict[str, tuple[Watch, float]] = {}
+        self._streams: dict[str, int] = {}
+        self._lock = threading.Lock()
+
+    def of(self, name: str, folder: Path) -> Watch:
+        """The watch of a scan. Raises DeviceError when too many are looked at."""
+        with self._lock:
+            if name in self._kept:
+                return self._kept[name]
+            self._sweep(name)
+            if name in self._open:
+                watch, _ = self._open[name]
+            else:
+                if len(self._open) >= _MOST:
+                    raise DeviceError(f"{_MOST} live views are open", "each takes a part of a processor", "close one")
+                watch = Watch(folder, self._control)
+                watch.start()
+            self._open[name] = (watch, time.monotonic())
+            return watch
+
+    def _sweep(self, wanted: str) -> None:
+        """Close what nobody looks at; when there are too many, those that nobody has a stream of at once."""
+        now, full = time.monotonic(), len(self._open) >= _MOST
+        for name, (watch, used) in list(self._open.items()):
+            idle = not self._streams.get(name) and name != wanted
+            if idle and (full or now - used > _LINGER_S):
+                watch.close()
+                del self._open[name]
+
+    @contextmanager
+    def _stream(self, name: str):
+        self._streams[name] = self._streams.get(name, 0) + 1
+        try:
+            yield
+        finally:
+            self._streams[name] -= 1
+            with self._lock:
+                if name in self._open:
+                    self._open[name] = (self._open[name][0], time.monotonic())
+
+    @property
+    def full(self) -> bool:
+        """Whether no page more can be told."""
+        return sum(self._streams.values()) >= STREAMS
+
+    async def events(self, name: str, watch: Watch, ending: Callable[[], bool]) -> AsyncIterator[bytes]:
+        """Server-sent events of one page: the newest state and motion, never an older one.
+
+        Nothing is queued: who reads slowly is sent less often, and waits in `yield` for the socket to take more.
+        """
+        told = {"state": -1, "motion": -1}
+        silent_s = 0.0
+        with self._stream(name):
+            while not ending():
+                for kind, newest in (("state", watch.state), ("motion", watch.motion)):
+                    if newest.version != told[kind]:
+                        told[kind], silent_s = newest.version, 0.0
+                        yield b"event: %s\nid: %d\ndata: %s\n\n" % (kind.encode(), newest.version, newest.data)
+                if silent_s >= _ALIVE_S:
+                    silent_s = 0.0
+                    yield b"event: alive\ndata: 0\n\n"
+                await asyncio.sleep(_LOOK_S)
+                silent_s += _LOOK_S
+
+    def close(self) -> None:
+        """Close all."""
+        with self._lock:
+            for watch, _ in self._open.values():
+                watch.close()
+            for watch in self._kept.values():
+                watch.close()
+            self._open, self._kept = {}, {}

@@ -1,0 +1,355 @@
+"""Who is let in, from where, how much and how slowly; what is refused changes nothing and locks nobody out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import ssl
+import subprocess
+import threading
+import time
+from itertools import cycle, islice
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+from polysight.host.serve import connections, guard
+from polysight.host.serve.guard import TOKEN_HEADER, TRIES, Access, cookie_name
+from tests.support.page.asking import TOKEN, ask, digest_of, get, post, raw
+from tests.support.page.live_view import served_folder
+from tests.support.processes import LIMIT_S, wait_for
+from tests.support.products import judged_products
+
+SECRET = "nobody may read this"
+
+
+@pytest.fixture
+def scans(finished: Path, tmp_path: Path) -> Path:
+    """A folder with a scan that was processed, beside a file that nobody may see."""
+    shutil.copytree(finished, tmp_path / "scans" / "one")
+    judged_products(tmp_path / "scans" / "one" / "products", "care")
+    (tmp_path / "secret.txt").write_text(SECRET)
+    (tmp_path / "scans" / "out").symlink_to(tmp_path)
+    return tmp_path / "scans"
+
+
+def test_names_of_others_are_not_answered_to(scans):
+    with served_folder(scans, TOKEN) as view:
+        for host in ("localhost", "localhost:8080", "127.0.0.1", f"127.0.0.1:{view.port}", "[::1]:80"):
+            assert ask(view, "/api/scans", Host=host)[0] == 200, host
+        for host in (
+            "evil.example",
+            "127.0.0.1.evil.example",
+            "localhost.evil.example:80",
+            "192.168.1.7",
+            "",
+            "[",
+            "a:b:c",
+        ):
+            for path in ("/", "/api/scans", "/base.css"):
+                assert ask(view, path, Host=host)[0] == 400, host
+            assert post(view, "/api/control/abort?scan=one", Host=host)[0] == 400
+
+
+def test_other_sites_may_not_ask(scans):
+    own = "http://127.0.0.1"
+    with served_folder(scans, TOKEN) as view:
+        before = digest_of(scans)
+        for origin in ("https://evil.example", "null", own, f"{own}:1", f"https://127.0.0.1:{view.port}"):
+            status, told = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
+            assert (status, told["what"]) == (403, "Another site asks"), origin
+        for where in ("cross-site", "same-site"):  # same-site: another port of this machine
+            assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Sec_Fetch_Site=where)[0] == 403
+            assert ask(view, "/api/scans", Sec_Fetch_Site=where)[0] == 403
+        assert digest_of(scans) == before
+        assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=f"{own}:{view.port}")[0] == 200
+
+
+def test_beyond_loopback_reading_needs_the_token_too(scans):
+    access = Access(TOKEN, loopback=False, control=True)
+    with served_folder(scans, access=access) as view:
+        assert ask(view, "/")[0] == 200  # an empty page that asks for the token
+        for path in (
+            "scans",
+            "scan?scan=one",
+            "result?scan=one",
+            "state?scan=one",
+            "events?scan=one",
+            "file/report.html",
+        ):
+            assert ask(view, f"/api/{path}")[0] == 401, path
+        assert "folder" not in str(get(view, "/api/page")["folder"])
+        assert get(view, "/api/scans", **{TOKEN_HEADER: TOKEN})["scans"]
+        status, _, headers = ask(view, "/api/session", "POST", **{TOKEN_HEADER: TOKEN})
+        cookie = headers["set-cookie"]
+        assert (status, "httponly" in cookie.lower(), "samesite=strict" in cookie.lower()) == (200, True, True)
+        cookie = cookie.partition(";")[0]
+        assert get(view, "/api/scans", Cookie=cookie)["scans"]
+        assert ask(view, "/api/notes?scan=one", "POST", {}, Cookie=cookie)[0] == 403  # it reads, and does nothing else
+        assert get(view, "/api/scans", Host=f"192.168.7.7:{view.port}", Cookie=cookie)["scans"]
+
+
+def test_wrong_tokens_are_slowed_down_and_a_session_is_not(scans):
+    with served_folder(scans, TOKEN) as view:
+        answers = [post(view, "/api/notes?scan=one", token=f"guess {n}")[0] for n in range(int(TRIES) * 3)]
+        assert answers[0] == 403
+        assert 429 in answers
+        wait_for(lambda: post(view, "/api/session")[0] == 200, "that the right token is compared again")
+        cookie = f"{cookie_name(view.port)}={view.site.access.session}"
+        for n in range(int(TRIES) * 2):
+            post(view, "/api/notes?scan=one", token=f"guess {n}")
+        assert post(view, "/api/notes?scan=one", {"notes": "still here"}, Cookie=cookie)[0] == 200
+
+
+def test_large_bodies_are_refused_and_nothing_is_kept(scans):
+    with served_folder(scans, TOKEN) as view:
+        before, large = digest_of(scans), b"x" * (guard.BODY_BYTES + 1)
+        status, _, _ = ask(view, "/api/notes?scan=one", "POST", large, **{TOKEN_HEADER: TOKEN})
+        assert status == 413
+        head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
+        chunks = b"%x\r\n%s\r\n" % (len(large), large) * 3
+        assert b" 413 " in raw(view, f"{head}Transfer-Encoding: chunked\r\n\r\n".encode() + chunks + b"0\r\n\r\n")[:40]
+        for size in (17_000, 70_000, 1 << 20):
+            answer = raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * size + b"\r\n\r\n")[:40]
+            assert b" 400 " in answer or b" 431 " in answer or answer == b""
+        assert digest_of(scans) == before
+
+
+def test_slow_bodies_and_slow_heads_are_let_go(scans, monkeypatch):
+    monkeypatch.setattr(guard, "BODY_S", 0.3)
+    monkeypatch.setattr(connections, "HEAD_S", 0.3)
+    with served_folder(scans, TOKEN) as view:
+        head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
+        assert b" 408 " in raw(view, f"{head}Content-Length: 9\r\n\r\n{{".encode())[:40]
+        assert raw(view, b"GET / HTTP/1.1\r\nHost:") == b""
+        assert raw(view, b"") == b""
+        # Nor is the next head on a connection waited for, after an answer.
+        whole = b"GET /icon.svg HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+        assert raw(view, whole + b"GET / HT").count(b"HTTP/1.1 200") == 1
+
+
+@pytest.mark.parametrize("many", [80, connections.MOST + 60])
+def test_half_open_connections_lock_nobody_out(scans, many):
+    with served_folder(scans, TOKEN) as view:
+        held = []
+        for k in range(many):
+            held.append(socket.create_connection(("127.0.0.1", view.port), LIMIT_S))
+            held[-1].sendall(b"GET / HTTP/1.1\r\nHo"[: k % 18])
+        for _ in range(5):
+            assert get(view, "/api/scans")["scans"]
+            assert post(view, "/api/notes?scan=one", {"notes": "n"})[0] == 200
+        for one in held:
+            one.close()
+
+
+def test_an_open_stream_is_not_what_makes_room(scans):
+    with served_folder(scans, TOKEN) as view:
+        stream = socket.create_connection(("127.0.0.1", view.port), LIMIT_S)
+        stream.sendall(b"GET /api/events?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert b"event: state" in _read_until(stream, b"event: state")
+        held = [socket.create_connection(("127.0.0.1", view.port), LIMIT_S) for _ in range(connections.MOST + 40)]
+        for _ in range(3):
+            assert b"event: " in _read_until(stream, b"event: ")
+        for one in (stream, *held):
+            one.close()
+
+
+def _read_until(s: socket.socket, mark: bytes) -> bytes:
+    out = b""
+    while mark not in out:
+        part = s.recv(65536)
+        assert part, out[-300:]
+        out += part
+    return out
+
+
+NAMES = (
+    "..", "../secret.txt", "../../etc/passwd", "/etc/passwd", "one/../../secret.txt", "out", "out/scans/one", "%2e%2e",
+    "one\x00", "one/",
+    "./one", ".polysight", "one\\..", "", " ", "a" * 3000, "one/products", "..%2fsecret.txt", "\u202eeno",
+)  # fmt: skip
+
+
+def test_no_name_leads_out_of_the_folder(scans, tmp_path):
+    from urllib.parse import quote
+
+    with served_folder(scans, TOKEN) as view:
+        before = digest_of(tmp_path)
+        for name in NAMES:
+            given = quote(name, safe="")
+            for what in (
+                "scan",
+                "result",
+                "thumbnail",
+                "state",
+                "map/h_amplitude",
+                "file/image.npz",
+                "probe",
+                "file/secret.txt",
+            ):
+                status, body, _ = ask(view, f"/api/{what}?scan={given}&x=0&y=0")
+                if name == "one/products":  # a folder of products inside a scan: nothing but what the scan shows
+                    continue
+                assert status in (400, 404), (name, what, status, body[:200])
+                assert SECRET.encode() not in body
+            for what, asked in (
+                ("notes", {"notes": "x"}),
+                ("labels", {"boxes": {"a": [0, 0, 9, 9]}}),
+                ("control/abort", {}),
+            ):
+                if name != "one/products":
+                    assert post(view, f"/api/{what}?scan={given}", asked)[0] in (400, 404), (name, what)
+        for name in ("../secret.txt", "..%2f..%2fmanifest.jsonl", "manifest.jsonl", "figures", "%00"):
+            assert ask(view, f"/api/file/{name}?scan=one")[0] in (400, 404)
+        assert digest_of(tmp_path) == before
+
+
+def test_a_link_among_products_is_not_served(scans, tmp_path):
+    (scans / "one" / "products" / "image.csv").symlink_to(tmp_path / "secret.txt")
+    with served_folder(scans) as view:
+        assert "image.csv" not in [f["name"] for f in get(view, "/api/result?scan=one")["files"]]
+        assert ask(view, "/api/file/image.csv?scan=one")[0] == 404
+
+
+def test_nothing_in_a_report_can_act(scans):
+    (scans / "one" / "products" / "report.html").write_text("<script>fetch('/api/control/abort')</script>")
+    with served_folder(scans) as view:
+        status, _, headers = ask(view, "/api/file/report.html?scan=one")
+        policy = headers["content-security-policy"]
+        assert (status, "sandbox" in policy, "allow-scripts" in policy, "script-src" in policy) == (
+            200,
+            True,
+            False,
+            False,
+        )
+        assert "default-src 'none'" in policy
+        assert headers["x-content-type-options"] == "nosniff"
+        for name in ("image.npz", "materials.json"):
+            found = ask(view, f"/api/file/{name}?scan=one")[2]
+            assert found["content-disposition"].startswith("attachment")
+            assert found["content-type"] == "application/octet-stream"
+
+
+def hostile(port: int) -> list[bytes]:
+    """Requests that nobody well-meaning sends, as bytes."""
+    host = b"Host: 127.0.0.1:%d\r\n" % port
+    good = b"X-Polysight-Token: the-right-token\r\n"
+    paths = [
+        b"/api/control/abort?scan=one",
+        b"/api/notes?scan=one",
+        b"/api/labels?scan=one",
+        b"/api/start",
+        b"/api/train",
+    ]
+    paths += [b"/api/process?scan=one", b"/api/export?scan=one", b"/api/session", b"/api/doctor", b"/api/plan"]
+    body = b"Content-Length: 2\r\n\r\n{}"
+    out = [b"POST %s HTTP/1.1\r\n%s%s" % (p, host, body) for p in paths]
+    out += [
+        b"POST %s HTTP/1.1\r\n%sX-Polysight-Token: %s\r\n%s" % (p, host, t, body)
+        for p in paths
+        for t in (b"", b"x", b"the-right-toke", b"\xff")
+    ]
+    out += [b"POST %s HTTP/1.1\r\nHost: evil.example\r\n%s%s" % (p, good, body) for p in paths]
+    out += [
+        b"POST %s HTTP/1.1\r\n%s%sOrigin: %s\r\n%s" % (p, host, good, o, body)
+        for p in paths
+        for o in (b"https://evil.example", b"null")
+    ]
+    out += [b"POST %s HTTP/1.1\r\n%s%sSec-Fetch-Site: cross-site\r\n%s" % (p, host, good, body) for p in paths]
+    out += [
+        b"%s /api/control/abort?scan=one HTTP/1.1\r\n%s%s\r\n" % (m, host, good)
+        for m in (b"GET", b"PUT", b"DELETE", b"OPTIONS", b"TRACE", b"CONNECT", b"BREW")
+    ]
+    out += [
+        b"GET /api/%s?scan=%s HTTP/1.1\r\n%s\r\n" % (w, n, host)
+        for w in (b"scan", b"result", b"file/image.npz", b"thumbnail")
+        for n in (b"..", b"%2e%2e%2f", b"/etc", b"one%00", b"a" * 9000, b"%ff%fe")
+    ]
+    out += [
+        b"GET /%s HTTP/1.1\r\n%s\r\n" % (p, host)
+        for p in (b"../../etc/passwd", b"..%2f..%2fetc/passwd", b"static/../guard.py", b"%00", b"?" + b"q" * 9000)
+    ]
+    out += [
+        b"POST /api/notes?scan=one HTTP/1.1\r\n%s%sContent-Length: %s\r\n\r\n{" % (host, good, n)
+        for n in (b"99999999999", b"-1", b"1e9", b"0x10", b"2, 3")
+    ]
+    out += [
+        b"POST /api/notes?scan=one HTTP/1.1\r\n%s%sContent-Length: %d\r\n\r\n%s" % (host, good, len(b), b)
+        for b in (
+            b"[",
+            b"[]",
+            b"null",
+            b'{"a":1}',
+            b'{"notes":1}',
+            b"\xff\xfe",
+            b"[" * 5000,
+            b'{"notes":"' + b"x" * 30000 + b'"}',
+        )
+    ]
+    out += [
+        b"",
+        b"\r\n\r\n",
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+        b"GET / HTTP/9.9\r\n\r\n",
+        b"GET /\r\n\r\n",
+        b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n",
+    ]
+    out += [
+        b"GET / HTTP/1.1\r\n%sX: %s\r\n\r\n" % (host, b"y" * 40000),
+        b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 5000,
+        b"\0" * 3000,
+    ]
+    out += [
+        b"GET / HTTP/1.1\r\n%sUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n" % host,
+        b"GET / HTTP/1.1\r\n%s%s\r\n" % (host, host),
+    ]
+    return out
+
+
+@pytest.mark.slow
+def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, tmp_path):
+    with served_folder(scans, TOKEN) as view:
+        before, cookie = digest_of(tmp_path), f"{cookie_name(view.port)}={view.site.access.session}"
+        requests = list(islice(cycle(hostile(view.port)), 1000))
+        held: list[socket.socket] = []
+
+        def send(part: list[bytes]) -> None:
+            for data in part:
+                s = socket.create_connection(("127.0.0.1", view.port), LIMIT_S)
+                s.sendall(data)
+                held.append(s)  # left open: nobody reads the answer, nobody closes
+
+        threads = [threading.Thread(target=send, args=(requests[k::8],)) for k in range(8)]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            assert get(view, "/api/scans")["scans"]
+            assert post(view, "/api/session", Cookie=cookie)[0] == 200
+            time.sleep(0.01)
+        for s in held:
+            s.close()
+        assert digest_of(tmp_path) == before
+        wait_for(lambda: post(view, "/api/session")[0] == 200, "a new operator")
+        assert post(view, "/api/notes?scan=one", {"notes": "the operator's", "tags": ["a"]})[0] == 200
+        assert get(view, "/api/scan?scan=one")["notes"] == "the operator's"
+
+
+def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
+    program = shutil.which("openssl")
+    if program is None:
+        pytest.skip("no openssl here to make a certificate with: apt-get install openssl")
+    files = ["-keyout", tmp_path / "key.pem", "-out", tmp_path / "certificate.pem"]
+    subject = ["-subj", "/CN=127.0.0.1", "-addext", "subjectAltName=IP:127.0.0.1"]
+    command = [program, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *files, *subject]
+    subprocess.run([str(w) for w in command], check=True, capture_output=True)
+    from polysight.host.serve import Place
+    from tests.support.page.live_view import served_place
+
+    place = Place("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
+    with served_place(scans, place, Access(TOKEN, control=True, secure=True)) as view:
+        trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
+        with urlopen(f"https://127.0.0.1:{view.port}/api/scans", timeout=LIMIT_S, context=trusted) as reply:
+            assert json.load(reply)["scans"]
+        assert b"HTTP" not in raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")

@@ -1,0 +1,70 @@
+"""Requests to a served site: whole ones, raw ones, and hostile ones."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+from polysight.host.serve.guard import TOKEN_HEADER
+from tests.support.processes import LIMIT_S
+
+TOKEN = "the-right-token"
+
+
+def ask(
+    view: Any, path: str, method: str = "GET", body: Any = None, **headers: str
+) -> tuple[int, bytes, dict[str, str]]:
+    """Status, body and headers (lower case) of one request; header names with `_` for `-`."""
+    connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=LIMIT_S)
+    raw = body if isinstance(body, bytes | None) else json.dumps(body).encode()
+    try:
+        connection.request(method, path, raw, {k.replace("_", "-"): v for k, v in headers.items()})
+        reply = connection.getresponse()
+        return reply.status, reply.read(), {k.lower(): v for k, v in reply.getheaders()}
+    finally:
+        connection.close()
+
+
+def get(view: Any, path: str, **headers: str) -> Any:
+    """JSON of a request that is answered."""
+    status, body, _ = ask(view, path, **headers)
+    assert status == 200, (path, status, body)
+    return json.loads(body)
+
+
+def post(view: Any, path: str, body: Any = None, token: str = TOKEN, **headers: str) -> tuple[int, Any]:
+    """Status and JSON of what is asked for with the token."""
+    status, raw, _ = ask(view, path, "POST", {} if body is None else body, **{TOKEN_HEADER: token, **headers})
+    return status, json.loads(raw)
+
+
+def raw(view: Any, data: bytes, limit_s: float = LIMIT_S) -> bytes:
+    """What comes back for some bytes, until the server closes."""
+    with socket.create_connection(("127.0.0.1", view.port), limit_s) as s:
+        s.sendall(data)
+        out = b""
+        while part := _received(s):
+            out += part
+        return out
+
+
+def _received(s: socket.socket) -> bytes:
+    try:
+        return s.recv(65536)
+    except ConnectionResetError:
+        return b""
+
+
+def digest_of(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder, and where links lead."""
+    return {
+        str(p.relative_to(folder)): f"-> {p.readlink()}"
+        if p.is_symlink()
+        else hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(folder.rglob("*"))
+        if p.is_symlink() or p.is_file()
+    }

@@ -154,8 +154,8 @@ def test_two_scans_as_typed(folders, capsys):
     assert PAPER in out
 
 
-def test_patches_exchanged_between_two_angles_are_told(seen, folders, capsys):
-    there, angle = _seen(seen[1][60.0]), "60"
+def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
+    there, angle = scans[1], "60"
     truths = {"wood": "ceramic", "ceramic": "wood"}
     like = {p.truth: p for p in there.patches}
     swap = {a: b for a in like for key, other in truths.items() if a and key in a for b in like if b and other in b}

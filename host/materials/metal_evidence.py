@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.host.materials.inversion import BRIGHTNESS_STD, OUTLIER, Seen, Uncertain
+from polysight.host.materials.inversion import BRIGHTNESS_STD, OUTLIER, Seen, Uncertain, forward_differences
 from polysight.host.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
 
 Complex = npt.NDArray[np.complex128]
@@ -163,10 +163,8 @@ class _Explanation:
         return np.concatenate([x[..., :8], _robust(np.concatenate(patches, -1)), *channel, *bounds], -1)
 
     def jacobian(self, x: Real) -> Real:
-        """[residual, parameter] by forward differences, all at once."""
-        step = np.sqrt(np.finfo(np.float64).eps) * np.where(x == 0, 1.0, np.abs(x))
-        at = self.residuals(np.concatenate([x[None], x + np.diag(step)]))
-        return ((at[1:] - at[0]) / step[:, None]).T
+        """[residual, parameter]."""
+        return forward_differences(self.residuals, x)
 
     @staticmethod
     def _level(own: Complex, a: Complex, b: Complex) -> Real:

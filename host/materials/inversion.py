@@ -17,7 +17,7 @@ with J the Jacobian of all residuals and C the covariance, source s contributes 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -176,7 +176,9 @@ def true_ratio(inverse: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j
     return (c - b) / (1 - a * c)
 
 
-def measured_ratio(t: npt.ArrayLike, a: complex, b: complex, rho: complex = 0j) -> Complex:
+def measured_ratio(
+    t: npt.ArrayLike, a: Complex | complex, b: Complex | complex, rho: Complex | complex = 0j
+) -> Complex:
     """V / H of a true t: the first formula of the module's text."""
     t = np.asarray(t, np.complex128)
     return (1 + rho) * (1 + a) / (1 + b) * (t + b) / (1 + a * t)
@@ -186,6 +188,13 @@ def slope(t: npt.ArrayLike, theta_rad: float) -> Complex:
     """D eps / d t of Eq. 3 by t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
     t = np.asarray(t, np.complex128)
     return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
+
+
+def forward_differences(f: Callable[[Real], Real], x: Real) -> Real:
+    """Jacobian of f at x, [value, parameter]; f is called once, for all steps: x of shape [step, parameter]."""
+    step = np.sqrt(np.finfo(np.float64).eps) * np.maximum(1.0, np.abs(x))
+    at = f(np.concatenate([x[None], x + np.diag(step)]))
+    return ((at[1:] - at[0]) / step[:, None]).T
 
 
 class _Model:
@@ -205,35 +214,39 @@ class _Model:
         self.start = true_ratio(self.q, *prior.leakage)
         self.theta = np.array([s.theta_rad for s in seen], np.float64)
 
-    def nuisances(self, x: Real) -> tuple[complex, complex, complex, float]:
-        """a, b, rho and the angle's error."""
-        p = self.prior
-        a = p.leakage[0] + p.leakage_std * complex(x[0], x[1])
-        b = p.leakage[1] + p.leakage_std * complex(x[2], x[3])
-        return a, b, p.reference_std * complex(x[4], x[5]), p.theta_std_rad * float(x[6])
+    def nuisances(self, x: Real) -> tuple[Complex, Complex, Complex, Real]:
+        """a, b, rho and the angle's error; all of [..., parameter] to [..., 1]."""
+        p, u = self.prior, [x[..., k, None] for k in range(7)]
+        a = p.leakage[0] + p.leakage_std * (u[0] + 1j * u[1])
+        b = p.leakage[1] + p.leakage_std * (u[2] + 1j * u[3])
+        return a, b, p.reference_std * (u[4] + 1j * u[5]), p.theta_std_rad * u[6]
 
     def ratios(self, x: Real) -> Complex:
-        """T of every patch."""
-        own = x[_NUISANCES:].reshape(2, -1)
-        return self.start + self.std * (own[0] + 1j * own[1])
+        """T of every patch, [..., patch]."""
+        real, imag = np.split(x[..., _NUISANCES:], 2, axis=-1)
+        return self.start + self.std * (real + 1j * imag)
 
     def misfit(self, x: Real) -> Real:
-        """Brightness beside the model's in standard deviations, [patch]; 0 where it is not used."""
+        """Brightness beside the model's in standard deviations, [..., patch]; 0 where it is not used."""
         a, _, _, error = self.nuisances(x)
         t, theta = self.ratios(x), self.theta + error
         r_s = fresnel(permittivity_from_ratio(t, theta), theta)[0]
         with np.errstate(divide="ignore", invalid="ignore"):
             model = np.log(np.abs(r_s * (1 + a * t) / (1 + a)))
-            off = (self.log_level - model) / self.brightness_std - x[7]
+            off = (self.log_level - model) / self.brightness_std - x[..., 7, None]
         return np.where(self.bright & np.isfinite(off), np.clip(off, -1e3, 1e3), 0.0)
 
     def residuals(self, x: Real) -> Real:
-        """Priors of the nuisances, then ratios, then brightness."""
+        """Priors of the nuisances, then ratios, then brightness; [..., parameter] to [..., residual]."""
         a, b, rho, _ = self.nuisances(x)
         off = (measured_ratio(self.ratios(x), a, b, rho) - self.q) / self.std
         misfit = self.misfit(x)
         robust = np.sign(misfit) * OUTLIER * np.sqrt(np.log1p((misfit / OUTLIER) ** 2))
-        return np.concatenate([x[:_NUISANCES], off.real, off.imag, robust])
+        return np.concatenate([x[..., :_NUISANCES], off.real, off.imag, robust], axis=-1)
+
+    def jacobian(self, x: Real) -> Real:
+        """[residual, parameter]."""
+        return forward_differences(self.residuals, x)
 
     def source_rows(self) -> dict[str, npt.NDArray[np.intp]]:
         """Which residuals belong to which source."""
@@ -271,13 +284,15 @@ def invert(seen: Sequence[Seen], prior: Uncertain) -> Inversion:
 
 
 def _least_squares(model: _Model, start: Real) -> scipy.optimize.OptimizeResult:
-    return scipy.optimize.least_squares(model.residuals, start, method="lm", xtol=1e-10, ftol=1e-10)
+    options = {"jac": model.jacobian, "method": "lm", "xtol": 1e-10, "ftol": 1e-10}
+    return scipy.optimize.least_squares(model.residuals, start, **options)
 
 
 def _solution(model: _Model, found: scipy.optimize.OptimizeResult) -> Inversion:
     x, jac, prior, n = found.x, found.jac, model.prior, model.n
     covariance = np.linalg.inv(jac.T @ jac)
-    a, b, _, error = model.nuisances(x)
+    (a,), (b,), _, (error,) = model.nuisances(x)
+    a, b, error = complex(a), complex(b), float(error)
     spread = prior.leakage_std * np.sqrt(np.diag(covariance)[:4])
     t = model.ratios(x)
     patches = tuple(

@@ -18,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.host.materials.inversion import BRIGHTNESS_STD, OUTLIER, Seen, Uncertain
+from polysight.host.materials.inversion import BRIGHTNESS_STD, OUTLIER, Seen, Uncertain, forward_differences
 from polysight.host.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
 
+Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 
 CHANNEL_RATIO_STD_DB = 2.5
@@ -100,8 +101,8 @@ def metal_evidence(seen: list[Seen], prior: Uncertain, channel_ratio: complex | 
         return MetalEvidence(0.0, 0, level)
     metal = _Explanation(seen, prior, level)
     as_metal = _best(metal, np.zeros(8))
-    starts = [np.concatenate([np.zeros(8), [np.log(e.real), np.log(-e.imag)]]) for e in _STARTS]
-    starts.sort(key=lambda x: float(np.sum(metal.residuals(x) ** 2)))
+    starts = np.array([[0.0] * 8 + [np.log(e.real), np.log(-e.imag)] for e in _STARTS])
+    starts = starts[np.argsort(np.sum(metal.residuals(starts) ** 2, axis=-1), kind="stable")]
     as_dielectric = min(_best(metal, x) for x in starts[:_REFINED])
     unlike = sum(abs(s.inverse_ratio - 1) > _UNLIKE for s in seen)
     return MetalEvidence(as_dielectric - as_metal, unlike, level)
@@ -109,7 +110,9 @@ def metal_evidence(seen: list[Seen], prior: Uncertain, channel_ratio: complex | 
 
 def _best(model: _Explanation, start: Real) -> float:
     """The least sum of squares from one start."""
-    return 2 * float(scipy.optimize.least_squares(model.residuals, start, method="lm", max_nfev=40 * start.size).cost)
+    limit = 40 * start.size
+    found = scipy.optimize.least_squares(model.residuals, start, jac=model.jacobian, method="lm", max_nfev=limit)
+    return 2 * float(found.cost)
 
 
 class _Explanation:
@@ -125,41 +128,48 @@ class _Explanation:
         self.theta = np.array([s.theta_rad for s in seen], np.float64)
 
     def residuals(self, x: Real) -> Real:
-        """Priors, brightness, and how possible each other patch is."""
+        """Priors, brightness, and how possible each other patch is; [..., parameter] to [..., residual]."""
         p = self.prior
-        a = p.leakage[0] + p.leakage_std * complex(x[0], x[1])
-        b = p.leakage[1] + p.leakage_std * complex(x[2], x[3])
-        theta = self.theta + p.theta_std_rad * float(x[4])
-        middle = float(theta.mean())
-        own, own_s, bounds = 1.0 + 0j, -1.0 + 0j, []
-        if x.size > 8:
-            eps = complex(np.exp(min(x[8], 4.0)), -np.exp(min(x[9], 4.0)))
-            own, own_s = 1 / complex(ratio_from_permittivity(eps, middle)), complex(fresnel(eps, middle)[0])
-            bounds = [max(0.0, x[8] - np.log(30)) / 0.1, max(0.0, x[9] - np.log(30)) / 0.1, max(0.0, -x[8]) / 0.1]
-            bounds.append(max(0.0, np.log(abs(eps) / _LARGEST)) / 0.6)  # such dielectrics are rare
-        c = self.q * (own + b) / (1 + a * own) / (1 + p.reference_std * complex(x[5], x[6]))
+        u = [x[..., k, None] for k in range(x.shape[-1])]
+        a = p.leakage[0] + p.leakage_std * (u[0] + 1j * u[1])
+        b = p.leakage[1] + p.leakage_std * (u[2] + 1j * u[3])
+        theta = self.theta + p.theta_std_rad * u[4]
+        own, own_s, bounds = np.ones((1,), np.complex128), -np.ones((1,), np.complex128), []
+        if len(u) > 8:
+            eps, middle = (
+                np.exp(np.minimum(u[8], 4.0)) - 1j * np.exp(np.minimum(u[9], 4.0)),
+                theta.mean(-1, keepdims=True),
+            )
+            own, own_s = 1 / ratio_from_permittivity(eps, middle), fresnel(eps, middle)[0]
+            large = [u[8] - np.log(30), u[9] - np.log(30), -u[8]]
+            bounds = [np.maximum(0.0, beyond) / 0.1 for beyond in large]
+            bounds.append(np.maximum(0.0, np.log(np.abs(eps) / _LARGEST)) / 0.6)  # such dielectrics are rare
+        c = self.q * (own + b) / (1 + a * own) / (1 + p.reference_std * (u[5] + 1j * u[6]))
         t = (c - b) / (1 - a * c)
         with np.errstate(divide="ignore", invalid="ignore"):
             eps_of = permittivity_from_ratio(t, theta)
             r_s = fresnel(eps_of, theta)[0]
             model = np.log(np.abs(r_s * (1 + a * t) / (own_s * (1 + a * own))))
-            brightness = np.where(self.bright, (self.log_level - model) / BRIGHTNESS_STD - x[7], 0.0)
+            brightness = np.where(self.bright, (self.log_level - model) / BRIGHTNESS_STD - u[7], 0.0)
             size = np.abs(eps_of)
-            slack = 1 + 10 * self.loose
             impossible = [
                 np.maximum(0.0, 1 - eps_of.real) / 0.1,
                 np.maximum(0.0, eps_of.imag - 0.02) / (0.1 + 0.1 * size),
                 np.maximum(0.0, np.log(size / _LARGEST)) / 0.5,
             ]
-        metal = np.abs(t - 1) < _NEAR_METAL
-        parts = [_robust(np.where(metal, 0.0, part) / slack) for part in impossible]
+        metal, slack = np.abs(t - 1) < _NEAR_METAL, 1 + 10 * self.loose
+        patches = [brightness, *(np.where(metal, 0.0, part) / slack for part in impossible)]
         channel = [] if self.level_db is None else [(self._level(own, a, b) - self.level_db) / CHANNEL_RATIO_STD_DB]
-        return np.concatenate([x[:8], _robust(brightness), *parts, channel, bounds])
+        return np.concatenate([x[..., :8], _robust(np.concatenate(patches, -1)), *channel, *bounds], -1)
+
+    def jacobian(self, x: Real) -> Real:
+        """[residual, parameter]."""
+        return forward_differences(self.residuals, x)
 
     @staticmethod
-    def _level(own: complex, a: complex, b: complex) -> float:
+    def _level(own: Complex, a: Complex, b: Complex) -> Real:
         """V over H beside the direct path's, dB: the direct path holds 1 + a and 1 + b."""
-        return 20 * float(np.log10(max(abs((own + b) / (1 + a * own) * (1 + a) / (1 + b)), 1e-6)))
+        return 20 * np.log10(np.maximum(np.abs((own + b) / (1 + a * own) * (1 + a) / (1 + b)), 1e-6))
 
 
 def _robust(r: Real) -> Real:

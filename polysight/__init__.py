@@ -14,10 +14,12 @@ from polysight.shared import __version__
 
 if TYPE_CHECKING:
     from polysight.host.api import Scan, open_scan, read_netcdf
+    from polysight.host.api.bluesky_device import RadarScan, radar_scan
     from polysight.host.imaging import backproject
     from polysight.host.polarimetry import fresnel, multilayer, permittivity_from_ratio
 
 __all__ = [
+    "RadarScan",
     "Scan",
     "__version__",
     "backproject",
@@ -25,10 +27,12 @@ __all__ = [
     "multilayer",
     "open_scan",
     "permittivity_from_ratio",
+    "radar_scan",
     "read_netcdf",
 ]
 
 _HOME = {
+    "RadarScan": "polysight.host.api.bluesky_device",
     "Scan": "polysight.host.api",
     "open_scan": "polysight.host.api",
     "read_netcdf": "polysight.host.api",
@@ -36,6 +40,7 @@ _HOME = {
     "fresnel": "polysight.host.polarimetry",
     "multilayer": "polysight.host.polarimetry",
     "permittivity_from_ratio": "polysight.host.polarimetry",
+    "radar_scan": "polysight.host.api.bluesky_device",
 }
 
 

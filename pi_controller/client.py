@@ -54,7 +54,7 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
 
 
 def _listens(address: str) -> bool:
-    """Whether a program listens there, whatever it is: told at once, also by a machine that is slow to answer."""
+    """Whether a program listens there, whatever it is: known at once, also of a machine that is slow to answer."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_LIMIT_S).close()

@@ -99,7 +99,7 @@ class Executor:
         return True
 
     @property
-    def stands_still_s(self) -> float:
+    def unresponsive_s(self) -> float:
         """For how long the executor has not turned; below :data:`HUNG_S` unless it hangs."""
         return time.monotonic() - self._turned_s
 
@@ -110,7 +110,7 @@ class Executor:
             return refused(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
         if run.owner != owner:
             return refused(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
-        self._machine.hear_host()
+        self._machine.note_host_alive()
         return m.Accepted(state=self.status.state)
 
     def start(self) -> None:
@@ -160,23 +160,23 @@ class Executor:
         """A command of this run's host is being answered: until its reply is out, no `Alive` can come."""
         run = self._run
         if run and isinstance(command, OF_THE_RUN) and (command.scan_id, command.owner) == (run.scan_id, run.owner):
-            self._machine.hear_host()
+            self._machine.note_host_alive()
 
     def _take(self, item: Any) -> None:
         machine, row = self._machine, self._machine.row
         if isinstance(item, BurstSent):
-            machine.take_burst(item)
+            machine.on_burst(item)
         elif isinstance(item, m.Pulsed):
             self._answer_pulses(item)
         elif isinstance(item, LoopFault):
-            machine.take_loop_fault(item)
+            machine.on_loop_fault(item)
             self._answer_pulses(refused(item.number, item.detail))  # every request gets a reply
         elif isinstance(item, Request):
             if item.room is not None:
                 item.room.release()
             self._execute(item._replace(room=None))
         elif isinstance(item, Reply):
-            machine.take_stage(item)
+            machine.on_stage(item)
         elif isinstance(item, StageLost):
             machine.happen("stage lost", PiFault.STAGE_LOST, item.reason)
         else:
@@ -246,7 +246,7 @@ class Executor:
         """Carry out a command of the state machine. Raises RefusedError."""
         if event:
             self._machine.command(event, *args)
-        return m.Accepted(state=self._machine.told)
+        return m.Accepted(state=self._machine.wire_state)
 
     def _pulse(self, request: Request, command: m.Pulse) -> None:
         """Hand a burst to the trigger loop; its reply follows when it has been sent."""
@@ -340,13 +340,13 @@ class Executor:
         machine, stage, row, counts = self._machine, self._machine.stage, self._machine.row, self._loop.counts
         scan_id, last_seq = self._journal.scan_id, self._journal.last_seq
         self.status = m.StatusReply(
-            state=machine.told, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
+            state=machine.wire_state, homed=machine.homed, x_mm=stage.x_mm, y_mm=stage.y_mm,
             scan_id=scan_id, row_index=row.row.index if row else -1, take=row.take if row else 0,
             points=counts.bursts if row else 0, pulses=counts.pulses if row else 0, last_seq=last_seq,
             fault=machine.fault, reason=machine.reason, lost_x_mm=machine.lost_mm[0], lost_y_mm=machine.lost_mm[1],
         )  # fmt: skip
         self.hello = m.HelloReply(
-            pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.told,
+            pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
             scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placing,
         )  # fmt: skip
 

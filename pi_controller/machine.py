@@ -88,13 +88,13 @@ LIMITS_S: dict[State, float] = {
 }  # running: the row's own; the others: none
 END_LIMIT_S = 0.5  # from STOP to standstill when this program is told to end
 HOST_MISSES = 4  # heartbeats of the host that may fail to come
-TOLD: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others are told as they are
+WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others are told as they are
 
 
 class Machine:
     """Applies RULES, keeps the deadline of the state, and watches the host while a row is in motion.
 
-    Only the executor's thread calls it, except `hear_host`.
+    Only the executor's thread calls it, except `note_host_alive`.
     """
 
     def __init__(self, post: Callable[[Callable[[], object]], None], clock: Callable[[], float]) -> None:
@@ -135,8 +135,8 @@ class Machine:
             row = self.state in ("running", "held", "stopping", "done", "ending")
             raise RefusedError(
                 PiFault.NOT_READY,
-                f"no {event} in state {self.told}" + (f": {self.reason}" if self.reason else ""),
-                f"the state is {self.told}",
+                f"no {event} in state {self.wire_state}" + (f": {self.reason}" if self.reason else ""),
+                f"the state is {self.wire_state}",
                 "wait for the row's end, or abort it" if row else "begin a run, home the stage, start a row",
             )
 
@@ -146,9 +146,9 @@ class Machine:
         self.happen(event, *args)
 
     @property
-    def told(self) -> m.State:
+    def wire_state(self) -> m.State:
         """The state as it is told on the wire."""
-        return TOLD.get(self.state) or self.state  # pyright: ignore[reportReturnType]
+        return WIRE_STATE.get(self.state) or self.state  # pyright: ignore[reportReturnType]
 
     def _nothing(self, *_: object) -> None:
         pass
@@ -158,20 +158,20 @@ class Machine:
     def watch_host(self, heartbeat_ms: int) -> None:
         """The host promises to be heard so often; 0: it is not watched."""
         self._host_limit_s = HOST_MISSES * heartbeat_ms / 1e3 if heartbeat_ms else math.inf
-        self._host_heard_s = self._clock()
+        self._host_alive_s = self._clock()
 
-    def hear_host(self) -> None:
+    def note_host_alive(self) -> None:
         """The host of the run lives. From any thread."""
-        self._host_heard_s = max(self._host_heard_s, self._clock())
+        self._host_alive_s = max(self._host_alive_s, self._clock())
 
     @property
     def host_lives(self) -> bool:
         """True if the host has kept its promise so far; False if it promised nothing."""
-        return self._host_limit_s < math.inf and self._clock() < self._host_heard_s + self._host_limit_s
+        return self._host_limit_s < math.inf and self._clock() < self._host_alive_s + self._host_limit_s
 
     @property
     def _host_lost_s(self) -> float:
-        return self._host_heard_s + self._host_limit_s if self.state in ("running", "held") else math.inf
+        return self._host_alive_s + self._host_limit_s if self.state in ("running", "held") else math.inf
 
     def seconds_left(self) -> float | None:
         """Until something is due; None when nothing is."""

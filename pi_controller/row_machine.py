@@ -26,7 +26,7 @@ from polysight.shared.stage_line import HOMING_LIMIT_S, Immediate, Reply
 STATUS_EVENT_S = 0.24
 RESTS = 3  # statuses at rest after which the end of a motion counts as lost
 MOVING = ("homing", "running", "held", "stopping")
-NOT_ANY_MORE_HOMED = (
+POSITION_LOST = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
 )  # fmt: skip
 
@@ -79,11 +79,11 @@ class RowMachine(Machine):
         self._homing, self._homing_underway = -1, False  # sequence of HOME; whether the stage has taken it
         self._lines_dead = self._terminating = False
         self._rests, self._watch = 0, TriggerWatch()
-        self._status_told_s = 0.0
+        self._status_sent_s = 0.0
 
     # --- what comes by itself ---------------------------------------------------------------------------------------
 
-    def take_burst(self, sent: BurstSent) -> None:
+    def on_burst(self, sent: BurstSent) -> None:
         """A burst has ended."""
         row, r = self.row, sent.record
         if row is None or sent.job is not row.job or not r.pulses:
@@ -97,7 +97,7 @@ class RowMachine(Machine):
         if row.bursts >= row.row.points:
             self.happen("all sent")
 
-    def take_loop_fault(self, fault: LoopFault) -> None:
+    def on_loop_fault(self, fault: LoopFault) -> None:
         """The trigger loop has given up: this row, or for good."""
         if fault.job is None:
             self._lines_dead = True
@@ -105,11 +105,11 @@ class RowMachine(Machine):
         elif self.row is not None and fault.job is self.row.job:
             self.happen("row fault", fault.number, fault.detail)
 
-    def take_stage(self, reply: Reply) -> None:
+    def on_stage(self, reply: Reply) -> None:
         """What the stage tells by itself."""
         homing, homed = self.state == "homing", reply.sequence == self._homing
         if reply.kind == "status":
-            self._take_status(reply)
+            self._on_status(reply)
         elif reply.kind == "ok":
             self._homing_underway |= homing and homed
         elif homing and not self._homing_underway:
@@ -126,9 +126,9 @@ class RowMachine(Machine):
             self.stage.note_position(reply)
             self.happen("homed" if homing else "passed", reply)
 
-    def _take_status(self, reply: Reply) -> None:
+    def _on_status(self, reply: Reply) -> None:
         self.stage.note_position(reply)
-        self._tell_status(reply)
+        self._publish_status(reply)
         row, edges = self.row, self._loop.counts.edges
         if row is not None and self.state in MOVING:
             row.points = max(0, _number(reply, "points"))
@@ -145,11 +145,11 @@ class RowMachine(Machine):
             except StageLostError as e:
                 self.happen("stage lost", e.number, str(e))
 
-    def _tell_status(self, reply: Reply) -> None:
+    def _publish_status(self, reply: Reply) -> None:
         now = self._clock()
-        if now - self._status_told_s < (STATUS_EVENT_S if self.state in MOVING else 1.0):
+        if now - self._status_sent_s < (STATUS_EVENT_S if self.state in MOVING else 1.0):
             return
-        self._status_told_s = now
+        self._status_sent_s = now
         self._journal.add(
             m.StageStatus, state=reply.fields.get("state", ""), x_mm=self.stage.x_mm, y_mm=self.stage.y_mm,
             points=max(0, _number(reply, "points")), alarm=max(0, min(_number(reply, "alarm"), 999)),
@@ -199,7 +199,7 @@ class RowMachine(Machine):
             self._loop.disarm()
             if isinstance(e, StageLostError):
                 self.happen("stage lost", e.number, str(e))
-            elif e.number in NOT_ANY_MORE_HOMED:
+            elif e.number in POSITION_LOST:
                 self.happen("not homed")
             raise
         self.row = RunningRow(row, take, job, sequence)
@@ -249,12 +249,12 @@ class RowMachine(Machine):
         return self.row is not None
 
     def _fail_row(self, number: int, reason: str) -> str | None:
-        self._tell_fault(number, reason)
+        self._report_fault(number, reason)
         self._decide("fault", number, reason)
         return self._stop()
 
     def _fail(self, number: int, reason: str) -> str | None:
-        self._tell_fault(number, reason)
+        self._report_fault(number, reason)
         self._decide("fault", number, reason, lasting=True)
         return self._stop()
 
@@ -263,7 +263,7 @@ class RowMachine(Machine):
         self.homed = False
         self.stage.at_rest()
         if self.state != "fault":
-            self._tell_fault(number, reason)
+            self._report_fault(number, reason)
         self._decide("fault", number, reason, lasting=True)
 
     def _lose_position(self) -> None:
@@ -299,7 +299,7 @@ class RowMachine(Machine):
         try:
             self.stage.clear()
         except StageRefusedError as e:
-            self.homed = self.homed and e.number not in NOT_ANY_MORE_HOMED
+            self.homed = self.homed and e.number not in POSITION_LOST
         except StageLostError as e:
             self._post(partial(self.happen, "stage lost", e.number, str(e)))
 
@@ -308,7 +308,7 @@ class RowMachine(Machine):
         if row.status is None:
             row.judge(counts)
             if row.fault:
-                self._tell_fault(row.fault, row.reason)
+                self._report_fault(row.fault, row.reason)
         self._journal.add(
             m.RowFinished, row_index=row.row.index, take=row.take, status=row.status, points=row.points,
             **counts._asdict(), fault=row.fault, reason=row.reason, timed_by=self._loop.timed_by,
@@ -324,7 +324,7 @@ class RowMachine(Machine):
 
     # --- events -----------------------------------------------------------------------------------------------------
 
-    def _tell_fault(self, number: int, reason: str) -> None:
+    def _report_fault(self, number: int, reason: str) -> None:
         e = explain(number)
         if not self.fault:
             self.fault, self.reason = int(number), reason

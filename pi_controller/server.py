@@ -40,7 +40,7 @@ class Server:
         self._allowed = AllowedKeys(key_dir)
         self._secret = not is_loopback(command_address)
         try:
-            self._door = authenticator(self._context)  # before the others are bound: it is asked for each connection
+            self._zap = authenticator(self._context)  # before the others are bound: it is asked for each connection
             self._commands = replier(self._context, command_address, key_dir)
             self._events = publisher(self._context, event_address, key_dir)
         except PolysightError:
@@ -72,7 +72,7 @@ class Server:
         poller = zmq.Poller()
         poller.register(self._wake, zmq.POLLIN)
         poller.register(self._commands, zmq.POLLIN)
-        poller.register(self._door, zmq.POLLIN)
+        poller.register(self._zap, zmq.POLLIN)
         next_beat = time.monotonic()
         while not self._stop and executor.crash is None:
             now = time.monotonic()
@@ -83,7 +83,7 @@ class Server:
             if self._wake in ready:
                 os.eventfd_read(self._wake)
                 self.drain()
-            if self._door in ready:
+            if self._zap in ready:
                 self._admit()
             if self._commands in ready:
                 self._receive(executor)
@@ -102,11 +102,11 @@ class Server:
 
     def _admit(self) -> None:
         """Answer ZeroMQ's question (ZAP, RFC 27) whether a client with this public key may connect."""
-        version, number, _, _, _, mechanism, *credentials = self._door.recv_multipart()
+        version, number, _, _, _, mechanism, *credentials = self._zap.recv_multipart()
         key = bytes(credentials[0]) if mechanism == b"CURVE" and credentials else b""
         name = self._allowed.name_of(key) if key else ""
         code, text = (b"200", b"OK") if name else (b"400", b"this key is not allowed")
-        self._door.send_multipart([version, number, code, text, key.hex().encode(), b""])
+        self._zap.send_multipart([version, number, code, text, key.hex().encode(), b""])
 
     def _receive(self, executor: Executor) -> None:
         """Take one command: its envelope (who sent it, up to the empty frame), and one frame of content."""
@@ -144,8 +144,8 @@ class Server:
         except Exception as e:  # noqa: BLE001 - told to the client, and in the log
             traceback.print_exc()
             return refused(PiFault.BAD_REQUEST, f"a command of {len(raw)} bytes cannot be read: {type(e).__name__}")
-        if executor.stands_still_s > HUNG_S:
-            return refused(PiFault.PROGRAM, f"the executor has stood still for {executor.stands_still_s:.0f} s")
+        if executor.unresponsive_s > HUNG_S:
+            return refused(PiFault.PROGRAM, f"the executor has stood still for {executor.unresponsive_s:.0f} s")
         if isinstance(command, m.Hello):
             return msgspec.structs.replace(executor.hello, t_unix_ns=time.time_ns())
         if isinstance(command, m.Status):
@@ -158,7 +158,7 @@ class Server:
 
     def _beat(self, executor: Executor) -> None:
         """Tell that this program lives; while the executor hangs, it does not."""
-        if executor.stands_still_s > HUNG_S:
+        if executor.unresponsive_s > HUNG_S:
             return
         # Every event up to the status's number was handed over before the status was taken, so draining first keeps a
         # heartbeat from announcing an event that has not been sent.

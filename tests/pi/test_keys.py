@@ -34,7 +34,7 @@ class Door:
     """An executor that only says hello: what is asked here is who gets in."""
 
     crash = None
-    stands_still_s = 0.0
+    unresponsive_s = 0.0
     status = m.StatusReply(
         state="idle", homed=False, x_mm=0.0, y_mm=0.0, scan_id="", row_index=-1, take=0, points=0, pulses=0,
         last_seq=0, fault=0, reason="",

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.pi_controller.bursts import BurstSpec, Edge
-from polysight.pi_controller.machine import LIMITS_S, RULES, TOLD, RefusedError, State
+from polysight.pi_controller.machine import LIMITS_S, RULES, WIRE_STATE, RefusedError, State
 from polysight.pi_controller.row_machine import RowMachine
 from polysight.pi_controller.stage_link import STATUS_PER_HEARTBEAT, StatusWatch
 from polysight.pi_controller.trigger import LOOK_UP_S, BurstSent, LoopFault, TriggerLoop, TriggerWatch
@@ -54,9 +54,9 @@ class Bench:
         while self.posted:
             item = self.posted.pop(0)
             if isinstance(item, BurstSent):
-                self.machine.take_burst(item)
+                self.machine.on_burst(item)
             elif isinstance(item, LoopFault):
-                self.machine.take_loop_fault(item)
+                self.machine.on_loop_fault(item)
             else:
                 item()
 
@@ -83,7 +83,7 @@ class Bench:
         self.row_number = self.stage.number
 
     def stage_says(self, reply: Reply) -> None:
-        self.machine.take_stage(reply)
+        self.machine.on_stage(reply)
         self.run_posted()
 
     def status(self, points: int, state: str = "row") -> None:
@@ -154,7 +154,7 @@ def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms
     bench.machine.command("Hold") if held else None
     for _ in range(beats):
         bench.later(heartbeat_ms / 1e3)
-        bench.machine.hear_host()
+        bench.machine.note_host_alive()
     assert bench.armed, "a host that is heard is not lost"
     last = bench.t
     while bench.armed:
@@ -208,7 +208,7 @@ def test_a_lost_trigger_line_stops_everything_at_once(lasting):
     bench.edge()
     job = None if lasting else bench.machine.row.job  # type: ignore[union-attr]
     number = PiFault.TRIGGER_LINE_LOST if lasting else PiFault.EDGE_LOST
-    bench.machine.take_loop_fault(LoopFault(job, number, "gone"))
+    bench.machine.on_loop_fault(LoopFault(job, number, "gone"))
     assert not bench.armed
     assert bench.stage.sent == [Immediate.STOP]
     bench.stage_says(Reply("alarm", number=StageError.STOPPED))
@@ -248,7 +248,7 @@ def test_a_wire_with_edges_is_never_called_off(steps):
 def test_the_first_fault_wins():
     bench = Bench().homed()
     bench.start()
-    bench.machine.take_loop_fault(LoopFault(bench.machine.row.job, PiFault.EDGE_LOST, "2 edges lost"))  # type: ignore[union-attr]
+    bench.machine.on_loop_fault(LoopFault(bench.machine.row.job, PiFault.EDGE_LOST, "2 edges lost"))  # type: ignore[union-attr]
     bench.machine.happen("stage lost", PiFault.STAGE_LOST, "silent")
     bench.run_posted()
     assert (bench.machine.fault, bench.machine.reason) == (PiFault.EDGE_LOST, "2 edges lost")
@@ -306,9 +306,9 @@ def test_whatever_happens(start, actions):
             elif action == "banner":
                 bench.stage_says(Reply("banner"))
             elif action == "lines gone":
-                machine.take_loop_fault(LoopFault(None, PiFault.TRIGGER_LINE_LOST, "gone"))
+                machine.on_loop_fault(LoopFault(None, PiFault.TRIGGER_LINE_LOST, "gone"))
             elif action == "edge lost" and machine.row is not None:
-                machine.take_loop_fault(LoopFault(machine.row.job, PiFault.EDGE_LOST, "lost"))
+                machine.on_loop_fault(LoopFault(machine.row.job, PiFault.EDGE_LOST, "lost"))
             elif action == "stage lost":
                 machine.happen("stage lost", PiFault.STAGE_LOST, "silent")
             elif action == "time":
@@ -340,7 +340,7 @@ def test_the_page_shows_the_rules():
     rules = [(e[0], tuple(s), tuple(to)) for e, s, to, *_ in (r for r in shown if len(r) == 4)]
     assert rules == [(r.event, tuple(r.states.split()), tuple(r.leads_to.split())) for r in RULES]
     told = {s[0]: (to[0] if to else s[0]) for s, to, *_ in (r for r in shown if len(r) == 3)}
-    assert told == {s: TOLD.get(s, s) for s in get_args(State)}
+    assert told == {s: WIRE_STATE.get(s, s) for s in get_args(State)}
     limits = {
         row[0][0]: float(n[0]) for row in shown if len(row) == 3 for n in [row_seconds(SPEC_PAGE, row[0][0])] if n
     }

@@ -331,7 +331,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(inst
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr("threading.excepthook", lambda _: None)
-    monkeypatch.setattr("polysight.pi_controller.row_machine.RowMachine.take_burst", fail)
+    monkeypatch.setattr("polysight.pi_controller.row_machine.RowMachine.on_burst", fail)
     service = Service(at_stage_port(instrument, stage.port), hub)
     with ThreadPoolExecutor(1) as pool:
         served = pool.submit(service.serve)

@@ -11,9 +11,9 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parents[1] / "tests" / "preview"))
+sys.path.insert(0, str(HERE.parents[1]))
 
-from chromium import DESK, PHONE, Browser, find_chromium  # noqa: E402  # pyright: ignore[reportMissingImports]
+from tests.support.page.chromium import DESK, PHONE, Browser, find_chromium  # noqa: E402
 
 PICTURES = "[...document.querySelectorAll('.view img')]"
 ROWS_IN = "parseInt(document.getElementById('images-note').innerText) > 0"

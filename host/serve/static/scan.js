@@ -156,7 +156,8 @@ async function load() {
   showHead();
   showReasons();
   showFiles();
-  for (const id of ["images", "probe", "patches"]) by(id).hidden = !result;
+  for (const id of ["images", "patches"]) by(id).hidden = !result;
+  by("probe").hidden = !result || Boolean(labels?.open);
   by("label-open").hidden = !(result && server.control);
   if (!result) {
     if (!by("told").textContent) by("told").textContent = summary.rows ? "This scan was not processed yet." : "";

@@ -74,7 +74,7 @@ class Page:
         """Draw over the image, from one place in mm to another."""
         points = self.browser.value(
             "(() => { const c = document.querySelector('canvas.imageview'); c.scrollIntoView({block: 'center'});"
-            " const b = c.getBoundingClientRect(), w = b.width - 54, h = b.height - 46;"
+            " const b = c.getBoundingClientRect(), w = b.width - 62, h = b.height - 46;"
             " const e = window.extent; const at = (x, y) => [b.left + 46 + (x - e[0]) / (e[1] - e[0]) * w,"
             f" b.top + 8 + (e[3] - y) / (e[3] - e[2]) * h]; return [at({x0}, {y0}), at({x1}, {y1})]; }})()"
         )

@@ -1,5 +1,5 @@
 // What a scan says of one place: numbers, nearest materials, and the range profile through it.
-import { by, complain, get, make, permittivity } from "./common.js";
+import { by, complain, get, make, permittivity, rich } from "./common.js";
 import { plot } from "./plots.js";
 
 const number = (v, digits = 3) => (v === null || v === undefined ? "not known" : v.toPrecision(digits).replace("-", "−"));
@@ -35,7 +35,7 @@ export async function showProbe(scan, x, y, library) {
   if (told.nearest.length) facts.push(["nearest by P", told.nearest.map((n) => `${n.name} (${n.sigmas} σ)`).join(", ")]);
   by("probe-facts").replaceChildren(...facts.flatMap(([name, text]) => [make("dt", name), make("dd", text)]));
   by("profile").hidden = !told.profile;
-  by("profile-why").textContent = told.profile_why && `No range profile: ${told.profile_why}.`;
+  by("profile-why").replaceChildren(...rich(told.profile_why && `No range profile: ${told.profile_why}.`));
   if (told.profile) {
     const { path_m: path, boards } = told.profile;
     plot(by("profile"), {

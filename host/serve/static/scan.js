@@ -84,8 +84,8 @@ function showPatches() {
     const sure = p.confidence === null || p.confidence === undefined ? "" : ` ${Math.round(100 * p.confidence)} %`;
     const dominated = p.permittivity?.dominated_by ?? "", why = p.refused ? `${p.refused.what}: ${p.refused.why}` : p.why ?? "";
     const name = nest(make("td", `${patchName(p)}${p.metal_reference ? "" : sure}`), ...(p.box ? [make("div", `drawn as ${p.box}`, "soft")] : []));
-    const error = nest(make("td", dominated), ...(p.permittivity?.do ? [make("div", p.permittivity.do, "soft")] : []));
-    row.append(make("td", String(p.label)), name, make("td", permittivity(p.permittivity)), error, make("td", String(p.pixels), "n"), make("td", why));
+    const error = nest(make("td", dominated), ...(p.permittivity?.do ? [nest(make("div", null, "soft"), ...rich(p.permittivity.do))] : []));
+    row.append(make("td", String(p.label)), name, make("td", permittivity(p.permittivity)), error, make("td", String(p.pixels), "n"), nest(make("td"), ...rich(why)));
     return row;
   }));
 }

@@ -1,7 +1,7 @@
 // A picture with axes in millimetres: zoom, pan, a place to point at, boxes to draw; by mouse, finger and keyboard.
 import { ticks } from "./plots.js";
 
-const LEFT = 46, BOTTOM = 38, TOP = 8, RIGHT = 8;
+const LEFT = 46, BOTTOM = 38, TOP = 8, RIGHT = 16;
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 /**

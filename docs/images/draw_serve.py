@@ -28,7 +28,7 @@ def take(address: str, scan: str, to: Path) -> None:
     if find_chromium() is None:
         raise SystemExit("no Chromium here: tests/install-tools.sh installs it")
     base, _, token = address.partition("/#")
-    with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, Browser(Path(folder)) as browser:
         browser.size(*DESK)
         browser.open(f"{base}/scan?scan={quote(scan)}#{token}")
         browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", "the image")

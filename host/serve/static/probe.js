@@ -1,5 +1,5 @@
 // What a scan says of one place: numbers, nearest materials, and the range profile through it.
-import { by, complain, get, make, permittivity, rich } from "./common.js";
+import { by, called, complain, get, make, permittivity, rich } from "./common.js";
 import { plot } from "./plots.js";
 
 const number = (v, digits = 3) => (v === null || v === undefined ? "not known" : v.toPrecision(digits).replace("-", "−"));
@@ -26,7 +26,7 @@ export async function showProbe(scan, x, y, library) {
   } else facts.push(["permittivity", told.why]);
   if (told.patch) {
     const p = told.patch;
-    facts.push(["in patch", `${p.label}, ${p.metal_reference ? "the metal reference" : p.name === "unknown" ? "not in the library" : p.name ?? "not named"}`]);
+    facts.push(["in patch", `${p.label}, ${p.metal_reference ? "the metal reference" : called(p.name)}`]);
     if (p.permittivity) facts.push(["the patch's", permittivity(p.permittivity)]);
     const likely = Object.entries(p.probabilities ?? {}).map(([name, share]) => `${name === "unknown" ? "none of these" : name} ${Math.round(100 * share)} %`);
     if (likely.length) facts.push(["likeliest", likely.slice(0, 4).join(", ")]);

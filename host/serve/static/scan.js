@@ -1,6 +1,6 @@
 // One scan: its images, what was found in them, and what can be done with it.
 import { ImageView, caption, outline } from "./view.js";
-import { badge, begin, by, bytes, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
+import { badge, begin, by, bytes, called, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
 import { Labels } from "./label.js";
 import { showProbe } from "./probe.js";
 
@@ -74,7 +74,7 @@ function overlay(pen, at) {
   labels?.overlay(pen, at);
 }
 
-const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "not judged" : p.name === "unknown" ? "not in the library" : p.name ?? "not named");
+const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "not judged" : called(p.name));
 
 function showPatches() {
   by("patches").hidden = !result.patches.length;

@@ -1,4 +1,4 @@
-"""What somebody waits for: last row to image and report, another plane from kept samples, commands to their output."""
+"""What somebody waits for: last row to image and report, another plane from kept samples, lists of scans, commands."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from benchmarks.data import ROOT, SCENE, published, recorded_rows, temporary, wr
 from benchmarks.measure import Seconds
 from benchmarks.table import Line, add_arguments, show, write
 from benchmarks.whole import rows_that_fit
+from polysight.host.catalogue import Scans
 from polysight.host.imaging import View
 from polysight.host.jobs.process import make_products, publish_images
 from polysight.host.pipeline import Pipeline
 from polysight.host.process import Options
-from polysight.host.store import ScanFolder
+from polysight.host.store import MANIFEST, ScanFolder
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 3
@@ -65,6 +66,21 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
     return same, other
 
 
+def listed(scan: Path, made: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
+    """A list of so many scans, each with the manifest of `scan` and the products `made`: the first look, and later."""
+    for n in range(count):
+        shutil.copytree(made, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures"))
+        shutil.copy(scan / MANIFEST, root / f"scan-{n}")
+    first, again = Seconds(), Seconds()
+    for _ in range(REPEATS):
+        scans = Scans(root)
+        for took in (first, again):
+            with took.timed():
+                if len(scans.list()) != count:
+                    raise RuntimeError("scans are missing in the list")
+    return first, again
+
+
 def command(words: list[str]) -> tuple[float, float]:
     """CPU and wall seconds of a command in a process of its own. Raises RuntimeError when it fails."""
     before, began = os.times(), time.perf_counter()
@@ -85,6 +101,7 @@ def run(args: argparse.Namespace) -> int:
         behind = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
         same, other = from_samples(folder / "scan", repeats)
         made = small_products(folder)
+        first, again = listed(folder / "scan", made, folder / "many", 20 if args.quick else 200)
         typed = {name: [command(name.format(made=made).split()) for _ in range(repeats)] for name in COMMANDS}
     boards = len(rig.receivers)
     lines = []
@@ -94,6 +111,9 @@ def run(args: argparse.Namespace) -> int:
         lines.append(_least(f"last committed row to {what}, wall s", statistics.median(waited), limit, limit, note))
     for name, took in (("its own plane", same), ("another plane", other)):
         lines.append(_least(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1))
+    for name, took in (("first look", first), ("later", again)):
+        note = f"{took.median_wall:.2f} s wall"
+        lines.append(_least(f"list of 200 scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note))
     for name, times in typed.items():
         cpu, wall = (statistics.median(t[k] for t in times) for k in (0, 1))
         note = f"{wall:.2f} s wall"

@@ -11,9 +11,9 @@ import tempfile
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parents[1] / "tests" / "preview"))
+sys.path.insert(0, str(HERE.parents[1]))
 
-from chromium import DESK, PHONE, Browser, find_chromium  # noqa: E402  # pyright: ignore[reportMissingImports]
+from tests.support.page.chromium import DESK, PHONE, Browser, find_chromium  # noqa: E402
 
 PICTURES = "[...document.querySelectorAll('.view img')]"
 ROWS_IN = "parseInt(document.getElementById('images-note').innerText) > 0"
@@ -23,7 +23,7 @@ def take(address: str, to: Path) -> None:
     """Both pictures, once the six images are there and the page says that all of it is simulated."""
     if find_chromium() is None:
         raise SystemExit("no Chromium here: tests/install-tools.sh installs it")
-    with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, Browser(Path(folder)) as browser:
         for name, size in (("preview", DESK), ("preview-phone", PHONE)):
             browser.size(*size)
             browser.open("about:blank")

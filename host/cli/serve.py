@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,7 @@ def add_commands(add: Add) -> None:
 
 def _serve(args: argparse.Namespace) -> int:
     _check_extra()
+    sys.stderr.write("polysight serve: starting\n")  # what it shows takes seconds to load
     from polysight.host.serve import serve
 
     config = args.config if args.config is not None else RIG if RIG.exists() else None
@@ -37,6 +39,7 @@ def _preview(args: argparse.Namespace) -> int:
     _check_extra()
     if args.folder.exists() and not args.folder.is_dir():
         raise ConfigError(f"{args.folder} is a file", "a scan is a folder, there or not yet", "give a scan folder")
+    sys.stderr.write("polysight preview: starting\n")
     from polysight.host.serve import preview
 
     return preview(args.folder, _place(args), args.control)

@@ -10,6 +10,7 @@ from typing import Any
 
 from polysight.host.acquisition import Wish, ask
 from polysight.host.catalogue import Notes, Scans, Summary, compare, folder_bytes, probe, read_notes, write_notes
+from polysight.host.materials import UNKNOWN
 from polysight.shared.errors import DataError, no_such
 
 
@@ -25,7 +26,12 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     width = max((len(s.name) for s in found), default=0)
     for s in found:
         size = folder_bytes(root / s.name) / 1e6
-        told = [s.state, f"{s.committed}/{s.rows} rows" if s.rows else "", s.verdict, ", ".join(s.materials)]
+        told = [
+            s.state,
+            f"{s.committed}/{s.rows} rows" if s.rows else "",
+            s.verdict,
+            ", ".join(map(_called, s.materials)),
+        ]
         told += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
         sys.stdout.write(f"{s.name:{width}}  {size:8.1f} MB  {'  '.join(t for t in told if t)}\n")
     sys.stdout.write(f"{len(found)} scans under {root}\n")
@@ -75,7 +81,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     else:
         lines.append(f"no permittivity: {found['why']}")
     if (patch := found["patch"]) is not None:
-        lines.append(f"in patch {patch['label']}: {patch.get('name') or 'not named'}")
+        lines.append(f"in patch {patch['label']}: {_called(patch.get('name'))}")
     lines += [f"  {n['sigmas']:g} standard deviations from {n['name']}" for n in found["nearest"]]
     lines.append(found["profile_why"] or "range profile: --json")
     sys.stdout.write("".join(f"{line}\n" for line in lines))
@@ -101,7 +107,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         share = f"{100 * told['significant_share']:.1f} %"
         lines.append(f"P differs by more than {told['significant_sigmas']:g} standard deviations in {share} of them")
     for pair in told["patches"]:
-        names = " and ".join(name or "not named" for name in pair["names"])
+        names = " and ".join(map(_called, pair["names"]))
         where = f"x {pair['place_mm'][0]:g}, y {pair['place_mm'][1]:g} mm ({names})"
         d = pair["difference"]
         if d is None:
@@ -111,6 +117,11 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         lines.append(f"{where}: permittivity differs by {_complex(d)}{sure}")
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     return 0
+
+
+def _called(name: str | None) -> str:
+    """A material's name as people read it."""
+    return "not in the library" if name == UNKNOWN else name or "not named"
 
 
 def _value(value: float | None) -> str:

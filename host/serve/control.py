@@ -16,7 +16,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from polysight.host.acquisition import Wish
-from polysight.host.catalogue import PROGRAM, Notes, Summary, write_notes
+from polysight.host.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
 from polysight.host.jobs.label import save_labels
 from polysight.host.materials import Labels
 from polysight.host.plan import Changes, forecast, numbers
@@ -202,14 +202,14 @@ async def _start(site: Site, request: Request, wanted: StartRequest) -> dict[str
     del request
     config, programs = _config(site), _programs(site)
     folder = site.scans.folder(wanted.name, new=True)
-    if folder.exists() and any(p.name != PROGRAM for p in folder.iterdir()):
+    if folder.exists() and any(p.name not in (PROGRAM, NOTES) for p in folder.iterdir()):
         raise ConfigError(f"{wanted.name} is there already", "scans are never overwritten", "give another name")
     rig = wanted.of(config)
     await site.act(_check_free, site)
-    words: list[str | Path] = ["scan", "--out", folder]
+    more = _material_words(site, wanted.library, wanted.metal)  # refused before anything is written
     if wanted.given:
         config = _write_rig(folder, rig)
-    words += ["--config", config.absolute(), *_material_words(site, wanted.library, wanted.metal)]
+    words: list[str | Path] = ["scan", "--out", folder, "--config", config.absolute(), *more]
     if wanted.keep_incomplete:
         words.append("--keep-incomplete")
     if wanted.notes or wanted.tags:

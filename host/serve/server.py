@@ -10,6 +10,7 @@ import resource
 import secrets
 import socket
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -82,6 +83,7 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
     access = _access(place, listener, control)
     config = None if config is None else config.absolute()
     site = Site(Scans(root.absolute()), access, Watches(control), programs, config)
+    threading.Thread(target=site.scans.list, name="first look", daemon=True).start()  # the page finds it done
     return _run(site, place, listener, f"scans in {root}", "")
 
 

@@ -1,5 +1,5 @@
 // The list of scans: what there is, how it stands; search, order, and what several scans are chosen for.
-import { address, badge, begin, by, bytes, complain, day, get, make, nest, pageOf, post, STATES, VERDICTS } from "./common.js";
+import { address, badge, begin, by, bytes, called, complain, day, get, make, nest, pageOf, post, STATES, VERDICTS } from "./common.js";
 
 const LOOK_MS = 4000;
 const ORDER = { good: 0, care: 1, "": 2, none: 3, damaged: 4 };
@@ -24,7 +24,7 @@ function card(s) {
   if (s.simulated) badges.append(make("span", "simulated", "stamp"));
   const rows = s.rows ? `${s.committed} of ${s.rows} rows · ` : "";
   const facts = make("div", `${s.seconds ? day(s.seconds) : ""} · ${rows}${bytes(s.bytes)}${s.rig ? ` · ${s.rig}` : ""}`, "facts");
-  const found = s.materials.length ? make("div", s.materials.join(", "), "facts") : "";
+  const found = s.materials.length ? make("div", s.materials.map(called).join(", "), "facts") : "";
   item.append(picture, link, choose, badges, facts, found, s.notes ? make("div", s.notes, "words") : "");
   if (s.tags.length) item.append(nest(make("div", null, "badges"), ...s.tags.map((t) => make("span", t, "tag"))));
   item.classList.toggle("chosen", chosen.has(s.name));

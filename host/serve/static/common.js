@@ -115,6 +115,9 @@ export function permittivity(p) {
   return `${p.real.toFixed(2)}${error(p.real_std)} − j (${(-p.imag).toFixed(2)}${error(p.imag_std)})`;
 }
 
+/** A material's name as people read it. */
+export const called = (name) => (name === "unknown" ? "not in the library" : name ?? "not named");
+
 export const STATES = {
   running: ["is being scanned", "wait"], paused: ["paused", "wait"], finished: ["finished", "good"], stopped: ["stopped", "warn"],
   failed: ["failed", "bad"], lost: ["interrupted", "bad"], begun: ["not begun", "warn"], products: ["products only", "good"], damaged: ["damaged", "bad"],

@@ -1,6 +1,6 @@
 // Two scans: one under the other with an edge to move, side by side, or their difference in standard deviations.
 import { ImageView } from "./view.js";
-import { address, begin, by, complain, get, make, nest, permittivity, picture, query, signed } from "./common.js";
+import { address, begin, by, called, complain, get, make, nest, permittivity, picture, query, signed } from "./common.js";
 
 const MAPS = { h_amplitude: "|H|", v_amplitude: "|V|", p_amplitude: "|P|", p_phase: "phase of P", permittivity: "permittivity, real part", loss: "permittivity, loss" };
 const DIFFERENCES = { sigmas: "difference of P, in standard deviations", p: "|difference of P|", permittivity: "difference of the permittivity, real part", loss: "difference of the loss" };
@@ -60,7 +60,7 @@ function showTable() {
     const d = p.difference, sure = p.sigmas === null ? "–" : `${p.sigmas.toFixed(1)}${p.sigmas > told.significant_sigmas ? " differs" : ""}`;
     const row = make("tr");
     row.append(make("td", p.place_mm.join(", ").replaceAll("-", "−")));
-    [0, 1].forEach((k) => row.append(nest(make("td", p.names[k] ?? "not named"), make("div", permittivity(p.permittivity[k]), "soft"))));
+    [0, 1].forEach((k) => row.append(nest(make("td", called(p.names[k])), make("div", permittivity(p.permittivity[k]), "soft"))));
     const std = (s) => (s ? ` ± ${s.toPrecision(2)}` : "");
     row.append(make("td", d ? `${signed(d.real, 2)}${std(d.real_std)}, loss ${signed(-d.imag, 2)}${std(d.imag_std)}` : "–"), make("td", sure, "n"));
     return row;

@@ -22,6 +22,7 @@ export class Labels {
   toggle() {
     this.open = !this.open;
     by("label").hidden = !this.open;
+    by("probe").hidden = this.open;
     this.opened(this.open);
   }
 

@@ -1,5 +1,5 @@
 // What a scan says of one place: numbers, nearest materials, and the range profile through it.
-import { by, complain, get, make, permittivity } from "./common.js";
+import { by, called, complain, get, make, permittivity, rich } from "./common.js";
 import { plot } from "./plots.js";
 
 const number = (v, digits = 3) => (v === null || v === undefined ? "not known" : v.toPrecision(digits).replace("-", "−"));
@@ -26,7 +26,7 @@ export async function showProbe(scan, x, y, library) {
   } else facts.push(["permittivity", told.why]);
   if (told.patch) {
     const p = told.patch;
-    facts.push(["in patch", `${p.label}, ${p.metal_reference ? "the metal reference" : p.name === "unknown" ? "not in the library" : p.name ?? "not named"}`]);
+    facts.push(["in patch", `${p.label}, ${p.metal_reference ? "the metal reference" : called(p.name)}`]);
     if (p.permittivity) facts.push(["the patch's", permittivity(p.permittivity)]);
     const likely = Object.entries(p.probabilities ?? {}).map(([name, share]) => `${name === "unknown" ? "none of these" : name} ${Math.round(100 * share)} %`);
     if (likely.length) facts.push(["likeliest", likely.slice(0, 4).join(", ")]);
@@ -35,7 +35,7 @@ export async function showProbe(scan, x, y, library) {
   if (told.nearest.length) facts.push(["nearest by P", told.nearest.map((n) => `${n.name} (${n.sigmas} σ)`).join(", ")]);
   by("probe-facts").replaceChildren(...facts.flatMap(([name, text]) => [make("dt", name), make("dd", text)]));
   by("profile").hidden = !told.profile;
-  by("profile-why").textContent = told.profile_why && `No range profile: ${told.profile_why}.`;
+  by("profile-why").replaceChildren(...rich(told.profile_why && `No range profile: ${told.profile_why}.`));
   if (told.profile) {
     const { path_m: path, boards } = told.profile;
     plot(by("profile"), {

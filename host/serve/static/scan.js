@@ -1,6 +1,6 @@
 // One scan: its images, what was found in them, and what can be done with it.
 import { ImageView, caption, outline } from "./view.js";
-import { badge, begin, by, bytes, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
+import { badge, begin, by, bytes, called, address, complain, day, ending, get, make, nest, pageOf, permittivity, picture, post, rich, scanName, signed, STATES, VERDICTS } from "./common.js";
 import { Labels } from "./label.js";
 import { showProbe } from "./probe.js";
 
@@ -74,7 +74,7 @@ function overlay(pen, at) {
   labels?.overlay(pen, at);
 }
 
-const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "not judged" : p.name === "unknown" ? "not in the library" : p.name ?? "not named");
+const patchName = (p) => (p.metal_reference ? "metal reference" : p.refused ? "not judged" : called(p.name));
 
 function showPatches() {
   by("patches").hidden = !result.patches.length;
@@ -84,8 +84,8 @@ function showPatches() {
     const sure = p.confidence === null || p.confidence === undefined ? "" : ` ${Math.round(100 * p.confidence)} %`;
     const dominated = p.permittivity?.dominated_by ?? "", why = p.refused ? `${p.refused.what}: ${p.refused.why}` : p.why ?? "";
     const name = nest(make("td", `${patchName(p)}${p.metal_reference ? "" : sure}`), ...(p.box ? [make("div", `drawn as ${p.box}`, "soft")] : []));
-    const error = nest(make("td", dominated), ...(p.permittivity?.do ? [make("div", p.permittivity.do, "soft")] : []));
-    row.append(make("td", String(p.label)), name, make("td", permittivity(p.permittivity)), error, make("td", String(p.pixels), "n"), make("td", why));
+    const error = nest(make("td", dominated), ...(p.permittivity?.do ? [nest(make("div", null, "soft"), ...rich(p.permittivity.do))] : []));
+    row.append(make("td", String(p.label)), name, make("td", permittivity(p.permittivity)), error, make("td", String(p.pixels), "n"), nest(make("td"), ...rich(why)));
     return row;
   }));
 }
@@ -156,7 +156,8 @@ async function load() {
   showHead();
   showReasons();
   showFiles();
-  for (const id of ["images", "probe", "patches"]) by(id).hidden = !result;
+  for (const id of ["images", "patches"]) by(id).hidden = !result;
+  by("probe").hidden = !result || Boolean(labels?.open);
   by("label-open").hidden = !(result && server.control);
   if (!result) {
     if (!by("told").textContent) by("told").textContent = summary.rows ? "This scan was not processed yet." : "";

@@ -1,7 +1,7 @@
 // A picture with axes in millimetres: zoom, pan, a place to point at, boxes to draw; by mouse, finger and keyboard.
 import { ticks } from "./plots.js";
 
-const LEFT = 46, BOTTOM = 38, TOP = 8, RIGHT = 8;
+const LEFT = 46, BOTTOM = 38, TOP = 8, RIGHT = 16;
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 /**
@@ -205,8 +205,7 @@ export class ImageView {
     pen.fillRect(edge, 0, wide, 1e4);
     pen.drawImage(second, x0, y0, x1 - x0, y1 - y0);
     pen.restore();
-    pen.fillStyle = colour("--ink");
-    pen.fillRect(edge - 1, 0, 2, 1e4);
+    outline(pen, () => { pen.beginPath(); pen.moveTo(edge, 0); pen.lineTo(edge, 1e4); pen.stroke(); }, "#ffffff");
   }
 
   #marks(pen, at) {

@@ -57,7 +57,9 @@ class Browser:
         try:
             address = self._page(profile / "DevToolsActivePort")
             self._stack = ExitStack()
-            self._socket = self._stack.enter_context(connect(address, max_size=None, open_timeout=LIMIT_S))
+            self._socket = self._stack.enter_context(
+                connect(address, max_size=None, open_timeout=LIMIT_S, ping_interval=None)
+            )
         except BaseException:
             self._end()
             raise

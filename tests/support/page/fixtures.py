@@ -7,9 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from polysight.host.jobs.process import process
 from polysight.host.page.watch import Watch
+from polysight.host.process import ProcessRequest
+from polysight.simulators.scene import decode_scene, simulate
 from tests.support.page.chromium import Browser, find_chromium
 from tests.support.page.live_view import GrowingScan
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, PET, scene_of
 from tests.support.store.small_scan import Samples, SmallScan
 
 
@@ -53,3 +58,14 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         pytest.skip("no chromium here: sudo apt-get install chromium")
     with Browser(tmp_path_factory.mktemp("browser")) as made:
         yield made
+
+
+@pytest.fixture(scope="session")
+def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two processed scans, `one` and `two`, of copper and PET with other noise."""
+    root = tmp_path_factory.mktemp("processed")
+    scene = decode_scene(scene_of(COPPER, PET, columns=15, rows=17), "test")
+    for name, seed in (("one", 3), ("two", 7)):
+        folder = simulate(published_rig(), scene, root / name, seed=seed)
+        assert process(ProcessRequest(data=str(folder), out=str(folder / "products")), threads=1) == 0
+    return root

@@ -1,0 +1,138 @@
+"""One place of a scan, and two scans compared: what is told is what the images hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from polysight.host.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of
+from polysight.host.polarimetry import permittivity_from_ratio
+from polysight.host.products import read_products
+from polysight.shared.errors import DataError
+from tests.support.products import judged_products
+from tests.support.scenes import COPPER, PET
+
+CENTRE = tuple(PET["centre_mm"])
+
+
+def test_a_place_tells_its_own_pixel(processed):
+    saved = read_products(processed / "one")
+    pixels = Pixels(saved)
+    row, column = pixels.nearest(*CENTRE)
+    told = probe(processed / "one", *CENTRE)
+    p = complex(saved.p[row, column])
+    assert complex(told["p"]["real"], told["p"]["imag"]) == pytest.approx(p, abs=1e-4)
+    eps = complex(permittivity_from_ratio(p, pixels.theta_rad))
+    assert complex(told["permittivity"]["real"], told["permittivity"]["imag"]) == pytest.approx(eps, abs=1e-3)
+    assert told["place_mm"] == pytest.approx([pixels.x_mm[column], pixels.y_mm[row]], abs=0.01)
+    assert told["patch"]["truth"]["name"] == "PET"
+    assert told["nearest"][0]["name"].startswith("PET")
+
+
+def test_the_error_of_a_pixel_is_that_of_draws(processed):
+    """Of P as it is drawn with its standard deviation, in each part."""
+    pixels = Pixels(read_products(processed / "one"))
+    at = pixels.nearest(*CENTRE)
+    p, sigma = complex(pixels.p[at]), float(pixels.p_sigma[at]) / 20  # small: the law is of first order
+    rng = np.random.default_rng(1)
+    drawn = permittivity_from_ratio(
+        p + sigma * (rng.standard_normal(4000) + 1j * rng.standard_normal(4000)), pixels.theta_rad
+    )
+    assert float(pixels.permittivity_sigma[at]) / 20 == pytest.approx(np.std(drawn.real), rel=0.06)
+    assert float(pixels.permittivity_sigma[at]) / 20 == pytest.approx(np.std(drawn.imag), rel=0.06)
+
+
+def test_the_range_profile_has_its_peak_at_the_plate(processed):
+    for plate in (COPPER, PET):
+        told = probe(processed / "one", *plate["centre_mm"])["profile"]
+        for levels in told["boards"].values():
+            assert abs(told["path_m"][int(np.argmax(levels))]) < 0.03
+
+
+def test_metal_has_no_permittivity_and_says_why(processed):
+    told = probe(processed / "one", *COPPER["centre_mm"])
+    assert told["permittivity"] is None
+    assert "metal" in told["why"]
+    assert told["patch"]["metal_reference"]
+
+
+def test_places_outside_the_image_are_refused(processed):
+    for place in ((1000.0, 0.0), (0.0, -500.0), (float("nan"), 0.0)):
+        with pytest.raises(DataError, match="outside"):
+            probe(processed / "one", *place)
+
+
+def test_without_a_result_nothing_is_told_of_materials(tmp_path):
+    judged_products(tmp_path, "none", careless=True)
+    told = probe(tmp_path, 0.0, 0.0)
+    assert (told["permittivity"], told["patch"], told["nearest"]) == (None, None, [])
+    assert result_of(tmp_path)["referenced"] is False
+    assert {p["name"] for p in result_of(tmp_path)["pictures"]} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
+
+
+def test_a_scan_does_not_differ_from_itself(processed):
+    found = compare(processed / "one", processed / "one")
+    assert np.nanmax(np.abs(found.p)) == 0
+    assert found.to_dict()["significant_share"] == 0
+    assert all(pair["sigmas"] == 0 for pair in found.patches if pair["difference"])
+
+
+def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
+    found = compare(processed / "one", processed / "two")
+    told = [pair["sigmas"] for pair in found.patches if pair["sigmas"] is not None]
+    assert told
+    assert max(told) < 3
+    assert found.to_dict()["significant_share"] < 0.05
+    back = compare(processed / "two", processed / "one")
+    both = np.isfinite(found.p) & np.isfinite(back.p)
+    assert np.array_equal(found.p[both], -back.p[both])
+
+
+def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
+    """The V channel of the PET's pixels is made 30 % stronger in a copy."""
+    import shutil
+
+    from polysight.host.products import write_image
+
+    shutil.copytree(processed / "one" / "products", tmp_path / "changed")
+    saved = read_products(processed / "one")
+    v, (x, y) = saved.v.copy(), CENTRE
+    pixels = Pixels(saved)
+    inside = np.ix_(abs(pixels.y_mm - y) < 15, abs(pixels.x_mm - x) < 15)
+    v[inside] *= 1.3
+    with np.errstate(invalid="ignore", divide="ignore"):
+        p = saved.h / v
+    write_image(tmp_path / "changed" / "image.npz", saved.h, v, p, saved.x_m, saved.y_m, saved.valid, saved.p_sigma)
+    found = compare(processed / "one", tmp_path / "changed")
+    told = np.nan_to_num(found.sigmas)
+    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.p_sigma)
+    assert np.allclose(told[inside], expected[inside], rtol=1e-4)
+    assert told[inside].min() > 0.5
+    told[inside] = 0
+    assert told.max() == 0
+
+
+def test_scans_that_cannot_be_compared_say_so(processed, tmp_path):
+    judged_products(tmp_path / "none", "none")
+    with pytest.raises(DataError, match="cannot be compared"):
+        compare(processed / "one", tmp_path / "none")
+
+
+def test_every_map_is_drawn_in_the_size_of_the_image(processed):
+    import io
+
+    from matplotlib.image import imread
+
+    pixels = Pixels(read_products(processed / "one"))
+    for name in MAPS:
+        made = draw_products(pixels, name)
+        assert imread(io.BytesIO(made.png)).shape[:2] == pixels.valid.shape
+        assert made.low < made.high
+    shared = draw_products(pixels, "h_amplitude", (-20.0, 0.0))
+    assert (shared.low, shared.high) == (-20.0, 0.0)
+    found = compare(processed / "one", processed / "two")
+    for name in ("p", "sigmas", "permittivity", "loss"):
+        assert imread(io.BytesIO(draw_comparison(found, name).png)).shape[:2] == pixels.valid.shape
+    for draw in (lambda: draw_products(pixels, "x"), lambda: draw_comparison(found, "x")):
+        with pytest.raises(DataError):
+            draw()

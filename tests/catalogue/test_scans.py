@@ -1,0 +1,117 @@
+"""The list of scans: what is in it, in what state, and that looking at it costs next to nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from polysight.host.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
+from polysight.host.store import MANIFEST, ScanFolder, manifest
+from polysight.shared.errors import ConfigError, DataError
+from tests.support.products import judged_products
+
+
+@pytest.fixture
+def root(processed: Path, tmp_path: Path) -> Path:
+    """A folder with a finished scan, one that was stopped, one whose program died, and products alone."""
+    for name in ("done", "week/stopped", "week/lost"):
+        shutil.copytree(processed / "one", tmp_path / name, ignore=shutil.ignore_patterns("raw", "samples", "figures"))
+    facts = manifest.read(tmp_path / "done" / MANIFEST).facts
+    ended = {"fact": "scan_ended", "exit_status": "abort", "reason": "asked to", "rows_committed": 3}
+    for name, kept in (("week/stopped", [*facts[:4], ended]), ("week/lost", facts[:6])):
+        (tmp_path / name / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept))
+        os.utime(tmp_path / name / MANIFEST, (1e9, 1e9))
+    judged_products(tmp_path / "out" / "one", "none")
+    (tmp_path / "empty").mkdir()
+    return tmp_path
+
+
+def test_every_scan_is_listed_with_its_state(root):
+    found = {s.name: s for s in Scans(root).list()}
+    assert {n: (s.state, s.committed, s.rows) for n, s in found.items()} == {
+        "done": ("finished", 17, 17), "week/stopped": ("stopped", 3, 17), "week/lost": ("lost", 5, 17),
+        "out/one": ("products", 0, 0),
+    }  # fmt: skip
+    assert (found["done"].simulated, found["done"].processed, found["out/one"].verdict) == (True, True, "none")
+
+
+def test_rows_are_counted_as_the_scan_folder_counts_them(root):
+    """Taken again, withdrawn, torn and damaged lines included."""
+    path = root / "done" / MANIFEST
+    facts = manifest.read(path).facts
+    again = [facts[5] | {"take": 2}, {"fact": "row_withdrawn", "row": facts[2]["row"], "take": 1, "reasons": ["x"]}]
+    lines = [manifest.encode_line(f) for f in [*facts, *again]]
+    lines[7] = lines[7].replace(b'"row":', b'"rov":')
+    path.write_bytes(b"".join(lines) + b'{"fact":"row_committed","pulses":3,"row":999')
+    shown = Scans(root).summary("done")
+    assert shown.committed >= len(ScanFolder.load(root / "done").committed())
+    assert shown.committed <= shown.rows
+
+
+def test_what_has_not_changed_is_not_read_again(root, monkeypatch):
+    listed = Scans(root)
+    first = listed.list()
+    opened: list[str] = []
+    monkeypatch.setattr(scans, "summary_of", lambda _, name: opened.append(name))
+    assert listed.list() == first
+    assert opened == []
+
+
+def test_a_list_reads_no_rows(root, monkeypatch):
+    opened: list[str] = []
+    real = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda p: opened.append(str(p)) or real(p))
+    Scans(root).list()
+    assert opened
+    assert not [p for p in opened if "raw" in p or "samples" in p or p.endswith(".npz")]
+
+
+def test_damaged_scans_are_listed_and_break_nothing(root):
+    for k, content in enumerate((b"", b"\0" * 500, b"{}\n", b'{"fact":"scan_started"}\n', os.urandom(3000))):
+        (root / f"bad{k}").mkdir()
+        (root / f"bad{k}" / MANIFEST).write_bytes(content)
+    (root / "done" / "products" / "materials.json").write_text("[")
+    (root / "done" / NOTES).write_text("{")
+    found = {s.name: s for s in Scans(root).list()}
+    assert {found[f"bad{k}"].state for k in range(5)} == {"damaged"}
+    assert (found["done"].state, found["done"].verdict) == ("finished", "damaged")
+
+
+def test_links_and_hidden_folders_are_not_followed(root, tmp_path_factory):
+    other = tmp_path_factory.mktemp("elsewhere")
+    shutil.copytree(root / "done", other / "secret")
+    (root / "link").symlink_to(other / "secret")
+    (root / ".hidden").mkdir()
+    shutil.copytree(root / "done", root / ".hidden" / "one")
+    names = {s.name for s in Scans(root).list()}
+    assert not names & {"link", ".hidden/one"}
+    for name in ("link", ".hidden/one", "../elsewhere", "", "done/", "done/products/..", "week"):
+        with pytest.raises(DataError):
+            Scans(root).folder(name)
+
+
+def test_one_scan_alone_is_shown_where_it_was_asked_for(root):
+    alone = Scans(root, "done")
+    assert [s.name for s in alone.list()] == ["done"]
+    with pytest.raises(DataError):
+        alone.folder("week/stopped")
+    assert Scans(root, "not-yet").folder("not-yet") == root / "not-yet"
+
+
+def test_notes_come_back_as_they_were_written(root):
+    written = write_notes(root / "done", Notes("two\nlines, Eichenholz 木", ("oak", " oak ", "", "b")))
+    assert written == read_notes(root / "done") == Notes("two\nlines, Eichenholz 木", ("oak", "b"))
+    assert json.loads((root / "done" / NOTES).read_text(encoding="utf-8"))["tags"] == ["oak", "b"]
+    assert Scans(root).summary("done").tags == ("oak", "b")
+    assert "\u202e" not in write_notes(root / "done", Notes("a\u202eb\x00c", ("\x1b[31m",))).notes
+
+
+@pytest.mark.parametrize("notes", [Notes("x" * 10_001), Notes("", ("y" * 41,)), Notes("", tuple(map(str, range(21))))])
+def test_too_long_notes_are_refused(root, notes):
+    with pytest.raises(ConfigError):
+        write_notes(root / "done", notes)
+    assert not (root / "done" / NOTES).exists()

@@ -1,0 +1,216 @@
+"""The operator's page beside the simulated rig, in a real browser: plan, start, pause, stop, resume, a dying server."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polysight.host.catalogue import PROGRAM
+from polysight.host.serve.programs import program_of
+from polysight.host.store import ScanFolder, validate
+from tests.support.page.chromium import DESK, PHONE, Browser, find_chromium
+from tests.support.processes import Program
+from tests.support.scenes import small_scene
+from tests.support.simulated_rig import Rig, running
+
+ROWS = 40
+SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
+LIMIT_S = 120.0
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rig")]
+
+
+class Lab:
+    """A rig, a server for its scans, and a browser."""
+
+    def __init__(self, rig: Rig, browser: Browser) -> None:
+        self.rig, self.browser, self.scans = rig, browser, rig.folder / "scans"
+        self.scans.mkdir()
+        self.serve()
+
+    def serve(self) -> None:
+        """Start the server, with a token of its own."""
+        self.server: Program = self.rig.start(
+            "polysight", "serve", self.scans, "--config", self.rig.config, "--port", "0"
+        )
+        self.rig.wait_for(lambda: "token=" in self.server.err, "the server's address")
+        found = re.search(r"(http://127\.0\.0\.1:\d+)/#token=(\S+)", self.server.err)
+        assert found is not None, self.server.err
+        self.address, self.token = found.groups()
+
+    def open(self, path: str, size: tuple[int, int, bool] = DESK) -> None:
+        """Go to a page with the token."""
+        self.browser.size(*size)
+        self.browser.open("about:blank")
+        self.browser.wait("location.href == 'about:blank'", "an empty page")
+        self.browser.errors.clear()
+        self.browser.open(f"{self.address}{path}#token={self.token}")
+        self.browser.wait("document.querySelector('.bar nav a')", "the page")
+
+    def fill(self, **values: Any) -> None:
+        """Type into fields, as a person does."""
+        for field, value in values.items():
+            self.browser.value(
+                f"(() => {{ const f = document.getElementById('{field}'); f.value = {json.dumps(str(value))};"
+                " f.dispatchEvent(new Event('input', {bubbles: true})); })()"
+            )
+
+    def click(self, element: str) -> None:
+        """Press a button that is there."""
+        self.browser.wait(f"document.getElementById('{element}')?.checkVisibility()", f"the button {element}", LIMIT_S)
+        self.browser.wait(f"!document.getElementById('{element}').disabled", f"that {element} can be pressed", LIMIT_S)
+        self.browser.value(f"document.getElementById('{element}').click()")
+
+    def start(self, name: str, **changes: Any) -> Path:
+        """Start a scan from the page; its folder."""
+        self.open("/new")
+        self.browser.wait("document.querySelector('.time')", "the plan", LIMIT_S)
+        self.fill(name=name, **changes)
+        self.click("start")
+        there = "location.pathname == '/watch' && document.getElementById('headline')"
+        self.browser.wait(there, "the live view", LIMIT_S)
+        return self.scans / name
+
+    def wait_headline(self, text: str) -> None:
+        """Until the live view says so."""
+        self.browser.wait(f"document.getElementById('headline')?.innerText == {json.dumps(text)}", text, LIMIT_S)
+
+    def wait_rows(self, folder: Path, rows: int) -> None:
+        """Until so many rows are committed, on the page and on the disk."""
+        self.browser.wait(f"parseInt(document.getElementById('count')?.innerText) >= {rows}", f"{rows} rows", LIMIT_S)
+        assert len(ScanFolder.load(folder).committed()) >= rows
+
+    def ended(self, folder: Path) -> None:
+        """Until the program that the page started has ended; the folder is whole."""
+        self.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
+        assert [f for f in validate(folder) if f.severity == "error"] == []
+        assert self.browser.errors == []
+
+
+def _program(folder: Path) -> Any:
+    found = program_of(folder, "scan")
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    if find_chromium() is None:
+        pytest.skip("no chromium here: sudo apt-get install chromium")
+    folder = tmp_path_factory.mktemp("lab")
+    with Browser(tmp_path_factory.mktemp("browser")) as browser, running(folder, time_scale=3.0, scene=SCENE) as rig:
+        yield Lab(rig, browser)
+
+
+def test_a_scan_is_planned_started_and_shown(lab):
+    lab.open("/new")
+    lab.browser.wait("document.querySelector('.time')", "the plan", LIMIT_S)
+    whole = lab.browser.value("document.querySelector('.time').innerText")
+    lab.fill(rows=5)
+    lab.browser.wait(f"document.querySelector('.time')?.innerText != {json.dumps(whole)}", "the plan of five rows")
+    lab.fill(columns=1999)
+    lab.browser.wait("document.getElementById('start').disabled", "that too long rows are refused", LIMIT_S)
+    assert "travel" in lab.browser.text("forecast")
+    folder = lab.start("first", rows=5, notes="the first one", tags="new, oak")
+    lab.browser.wait("document.getElementById('count')?.innerText == '5 of 5 rows'", "all rows", LIMIT_S)
+    lab.click("to-result")
+    lab.browser.wait("location.pathname == '/scan'", "the result")
+    lab.ended(folder)
+    assert ScanFolder.load(folder).plan.rows == 5
+    lab.open("/")
+    lab.browser.wait("document.querySelectorAll('#list li').length == 1", "the list")
+    said = lab.browser.text("list")
+    assert "first" in said
+    assert "the first one" in said
+    assert "oak" in said
+
+
+def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
+    folder = lab.start("second", rows=ROWS)
+    lab.wait_rows(folder, 1)
+    lab.click("pause")
+    lab.wait_headline("Paused")
+    rows = len(ScanFolder.load(folder).committed())
+    lab.click("continue")
+    lab.wait_rows(folder, rows + 1)
+    lab.click("pause")
+    lab.wait_headline("Paused")
+    lab.click("stop")  # while nothing moves: however slow this machine is, rows are left
+    lab.wait_headline("Stopped on request")
+    lab.ended(folder)
+    stopped = len(ScanFolder.load(folder).committed())
+    assert rows < stopped < ROWS
+    lab.click("resume")
+    lab.wait_rows(folder, stopped + 1)
+    lab.click("abort")
+    lab.browser.value("document.querySelector('#confirm button[value=yes]').click()")
+    lab.wait_headline("Stopped on request")
+    lab.ended(folder)
+
+
+def test_a_scan_outlives_its_server_and_the_next_one_finds_it(lab):
+    folder = lab.start("third", rows=ROWS)
+    lab.wait_rows(folder, 1)
+    before = json.loads((folder / PROGRAM / "scan.json").read_text())
+    lab.server.kill()
+    lab.browser.wait("document.body.classList.contains('lost')", "that the page says so", LIMIT_S)
+    rows = len(ScanFolder.load(folder).committed())
+    lab.rig.wait_for(lambda: len(ScanFolder.load(folder).committed()) > rows, "rows without a server")
+    lab.serve()
+    lab.open("/watch?scan=third", PHONE)
+    lab.wait_headline("All is well")
+    assert json.loads((folder / PROGRAM / "scan.json").read_text()) == before
+    assert _program(folder).running
+    lab.click("pause")
+    lab.wait_headline("Paused")
+    lab.click("stop")
+    lab.wait_headline("Stopped on request")
+    lab.ended(folder)
+
+
+def test_a_scan_has_the_priority_of_a_terminals_not_of_the_servers(lab):
+    folder = lab.start("fourth", rows=ROWS)
+    lab.wait_rows(folder, 1)
+    pid = json.loads((folder / PROGRAM / "scan.json").read_text())["pid"]
+    assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) > os.getpriority(os.PRIO_PROCESS, pid)
+    assert (
+        Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == Path("/proc/self/oom_score_adj").read_text().strip()
+    )
+    lab.open("/new")  # one rig, one scan
+    lab.browser.wait("document.querySelector('.time')", "the plan", LIMIT_S)
+    lab.fill(name="fifth")
+    lab.click("start")
+    lab.browser.wait(
+        "document.getElementById('told').innerText.includes('fourth is being scanned')", "the refusal", LIMIT_S
+    )
+    assert not (lab.scans / "fifth").exists()
+    lab.browser.errors.clear()  # the refused request
+    lab.open("/watch?scan=fourth")
+    lab.click("stop")
+    lab.wait_headline("Stopped on request")
+    lab.ended(folder)
+
+
+def test_the_doctor_is_shown_as_it_looks(lab):
+    lab.open("/new")
+    lab.click("doctor")
+    lab.browser.wait("document.querySelectorAll('#findings li').length > 10", "the first findings", LIMIT_S)
+    lab.browser.wait("/\\d+ ok/.test(document.getElementById('doctor-told').innerText)", "its end", LIMIT_S)
+    assert lab.browser.errors == []
+
+
+def test_a_scan_that_cannot_begin_says_why(lab):
+    lab.rig.pi.end()
+    folder = lab.start("sixth", rows=3)
+    lab.browser.wait("document.getElementById('program-log').innerText.includes('does not answer')", "why", LIMIT_S)
+    assert not (folder / "manifest.jsonl").exists()
+    lab.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
+    assert _program(folder).status not in (0, None)
+    lab.rig.start_pi()
+    lab.open("/")
+    lab.browser.wait("document.getElementById('list').innerText.includes('not begun')", "its state")

@@ -1,0 +1,85 @@
+"""What the operator's page does, as commands."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest
+from polysight.host.catalogue import Notes, read_notes
+from polysight.host.cli.main import main
+from polysight.simulators.scene import load_scene, simulate
+from tests.support.processes import wait_for
+from tests.support.products import judged_products
+from tests.support.rigs import published_rig
+from tests.support.scenes import small_scene
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A folder with a small simulated scan and with made-up products."""
+    (tmp_path / "scene.toml").write_text(small_scene(4, 3))
+    simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scans" / "one")
+    judged_products(tmp_path / "scans" / "two", "good")
+    return tmp_path / "scans"
+
+
+def told(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
+    """What a command prints that works."""
+    capsys.readouterr()
+    assert main([str(word) for word in words]) == 0
+    return capsys.readouterr().out
+
+
+def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
+    told(capsys, "note", root / "one", "--text", "Eiche, zweites Brett", "--tag", "oak", "--tag", "new")
+    assert read_notes(root / "one") == Notes("Eiche, zweites Brett", ("oak", "new"))
+    assert "oak" in told(capsys, "note", root / "one", "--untag", "new")
+    assert read_notes(root / "one").tags == ("oak",)
+    rows = json.loads(told(capsys, "scans", root, "--json"))["scans"]
+    assert {r["name"]: (r["state"], r["bytes"] > 1000) for r in rows} == {
+        "one": ("finished", True),
+        "two": ("products", True),
+    }
+    for words, names in ((["--tag", "oak"], {"one"}), (["--find", "BRETT"], {"one"}), (["--find", "pet"], {"two"})):
+        found = json.loads(told(capsys, "scans", root, "--json", *words))["scans"]
+        assert {r["name"] for r in found} == names
+    assert "2 scans" in told(capsys, "scans", root)
+
+
+def test_a_running_scan_is_asked(root, capsys):
+    stop = StopRequest()
+    with ControlDesk(root / "one", stop) as desk:
+        desk.open()
+        wait_for((root / "one" / CONTROL / ALIVE).exists, "the first sign of life")
+        assert "pause" in told(capsys, "ask", root / "one", "pause")
+        assert stop.paused
+    assert main(["ask", str(root / "one"), "pause"]) == 6
+    assert "polysight resume" in capsys.readouterr().err
+
+
+def test_a_place_and_two_scans_are_told(root, capsys, tmp_path):
+    text = told(capsys, "probe", root / "two", "0,0")
+    assert "|H|" in text
+    assert json.loads(told(capsys, "probe", root / "two", "0,0", "--json"))["referenced"] is True
+    shutil.copytree(root / "two", root / "three")
+    assert "0.0 %" in told(capsys, "compare", root / "two", root / "three", "--png", tmp_path / "d.png")
+    assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads(told(capsys, "compare", root / "two", root / "three", "--json"))["significant_share"] == 0
+
+
+@pytest.mark.parametrize("words", [["probe", "one", "0,0"], ["compare", "one", "two"], ["probe", "two", "900,0"]])
+def test_what_cannot_be_told_is_an_error(root, capsys, words):
+    words = [words[0], *(str(root / w) if "," not in w else w for w in words[1:])]
+    assert main(words) == 3
+    assert "why" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["scans", "nowhere"], ["note", "nowhere"], ["ask", "nowhere", "stop"]])
+def test_folders_that_are_not_there_are_said_to_be_missing(tmp_path, capsys, words):
+    words[1] = str(tmp_path / words[1])
+    assert main(words) == 3
+    assert "does not exist" in capsys.readouterr().err

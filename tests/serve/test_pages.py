@@ -1,0 +1,324 @@
+"""Result, probe, label, library and comparison in a real browser, at a desk's width and at a phone's."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polysight.host.catalogue import read_notes
+from polysight.host.materials import Library, read_labels
+from polysight.host.products import SavedProducts
+from polysight.host.serve.programs import program_of
+from tests.support.page.asking import TOKEN
+from tests.support.page.chromium import DESK, PHONE, Browser
+from tests.support.page.live_view import Served, served_folder
+from tests.support.paths import RIG_FILE
+from tests.support.processes import wait_for
+from tests.support.products import judged_products
+from tests.support.scenes import COPPER, PET
+
+pytestmark = pytest.mark.xdist_group("browser")
+SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
+PAGES = {
+    "/": "document.querySelectorAll('#list li').length == 2",
+    "/scan?scan=one": "document.querySelector('#scale img')?.naturalWidth > 1",
+    "/compare?a=one&b=two": "document.querySelector('#rows tr')",
+    "/new": "document.querySelector('.time')",
+    "/watch?scan=one": "document.querySelectorAll('.view img').length == 6",
+}
+LIMIT_S = 120.0
+
+
+class Page:
+    """A page of a served folder, in a browser."""
+
+    def __init__(self, browser: Browser, view: Served) -> None:
+        self.browser, self.view = browser, view
+
+    def open(self, path: str, size: tuple[int, int, bool] = DESK, token: str = TOKEN) -> None:
+        """Go there, and wait until it shows something."""
+        self.browser.size(*size)
+        self.browser.open("about:blank")
+        self.browser.wait("location.href == 'about:blank'", "an empty page")
+        self.browser.errors.clear()
+        self.browser.requests.clear()
+        self.browser.open(f"{self.view.address}{path}{f'#token={token}' if token else ''}")
+        self.browser.wait(PAGES.get(path, "document.querySelector('.bar')"), path, LIMIT_S)
+
+    def press(self, *keys: str) -> None:
+        """Keys, with the focus where it is."""
+        for key in keys:
+            text = {"text": "\r"} if key == "Enter" else {"text": key} if len(key) == 1 else {}
+            self.browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=key, **CODES.get(key, {}), **text)
+            self.browser.call("Input.dispatchKeyEvent", type="keyUp", key=key, code=key, **CODES.get(key, {}))
+
+    def fill(self, selector: str, text: str) -> None:
+        """Type into a field."""
+        self.browser.value(
+            f"(() => {{ const f = document.querySelector({json.dumps(selector)}); f.value = {json.dumps(text)};"
+            " f.dispatchEvent(new Event('input', {bubbles: true})); })()"
+        )
+
+    def click(self, selector: str) -> None:
+        """Press a button that is shown."""
+        found = f"document.querySelector({json.dumps(selector)})"
+        self.browser.wait(f"{found}?.checkVisibility() && !{found}.disabled", selector, LIMIT_S)
+        self.browser.value(f"{found}.click()")
+
+    def drag(self, x0: float, y0: float, x1: float, y1: float) -> None:
+        """Draw over the image, from one place in mm to another."""
+        points = self.browser.value(
+            "(() => { const c = document.querySelector('canvas.imageview'); c.scrollIntoView({block: 'center'});"
+            " const b = c.getBoundingClientRect(), w = b.width - 62, h = b.height - 46;"
+            " const e = window.extent; const at = (x, y) => [b.left + 46 + (x - e[0]) / (e[1] - e[0]) * w,"
+            f" b.top + 8 + (e[3] - y) / (e[3] - e[2]) * h]; return [at({x0}, {y0}), at({x1}, {y1})]; }})()"
+        )
+        (ax, ay), (bx, by) = points
+        for kind, x, y in (
+            ("mousePressed", ax, ay),
+            ("mouseMoved", (ax + bx) / 2, by),
+            ("mouseMoved", bx, by),
+            ("mouseReleased", bx, by),
+        ):
+            self.browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def whole(self) -> None:
+        """Nothing sticks out to the side, nothing is wrong, nothing came from elsewhere."""
+        assert self.browser.value("document.documentElement.scrollWidth <= innerWidth")
+        assert self.browser.errors == []
+        own = (self.view.address, "about:", "blob:")
+        assert all(url.startswith(own) for url in self.browser.requests), self.browser.requests
+
+
+CODES: dict[str, dict[str, Any]] = {
+    key: {"windowsVirtualKeyCode": code}
+    for key, code in {"Tab": 9, "Enter": 13, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}.items()
+}
+
+
+@pytest.fixture
+def scans(processed: Path, tmp_path: Path) -> Path:
+    shutil.copytree(processed, tmp_path / "scans")
+    return tmp_path / "scans"
+
+
+@pytest.fixture
+def page(browser: Browser, scans: Path) -> Iterator[Page]:
+    with served_folder(scans, TOKEN, config=RIG_FILE) as view:
+        yield Page(browser, view)
+
+
+CONTRAST = """(() => {
+  const parse = (c) => {
+    const m = c.match(/[\\d.]+/g).map(Number), wide = c.startsWith('color(');
+    return [...m.slice(0, 3).map((v) => (wide ? v * 255 : v)), m[3] ?? 1];
+  };
+  const over = (a, b) => a.slice(0, 3).map((v, i) => v * a[3] + b[i] * (1 - a[3]));
+  const linear = (v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  const light = (c) => c.reduce((sum, v, i) => sum + [0.2126, 0.7152, 0.0722][i] * linear(v / 255), 0);
+  const behind = (n) => {
+    const stack = [];
+    for (; n; n = n.parentElement) stack.push(parse(getComputedStyle(n).backgroundColor));
+    return stack.reverse().reduce((ground, c) => over(c, ground), [255, 255, 255]);
+  };
+  const bad = [];
+  for (const n of document.querySelectorAll('body *')) {
+    const own = [...n.childNodes].some((c) => c.nodeType === 3 && c.textContent.trim());
+    if (!own || !n.checkVisibility() || n.closest('svg, noscript, option, .view, .skip, :disabled')) continue;
+    const s = getComputedStyle(n), ground = behind(n), size = parseFloat(s.fontSize);
+    const [a, b] = [light(over(parse(s.color), ground)), light(ground)].sort((x, y) => y - x);
+    const least = size >= 24 || (size >= 18.66 && +s.fontWeight >= 700) ? 3 : 4.5;
+    if ((a + 0.05) / (b + 0.05) < least) bad.push([n.tagName, n.textContent.trim().slice(0, 30), a, b]);
+  }
+  return bad;
+})()"""
+"""Texts whose contrast is below AA of WCAG 2.1 (1.4.3)."""
+
+NAMELESS = """[...document.querySelectorAll('button, a[href], input, select, textarea')]
+  .filter((n) => n.checkVisibility() && !(n.getAttribute('aria-label') || n.textContent.trim() || n.labels?.length))
+  .map((n) => n.outerHTML.slice(0, 80))"""
+"""What can be used and has no name for who cannot see it."""
+
+
+@SIZES
+@pytest.mark.parametrize("path", PAGES)
+def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
+    for dark in (False, True):
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        page.browser.call("Emulation.setEmulatedMedia", features=[scheme])
+        page.open(path, size)
+        page.whole()
+        assert page.browser.value(CONTRAST) == []  # WCAG AA
+        assert page.browser.value(NAMELESS) == []
+        assert page.browser.value("document.querySelectorAll('h1').length") == 1
+        page.browser.screenshot(tmp_path / "page.png")
+        assert (tmp_path / "page.png").stat().st_size > 15_000
+    page.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+
+
+def test_the_list_is_searched_and_two_are_compared(page):
+    page.open("/")
+    page.fill("#find", "tw")
+    page.browser.wait("document.querySelectorAll('#list li').length == 1", "the search")
+    page.fill("#find", "")
+    page.browser.wait("document.querySelectorAll('#list li').length == 2", "all of them")
+    for k in (0, 1):
+        page.browser.value(f"document.querySelectorAll('#list input')[{k}].click()")
+    page.click("#compare")
+    page.browser.wait(
+        "location.pathname == '/compare' && document.querySelector('#rows tr')", "the comparison", LIMIT_S
+    )
+    for how in ("pair", "difference", "swipe"):
+        page.click(f"button[value={how}]")
+        page.browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", how, LIMIT_S)
+        page.whole()
+    assert "% of" in page.browser.text("share")
+
+
+def test_a_place_is_probed_by_keyboard_alone(page):
+    page.open("/scan?scan=one")
+    for _ in range(60):
+        if page.browser.value("document.activeElement?.className == 'imageview'"):
+            break
+        page.press("Tab")
+    assert page.browser.value("document.activeElement.className") == "imageview"
+    for _ in range(int(PET["centre_mm"][0] / 2)):
+        page.press("ArrowRight")
+    for _ in range(int(-PET["centre_mm"][1] / 2)):
+        page.press("ArrowDown")
+    page.press("Enter")
+    page.browser.wait("document.querySelectorAll('#probe-facts dt').length > 5", "the probe", LIMIT_S)
+    said = page.browser.text("probe-facts")
+    assert "± " in said
+    assert "PET" in said
+    assert page.browser.value("document.querySelectorAll('#profile path').length") == 2
+    page.press("+", "+")
+    page.browser.wait("document.querySelector('tr.here')", "its row in the table")
+    page.whole()
+
+
+def test_what_is_named_to_harm_is_shown_as_text(page, scans):
+    evil = "<img src=x onerror=\"document.title='broken'\">"
+    products = scans / "one" / "products"
+    told = json.loads((products / "materials.json").read_text())
+    for segment in told["segments"]:
+        segment["name"], segment["why"] = evil, evil
+    told["metal_reference"]["how"] = evil
+    (products / "materials.json").write_text(json.dumps(told))
+    (scans / "one" / "operator.json").write_text(json.dumps({"notes": evil, "tags": [evil[:40]]}))
+    shutil.move(scans / "two", scans / "<b onclick=x>two")
+    page.open("/")
+    page.whole()
+    assert evil in page.browser.text("list")
+    page.open("/scan?scan=one")
+    page.whole()
+    assert page.browser.value("document.querySelectorAll('[onerror], [onclick]').length") == 0
+    assert "broken" not in page.browser.value("document.title")
+    page.open("/compare?a=one&b=%3Cb+onclick%3Dx%3Etwo")
+    page.browser.wait("document.querySelector('#rows tr')", "the comparison", LIMIT_S)
+    page.whole()
+
+
+def test_notes_are_kept_beside_the_scan(page, scans):
+    page.open("/scan?scan=one")
+    page.fill("#notes-text", "Eiche, zweites Brett")
+    page.fill("#tags", "oak, 木")
+    page.click("#save-notes")
+    page.browser.wait("document.getElementById('notes-told').innerText == 'Saved.'", "that it is saved")
+    assert read_notes(scans / "one").tags == ("oak", "木")
+    page.open("/")
+    page.fill("#find", "brett")
+    page.browser.wait("document.querySelectorAll('#list li').length == 1", "the search finds it")
+
+
+def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, scans):
+    page.open("/scan?scan=one", token="")
+    page.browser.value("localStorage.clear()")
+    page.open("/scan?scan=one", token="wrong")
+    page.browser.wait("document.getElementById('token-bar')", "that it asks")
+    page.fill("#notes-text", "not mine")
+    page.click("#save-notes")
+    page.browser.wait("document.getElementById('notes-told').innerText.includes('token')", "the refusal")
+    assert read_notes(scans / "one").notes == ""
+    page.fill("#token-field", f"http://127.0.0.1/#token={TOKEN}")
+    page.browser.value("document.querySelector('#token-bar button').click()")
+    page.browser.wait(
+        "!document.getElementById('token-bar') && document.getElementById('name')?.innerText", "the page anew"
+    )
+    page.fill("#notes-text", "mine")
+    page.click("#save-notes")
+    wait_for(lambda: read_notes(scans / "one").notes == "mine", "the notes")
+
+
+def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
+    with served_folder(scans) as view:
+        page = Page(browser, view)
+        for path in ("/", "/scan?scan=one"):
+            page.open(path, token="")
+            page.whole()
+            shown = "[...document.querySelectorAll('button')].filter(b => b.checkVisibility()).map(b => b.innerText)"
+            asking = {"Label", "Process again", "Resume", "Save", "Write", "Make a library", "Start the scan"}
+            assert not asking & set(browser.value(shown))
+
+
+@pytest.mark.slow
+def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
+    """Label both scans, process one with its boxes, train on both, and name with that library."""
+    for name in ("one", "two"):
+        page.open(f"/scan?scan={name}")
+        page.browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", "the image", LIMIT_S)
+        extent = page.browser.value(f"fetch('/api/result?scan={name}').then(r => r.json()).then(r => r.extent_mm)")
+        page.browser.value(f"window.extent = {json.dumps(extent)}")
+        page.click("#label-open")
+        for k, (plate, called) in enumerate(((COPPER, "copper"), (PET, "my plastic"))):
+            x, y = plate["centre_mm"]
+            page.drag(x - 12, y - 12, x + 12, y + 12)
+            page.browser.wait(f"document.querySelectorAll('#boxes li').length == {k + 1}", "the box")
+            page.fill("#boxes li:last-child input", called)
+        page.browser.value("document.querySelector('#boxes input[type=radio]').click()")
+        page.click("#save-labels")
+        page.browser.wait(
+            "document.getElementById('label-told').innerText.startsWith('Saved')", "that it is saved", LIMIT_S
+        )
+        labels = read_labels(scans / name / "labels.json")
+        assert labels.metal == "copper"
+        assert labels.boxes["my plastic"] == pytest.approx([28, -22, 52, 2], abs=1.5)
+        page.whole()
+    page.open("/")
+    page.browser.value("document.querySelectorAll('#list input').forEach(i => i.click())")
+    page.click("#train-open")
+    page.fill("#train-name", "mine")
+    page.click("#train button")
+    page.browser.wait(
+        "document.getElementById('train-told').innerText == 'The library is made.'", "the library", LIMIT_S
+    )
+    assert Library.load(scans / "libraries" / "mine.npz").names == ("copper", "my plastic")
+    page.open("/scan?scan=one")
+    page.click("#process-open")
+    page.browser.value("document.getElementById('library').value = 'mine'")
+    page.click("#process button")
+    page.browser.wait("document.getElementById('rows').innerText.includes('my plastic')", "the new name", LIMIT_S)
+    found = program_of(scans / "one", "process")
+    assert found is not None
+    assert "--labels" in found.words
+    named = [s["name"] for s in SavedProducts(scans / "one" / "products").segments if not s["metal_reference"]]
+    assert named == ["my plastic"]
+    page.whole()
+
+
+def test_two_hundred_scans_are_shown_at_once(browser, tmp_path):
+    judged_products(tmp_path / "made", "care")
+    for k in range(200):
+        shutil.copytree(tmp_path / "made", tmp_path / "scans" / f"week-{k % 10}" / f"scan-{k:03d}")
+    with served_folder(tmp_path / "scans") as view:
+        page = Page(browser, view)
+        page.open("/?all", token="")
+        browser.wait("document.querySelectorAll('#list li').length == 200", "all of them")
+        page.whole()
+        drawn = [url for url in browser.requests if "thumbnail" in url]
+        assert len(drawn) < 100  # pictures come as they are scrolled to

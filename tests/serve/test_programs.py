@@ -1,0 +1,135 @@
+"""Programs that a page starts: found again by another server, never signalled, and told from others."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from polysight.host.catalogue import PROGRAM
+from polysight.host.jobs.live_scan import _check_new
+from polysight.host.serve import launcher
+from polysight.host.serve.programs import Programs, program_of
+from polysight.host.store import validate
+from polysight.shared.errors import ConfigError, ScanError
+from tests.support.page.asking import TOKEN, get, post
+from tests.support.page.live_view import served_folder
+from tests.support.paths import RIG_FILE
+from tests.support.processes import wait_for
+
+
+@pytest.fixture
+def programs() -> Iterator[Programs]:
+    made = Programs()
+    yield made
+    made.close()
+
+
+def ended(folder: Path, kind: str) -> None:
+    wait_for(lambda: not (program_of(folder, kind) or pytest.fail("none")).running, "its end")
+
+
+def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
+    programs.start(tmp_path, "export", ["--version"])
+    ended(tmp_path, "export")
+    wait_for(lambda: program_of(tmp_path, "export").status is not None, "its status")
+    found = program_of(tmp_path, "export")
+    assert (found.status, found.words, found.log.split()[0]) == (0, ("polysight", "--version"), "polysight")
+    programs.start(tmp_path, "export", ["validate", tmp_path])
+    wait_for(lambda: program_of(tmp_path, "export").status is not None, "its status")
+    found = program_of(tmp_path, "export")
+    assert found.status == 3
+    assert "why:" in found.log
+    assert "--version" not in found.log  # the log of the earlier one stays in the file
+
+
+def test_a_program_is_known_by_its_number_and_its_begin(tmp_path):
+    child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
+    try:
+        found = program_of(tmp_path, "scan")
+        assert found is not None
+        assert found.running
+        told = json.loads((tmp_path / PROGRAM / "scan.json").read_text())
+        (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(told | {"ticks": told["ticks"] - 1}))
+        assert not program_of(tmp_path, "scan").running  # another process has the number now
+    finally:
+        os.killpg(child.pid, 9)
+        child.wait()
+
+
+def test_one_program_of_a_kind_runs_in_a_folder(programs, tmp_path):
+    child = launcher.launch(["/bin/sleep", "60"], str(tmp_path), str(tmp_path / PROGRAM / "scan"))
+    try:
+        with pytest.raises(ScanError, match="runs already"):
+            programs.start(tmp_path, "scan", ["--version"])
+    finally:
+        os.killpg(child.pid, 9)
+        child.wait()
+    assert program_of(tmp_path, "scan").status is None  # killed: it could not say
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"[]", b"{}", b'{"pid":1,"ticks":"x"}', b"\xff", b'{"pid":-1,"ticks":0,"words":[],"started_utc":""}'],
+)
+def test_a_made_up_number_is_no_program_that_runs(tmp_path, content):
+    (tmp_path / PROGRAM).mkdir()
+    (tmp_path / PROGRAM / "scan.json").write_bytes(content)
+    found = program_of(tmp_path, "scan")
+    assert found is None or not found.running
+
+
+def test_a_log_is_shown_without_what_moves_a_terminal(tmp_path):
+    (tmp_path / PROGRAM).mkdir()
+    told = {"pid": 0, "ticks": 0, "words": ["x"], "started_utc": ""}
+    (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(told))
+    (tmp_path / PROGRAM / "scan.log").write_bytes(b"--- t x\n\x1b[31mred\x1b[0m\x07 \xe2\x80\xaeback\xff\n")
+    assert program_of(tmp_path, "scan").log == "red back\ufffd"
+
+
+def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
+    (tmp_path / PROGRAM).mkdir()
+    (tmp_path / "operator.json").write_text("{}")
+    _check_new(tmp_path)
+    (tmp_path / "something").touch()
+    with pytest.raises(ConfigError):
+        _check_new(tmp_path)
+
+
+def test_a_scan_starts_with_its_plan_and_without_a_pi_says_why(tmp_path):
+    with served_folder(tmp_path, TOKEN, config=RIG_FILE) as view:
+        wrong = [
+            {"name": "a"} | more for more in ({"rows": 0}, {"x": 1}, {"columns": 1999}, {"rows": 3, "library": "no"})
+        ]
+        for body, status in [({"name": "../out"}, 404), ({"name": ".hidden"}, 404), *((body, 400) for body in wrong)]:
+            assert post(view, "/api/start", body)[0] == status, body
+        assert [p.name for p in tmp_path.iterdir()] == []
+        assert post(view, "/api/start", {"name": "week/one", "rows": 3, "notes": "n", "tags": ["t"]})[0] == 200
+        folder = tmp_path / "week" / "one"
+        rig = tomllib.loads((folder / PROGRAM / "instrument.toml").read_text())
+        assert rig["grid"]["rows"] == 3
+        assert get(view, "/api/scan?scan=week/one")["state"] == "begun"
+        assert post(view, "/api/start", {"name": "two"})[0] == 409  # one rig
+        assert not (tmp_path / "two").exists()
+        ended(folder, "scan")
+        wait_for(lambda: program_of(folder, "scan").status is not None, "its status")
+        assert program_of(folder, "scan").status != 0
+        assert get(view, "/api/scans")["scans"][0]["tags"] == ["t"]
+        assert post(view, "/api/start", {"name": "week/one"})[0] == 200  # once more, by the same name
+        assert get(view, "/api/scan?scan=week/one")["notes"] == "n"
+        ended(folder, "scan")
+
+
+def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "one")
+    before = validate(tmp_path / "one")
+    (tmp_path / "one" / PROGRAM).mkdir()
+    (tmp_path / "one" / PROGRAM / "scan.log").touch()
+    (tmp_path / "one" / "operator.json").write_text('{"notes": "", "tags": []}')
+    (tmp_path / "one" / "export").mkdir()
+    assert validate(tmp_path / "one") == before

@@ -88,7 +88,7 @@ def joined(words: Sequence[str]) -> list[str]:
 def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
     """`--model`: which classifier; `none`: whether naming can be left out."""
     names = ["knn", "discriminant", *(["none"] if none else [])]
-    told = "classifier instead of the one that was chosen for the library by leaving scans out; knn is the paper's"
+    told = "classifier to use instead of the discriminant; knn is the paper's"
     sub.add_argument("--model", choices=names, help=told + ("; none names nothing" if none else ""))
 
 

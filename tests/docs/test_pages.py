@@ -11,6 +11,7 @@ from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
 from polysight.host.materials import check_labels, read_labels
 from polysight.host.radar.usb import PRODUCT, VENDOR
+from polysight.host.verdict import NoResult
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import EXPLANATIONS, PiFault
 
@@ -31,7 +32,7 @@ def test_fault_numbers_and_exit_statuses_are_told():
     for fault in PiFault:
         e = EXPLANATIONS[fault]
         assert f"| {int(fault)} | {e.what} | {e.why} | {e.remedy} |" in text
-    kinds = {PolysightError, *PolysightError.__subclasses__()}
+    kinds = {PolysightError, NoResult, *PolysightError.__subclasses__()}
     told = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
     assert {kind.exit_status for kind in kinds} | {0, 130} == told
 

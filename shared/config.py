@@ -41,17 +41,21 @@ class Chirp(Section, frozen=True):
         window_us = self.samples / self.sample_rate_hz * 1e6
         require(
             self.adc_start_us + window_us <= self.ramp_end_us,
-            f"ADC window {self.adc_start_us} + {window_us:.2f} us must end inside the ramp of {self.ramp_end_us} us",
+            f"adc_start_us = {self.adc_start_us} and samples / sample_rate_hz = {window_us:.2f} us"
+            f" must end inside the ramp, ramp_end_us = {self.ramp_end_us}",
         )
         top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
-        require(self.start_hz >= 76e9 and top <= 81.1e9, f"sweep {self.start_hz:.4g}..{top:.5g} Hz must be 76..81 GHz")
+        require(
+            self.start_hz >= 76e9 and top <= 81.1e9,
+            f"{self.start_hz:.4g}..{top:.5g} Hz, of start_hz, slope_hz_per_s and ramp_end_us, must be 76..81 GHz",
+        )
         none = " or 0: no filter, which only simulated rigs can have"
         require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
         require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
         a, b = self.linear_samples
         require(
             a >= 0 and a + 12 <= b <= self.samples,
-            f"linear_samples must be a range of 12 samples or more inside 0..{self.samples}",
+            f"linear_samples = [{a}, {b}] must be a range of 12 or more inside 0..samples = {self.samples}",
         )
 
     @property
@@ -301,7 +305,7 @@ class Instrument(Section, frozen=True):
             self.radar.control != "native" or set(self.radar.native) == set(names),
             f'radar.control = "native" needs radar.native for each of the boards {names}, not {[*self.radar.native]}',
         )
-        require(self.transmitter.tx_antenna < len(self.antennas.tx_mm), "tx_antenna is not one of antennas.tx_mm")
+        require(self.transmitter.tx_antenna < len(self.antennas.tx_mm), "boards.tx_antenna is none of antennas.tx_mm")
         misfit = self.stage.misfit(self.grid)
         require(not misfit, misfit)
 

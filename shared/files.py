@@ -6,6 +6,8 @@ import errno
 import json
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -59,6 +61,17 @@ def parse_json(raw: bytes) -> Any:
         return json.loads(raw.decode("utf-8"))
     except RecursionError:
         raise ValueError("nested too deeply") from None
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Within the block, an OSError that names no file (a full disk, while bytes are written) names this one."""
+    try:
+        yield
+    except OSError as e:
+        if e.filename is None:
+            e.filename = str(path)
+        raise
 
 
 def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:

@@ -129,9 +129,10 @@ class Stage(Section, frozen=True):
             half = (n - 1) / 2 * step + margin
             if half > centre or centre + half > travel:
                 return (
-                    f"grid of {n} x {step} mm in {axis} with {margin:g} mm of run-up on either side does not fit the"
-                    f" travel 0..{travel} mm around centre {centre} mm: narrow the grid, slow down, or raise"
-                    " accel_mm_s2"
+                    f"grid.{'columns' if axis == 'x' else 'rows'} = {n} of grid.step_{axis}_mm = {step}"
+                    f" with {margin:g} mm of run-up on either side do not fit stage.travel_{axis}_mm = {travel} around"
+                    f" stage.centre_{axis}_mm = {centre}: narrow the grid, lower stage.speed_mm_s, or raise"
+                    " stage.accel_mm_s2"
                 )
         return ""
 

@@ -61,13 +61,13 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         rule, _, path = str(e).partition(" - at `")
         path = path.rstrip("`") or "$"
         value = _lookup(raw, path)
-        key = path.removeprefix("$").lstrip(".") or "(top level)"
+        key = path.removeprefix("$").lstrip(".")
         if unknown := re.search(r"unknown field `(.*)`", rule):
             rule = f"no key {unknown[1]!r}: {_likelier(unknown[1], kind)}"
         raise ConfigError(
-            f"{source}: {key}{' = ' + value if value else ''}: {rule}",
+            f"{source}: {key}{' = ' + value if value else ''}{': ' if key else ''}{rule}",
             "the file does not follow its declaration",
-            f"correct {key} in {source}; {keys or _RIG_KEYS}",
+            f"correct {key or 'that'} in {source}; {keys or _RIG_KEYS}",
         ) from None
 
 

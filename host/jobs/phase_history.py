@@ -43,6 +43,8 @@ def export_cphd(folder: Path, out: Path | None) -> int:
             "a phase history is made of the rows, not of the images",
             "give the scan folder itself",
         )
+    sys.stderr.write(f"writing {FILE}: rows of {scan} ...\n")
+    sys.stderr.flush()
     pipeline = all_rows(open_source(scan, None, dropped=True), scan)
     file = export_folder(folder, out) / FILE
     write_cphd(file, phase_history(pipeline))

@@ -279,9 +279,11 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     out.mkdir(parents=True, exist_ok=True)
     pipeline = all_rows(source, data, max(depth_mm / 1e3, PLANE_REACH_M))
     builder = pipeline.images
+    _say("images, and the plane of the plates")
     images = pipeline.form_images()
     pipeline.place_plane(images, move=False)
     plates = pipeline.plane
+    _say("the plane at which the image is sharpest")
     found = focus_sweep(builder, depth_m=depth_mm / 1e3)
     depth_m = plates.offset_m if plates.known else found.depth_mm / 1e3
     grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
@@ -296,6 +298,12 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     sys.stdout.write("".join(f"{line}\n" for line in _focus_lines(head, at, found, plates)))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
+
+
+def _say(step: str) -> None:
+    """What is being done for the next seconds."""
+    sys.stderr.write(f"{step} ...\n")
+    sys.stderr.flush()
 
 
 def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstimate) -> list[str]:
@@ -339,6 +347,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     for board in rig.receivers:
         setup = BoardSetup.of(rig, board, model=calibration.high_pass(board.name))
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
+        _say(f"rows of {board.name}")
         for row in source.rows():
             recorded = source.read_row(board.name, row)
             words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples)

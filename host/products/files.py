@@ -28,7 +28,7 @@ from polysight.host.store import Scan, open_npz, versions
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
 from polysight.shared.errors import ConfigError, DataError, no_such
-from polysight.shared.files import open_to_write, read_json
+from polysight.shared.files import named, open_to_write, read_json
 from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
@@ -55,7 +55,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     """Write a file under a temporary name beside it, flush it to disk, then take its place."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
-    with open_to_write(part) as f:
+    with named(path), open_to_write(part) as f:
         f.write(data)
         f.flush()
         os.fsync(f.fileno())

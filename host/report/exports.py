@@ -253,7 +253,7 @@ def export_folder(folder: Path, out: Path | None) -> Path:
 
 
 def export(folder: Path, formats: list[str], out: Path | None) -> int:
-    """Write the formats asked for; prints each file.
+    """Write the formats asked for; prints each file when it is there, and on stderr which one is being made.
 
     Raises
     ------
@@ -274,10 +274,11 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             "polysight process names them",
         )
     out = export_folder(products.folder, out)
-    written: list[Path] = []
     for kind in formats:
+        sys.stderr.write(f"writing {kind} ...\n")
+        sys.stderr.flush()
         if kind == "png":
-            written += write_pngs(out, products)
+            _print(write_pngs(out, products))
             continue
         writer, name = {
             "hdf5": (write_hdf5, "image.h5"),
@@ -287,6 +288,10 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             "csv": (write_csv, "materials.csv"),
         }[kind]
         writer(out / name, products)
-        written.append(out / name)
-    sys.stdout.write("".join(f"{path}\n" for path in written))
+        _print([out / name])
     return 0
+
+
+def _print(paths: list[Path]) -> None:
+    sys.stdout.write("".join(f"{path}\n" for path in paths))
+    sys.stdout.flush()

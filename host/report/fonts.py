@@ -5,6 +5,7 @@ Matplotlib's own font has no Chinese, Japanese or Korean. The page names everyth
 
 from __future__ import annotations
 
+import unicodedata
 from functools import cache
 
 from matplotlib.font_manager import findfont, fontManager, get_font
@@ -34,7 +35,12 @@ def _glyphs() -> frozenset[int]:
 
 
 def is_drawable(text: str) -> bool:
-    """True if the installed fonts have every glyph of a text."""
+    """True if the installed fonts have every glyph of a text, and it runs from left to right.
+
+    Matplotlib neither turns right-to-left text nor joins its letters: Hebrew would be read backwards.
+    """
+    if any(unicodedata.bidirectional(character) in ("R", "AL") for character in text):
+        return False
     return all(character == "\n" or ord(character) in _glyphs() for character in text)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
+from polysight.shared.files import named
 from polysight.shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_kept
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s
 from polysight.shared.tables import to_builtins
@@ -124,7 +125,8 @@ class OwnLayout:
             raw = blank(payload, gaps[name])
             file = Path("raw") / name / f"{row.index:04d}.bin"
             (self._path / file).parent.mkdir(parents=True, exist_ok=True)
-            (self._path / file).write_bytes(raw)
+            with named(self._path / file):
+                (self._path / file).write_bytes(raw)
             missing = sum(stop - start for start, stop in gaps[name])
             partial = {
                 f for a, b in gaps[name] for f in range(a // self._rig.frame_bytes, -(-b // self._rig.frame_bytes))
@@ -161,12 +163,14 @@ class OwnLayout:
         plain = json.dumps(record, sort_keys=True, separators=(",", ":"))
         record["crc"] = f"{crc32(plain.encode()):08x}"
         line = json.dumps(record, sort_keys=True, separators=(",", ":"))
-        with (self._path / "manifest.jsonl").open("a", encoding="utf-8") as f:
+        path = self._path / "manifest.jsonl"
+        with named(path), path.open("a", encoding="utf-8") as f:
             f.write(line + "\n")
         self._lines, self._digest = self._lines + 1, sha256(line.encode()).hexdigest()[:16]
 
     def _event(self, *events: AnyEvent) -> None:
-        with (self._path / "events.msgpack").open("ab") as f:
+        path = self._path / "events.msgpack"
+        with named(path), path.open("ab") as f:
             f.write(b"".join(map(pack_kept, events)))
 
     def _stamp(self) -> dict[str, Any]:

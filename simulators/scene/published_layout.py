@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.shared.config import Board, Instrument
+from polysight.shared.files import named
 from polysight.shared.raster import Row
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from polysight.simulators.scene.cubes import reference_cube
@@ -87,7 +88,8 @@ class AuthorsLayout:
                 kept = [raw[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True)]
             else:
                 kept = [raw]
-            (folder / f"{stem}.bin").write_bytes(b"".join(kept))
+            with named(folder / f"{stem}.bin"):
+                (folder / f"{stem}.bin").write_bytes(b"".join(kept))
             (folder / f"{stem}_log.csv").write_text(self._log(len(raw), lost, points, step_s), encoding="ascii")
         self._now_s += row.points * step_s + LATE_S + 2.0
 

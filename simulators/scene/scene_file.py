@@ -293,7 +293,8 @@ def apply_scene(rig: Instrument, scene: Scene) -> Instrument:
     if not scene.disturbances.hpf:
         table["chirp"] = {**table["chirp"], "hpf1_khz": 0.0, "hpf2_khz": 0.0}
     table["polarimetry"] = {**table["polarimetry"], **_known_leakage(scene)}
-    return decode(table, Instrument, f"{rig.name} with scene {scene.name}")
+    told = f"its {', '.join(_OVERRIDES)} change the rig file's; docs/spec/scene-file.md names all keys"
+    return decode(table, Instrument, f"scene {scene.name}", told)
 
 
 def _known_leakage(scene: Scene) -> dict[str, Any]:

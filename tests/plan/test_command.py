@@ -35,7 +35,7 @@ def test_a_plan_that_would_be_refused_says_so_and_fails(capsys):
 
 def test_what_breaks_the_rig_file_is_one_message(capsys):
     assert main(["plan", *RIG, "--width-mm", "5000"]) == 2
-    assert "does not fit the travel" in capsys.readouterr().err
+    assert "do not fit stage.travel_x_mm" in capsys.readouterr().err
 
 
 def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):

@@ -27,7 +27,7 @@ def test_a_new_step_keeps_the_aperture(rig):
 
 
 def test_a_plan_that_breaks_a_rule_names_it(rig):
-    with pytest.raises(ConfigError, match="does not fit the travel"):
+    with pytest.raises(ConfigError, match="do not fit stage"):
         Changes(width_mm=900.0).apply(rig)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -16,8 +18,8 @@ from polysight.host.imaging.images import sub_bands
 from polysight.host.materials import parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
 from polysight.host.products import write_json
-from polysight.host.products.files import MATERIALS, SavedProducts, read_products
-from polysight.shared.errors import DataError
+from polysight.host.products.files import MATERIALS, SavedProducts, read_products, write_atomically
+from polysight.shared.errors import DataError, os_error
 from polysight.shared.tables import to_builtins
 from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
@@ -109,3 +111,13 @@ def test_what_is_missing_is_named(tmp_path):
     assert "polysight process" in e.value.remedy
     assert SavedProducts(tmp_path).materials == {}
     assert SavedProducts(tmp_path).chirp is None
+
+
+def test_a_full_disk_is_told_with_the_path(tmp_path, monkeypatch):
+    def full(_fd: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space") as e:
+        write_atomically(tmp_path / "image.npz", b"1")
+    assert str(tmp_path) in str(os_error(e.value))

@@ -90,3 +90,10 @@ def test_an_installed_font_that_has_the_glyph_draws_the_name(monkeypatch):
     finally:
         for cached in caches:
             cached.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "name", ["\u05e0\u05d7\u05d5\u05e9\u05ea", "\u0646\u062d\u0627\u0633"], ids=["Hebrew", "Arabic"]
+)
+def test_a_name_that_runs_from_right_to_left_is_not_drawn_backwards(name):
+    assert figure_label(name, "patch 3").startswith("patch 3: ")

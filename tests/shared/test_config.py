@@ -10,6 +10,7 @@ from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.tables import decode, read_toml, to_builtins
+from tests.support.rigs import rig_with
 
 RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
 
@@ -55,7 +56,7 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
         ("pi", "sync_out", [22, 23], "drives exactly one line"),
         ("pi", "trigger_bias", "up", "pi.trigger_bias = 'up'"),
         ("pi", "trigger_debounce_us", 10, "swallows every trigger"),
-        ("grid", "columns", 4000, "does not fit the travel"),
+        ("grid", "columns", 4000, "do not fit stage.travel_x_mm"),
         ("grid", "rows", 0, "grid.rows = 0"),
         ("stage", "accel_mm_s2", -1.0, "accel_mm_s2 = -1.0"),
     ],
@@ -89,3 +90,20 @@ def test_missing_file_bad_toml_and_binary_are_refused(tmp_path: Path):
     bad.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="cannot be read"):
         load_instrument(bad)
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value", "named"),
+    [
+        ("chirp", "ramp_end_us", 10.0, ["adc_start_us", "sample_rate_hz", "ramp_end_us"]),
+        ("chirp", "slope_hz_per_s", 1e14, ["start_hz", "slope_hz_per_s"]),
+        ("chirp", "linear_samples", [0, 5], ["linear_samples", "samples"]),
+        ("grid", "columns", 9000, ["grid.columns", "grid.step_x_mm", "stage.travel_x_mm", "stage.centre_x_mm"]),
+        ("stage", "speed_mm_s", 900.0, ["grid.columns", "stage.speed_mm_s", "stage.accel_mm_s2"]),
+    ],
+)
+def test_a_rule_between_keys_names_all_of_them(table, key, value, named):
+    with pytest.raises(ConfigError) as e:
+        rig_with(**{table: {key: value}})
+    assert all(name in e.value.what for name in named)
+    assert "top level" not in str(e.value)

@@ -114,3 +114,12 @@ def test_the_library_never_holds_the_demo_scan() -> None:
     for s in library:
         assert {p.name: (p.permittivity, p.metal) for p in s.plates} == materials
         assert not {p.centre_mm for p in s.plates} & {p.centre_mm for p in demo.plates}
+
+
+def test_an_error_in_a_scenes_tables_names_the_scene_and_its_key(rig: Instrument) -> None:
+    scene = decode_scene({"name": "wide", "grid": {"columns": 1.5}, "points": []}, "wide.toml")
+    with pytest.raises(ConfigError) as e:
+        apply_scene(rig, scene)
+    assert "scene wide: grid.columns = 1.5" in str(e.value)
+    assert "scene-file.md" in str(e.value)
+    assert "instrument.toml" not in str(e.value)

@@ -254,7 +254,8 @@ def test_a_stage_that_is_plugged_in_after_the_service_has_started_is_found(bench
 
 def test_update_and_roll_back(pi: InstalledPi):
     """Rig file, keys and journals stay; a service that runs goes on with the release that is in use."""
-    kept = "sudo sh -c 'sha256sum /etc/polysight/instrument.toml /etc/polysight/keys/* /var/lib/polysight/journal/*'"
+    files = "/etc/polysight/instrument.toml /etc/polysight/keys/* /var/lib/polysight/journal/*.journal"
+    kept = f"sudo sh -c 'sha256sum {files}'"
     before, first = pi.box.run(kept), pid_of(pi)
     begun = time.monotonic()
     pi.install()

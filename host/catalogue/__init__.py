@@ -6,7 +6,7 @@ a scan. `result_of` says what a processed scan shows, `draw_products` draws it, 
 """
 
 from polysight.host.catalogue.compare import DIFFERENCE, Comparison, compare, draw_comparison
-from polysight.host.catalogue.notes import NOTES, Notes, read_notes, write_notes
+from polysight.host.catalogue.notes import NOTES, Notes, is_plain, read_notes, write_notes
 from polysight.host.catalogue.pictures import (
     AMPLITUDE,
     MAPS,
@@ -43,6 +43,7 @@ __all__ = [
     "draw_products",
     "files_of",
     "folder_bytes",
+    "is_plain",
     "probe",
     "read_notes",
     "result_of",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import stat
 import unicodedata
 from pathlib import Path
 
@@ -32,6 +33,8 @@ def read_notes(folder: Path) -> Notes:
         when the file is damaged.
     """
     path = folder / NOTES
+    if not is_plain(path):
+        return Notes()
     try:
         with path.open("rb") as f:
             raw = f.read(_MOST_BYTES + 1)
@@ -42,6 +45,14 @@ def read_notes(folder: Path) -> Notes:
         raise DataError(
             f"{path}: cannot be read: {e}", "it was edited or damaged", "correct it, or remove it"
         ) from None
+
+
+def is_plain(path: Path) -> bool:
+    """Whether there is a regular file at a path: no link, and no pipe at which a reader would wait for ever."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def write_notes(folder: Path, notes: Notes) -> Notes:
@@ -63,6 +74,7 @@ def write_notes(folder: Path, notes: Notes) -> Notes:
         wrong = f"the tag {long[:LONGEST_TAG]!r}... has {len(long)} characters, {LONGEST_TAG} are possible"
     if wrong:
         raise ConfigError(wrong, "lists have to stay readable", "shorten it; longer texts go into a file of their own")
+    (folder / f".{NOTES}.part").unlink(missing_ok=True)  # a link there would have another file written
     content = {"notes": text, "tags": list(tags)}
     write_atomically(folder / NOTES, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
     return Notes(text, tags)

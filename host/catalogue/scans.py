@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from polysight.host.acquisition import last_sign_of_life
-from polysight.host.catalogue.notes import NOTES, Notes, read_notes
+from polysight.host.catalogue.notes import NOTES, Notes, is_plain, read_notes
 from polysight.host.products import IMAGE, MATERIALS, QUALITY, SavedProducts
 from polysight.host.store import MANIFEST, Fact, manifest
 from polysight.shared.errors import DataError, PolysightError, no_such
@@ -200,8 +200,10 @@ def summary_of(folder: Path, name: str) -> Summary:
         notes = Notes(e.what)
     told: dict[str, Any] = {"name": name, "notes": notes.notes, "tags": notes.tags, **_processed(folder)}
     try:
-        raw = (folder / MANIFEST).read_bytes()
+        raw = (folder / MANIFEST).read_bytes() if is_plain(folder / MANIFEST) else None
     except OSError:
+        raw = None
+    if raw is None:
         return Summary(state="products" if told["processed"] else "begun", **{"seconds": _age(folder), **told})
     first, rows, last = _read(raw)
     if first is None:

@@ -152,7 +152,7 @@ def _add_lists(add: Add) -> None:
         "note",
         _note,
         "write notes and tags of a scan, kept beside its rows; print them",
-        "polysight note scans/one --text 'oak, second board' --tag oak",
+        "polysight note scans/one --text 'second board' --tag oak",
     )
     sub.add_argument("scan", type=Path, metavar="SCAN", help="scan folder")
     sub.add_argument("--text", metavar="TEXT", help="the notes, in place of those that are there")

@@ -238,7 +238,10 @@ def _starting(site: Site, s: Summary) -> bool:
 def _write_rig(folder: Path, rig: Instrument) -> Path:
     """The rig file of a scan that differs from the usual one, where its program finds it."""
     path = folder / PROGRAM / RIG
+    if path.parent.is_symlink():
+        raise ConfigError(f"{path.parent} is a link", "the folder was made by another program", "give another name")
     path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)  # a link there would have another file written
     path.write_text(tomli_w.dumps(to_builtins(rig)), encoding="utf-8")
     return path
 

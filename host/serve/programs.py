@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from polysight.host.catalogue import PROGRAM
+from polysight.host.catalogue import PROGRAM, is_plain
 from polysight.host.serve import launcher
 from polysight.host.serve.launcher import started_ticks
 from polysight.shared.errors import DeviceError, ScanError
@@ -80,6 +80,7 @@ class Programs:
         with self._lock:
             if (found := program_of(folder, kind)) is not None and found.running:
                 raise ScanError(f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it")
+            _check_place(folder / PROGRAM, kind)
             base = str((folder / PROGRAM).absolute() / kind)
             words = [sys.executable, "-m", "polysight", *map(str, words)]
             answer = self._ask({"words": words, "cwd": str(Path.cwd()), "base": base})
@@ -109,6 +110,18 @@ class Programs:
         self._launcher.wait(10)
 
 
+def _check_place(place: Path, kind: str) -> None:
+    """Refuse a folder of logs that somebody has made so that other files would be written. Raises DeviceError."""
+    files = [place / f"{kind}{suffix}" for suffix in (".json", ".log", ".status", ".part")]
+    for path in (place, *files):
+        if path.is_symlink() or (path != place and path.exists() and not is_plain(path)):
+            raise DeviceError(
+                f"{path} is no file of its own",
+                "the folder was made by another program",
+                "remove it, and look who made it",
+            )
+
+
 def programs_of(folder: Path) -> list[Program]:
     """Every program that was started for a folder, the newest first."""
     found = [program for kind in KINDS if (program := program_of(folder, kind)) is not None]
@@ -118,6 +131,8 @@ def programs_of(folder: Path) -> list[Program]:
 def program_of(folder: Path, kind: str) -> Program | None:
     """One of them; None where none was started."""
     base = folder / PROGRAM / kind
+    if (folder / PROGRAM).is_symlink() or not is_plain(base.with_suffix(".json")):
+        return None
     try:
         told = json.loads(base.with_suffix(".json").read_text(encoding="utf-8")[:100_000])
         pid, ticks = int(told["pid"]), int(told["ticks"])
@@ -139,6 +154,8 @@ def _status(path: Path) -> int | None:
 
 def _tail(path: Path) -> str:
     """The log's end since the program's start, as a page may show it."""
+    if not is_plain(path):
+        return ""
     try:
         with path.open("rb") as f:
             f.seek(max(0, f.seek(0, 2) - _TAIL_BYTES))

@@ -115,3 +115,18 @@ def test_too_long_notes_are_refused(root, notes):
     with pytest.raises(ConfigError):
         write_notes(root / "done", notes)
     assert not (root / "done" / NOTES).exists()
+
+
+def test_pipes_and_links_in_a_folder_keep_no_list_waiting(root, tmp_path_factory):
+    victim = tmp_path_factory.mktemp("elsewhere") / "file"
+    victim.write_text("as it was")
+    for k, name in enumerate((MANIFEST, NOTES)):
+        shutil.copytree(root / "done", root / f"odd{k}")
+        (root / f"odd{k}" / name).unlink(missing_ok=True)
+        os.mkfifo(root / f"odd{k}" / name)
+    (root / "done" / f".{NOTES}.part").symlink_to(victim)
+    found = {s.name: s for s in Scans(root).list()}
+    assert (found["odd0"].state, found["odd1"].notes) == ("products", "")
+    write_notes(root / "done", Notes("mine"))
+    assert victim.read_text() == "as it was"
+    assert read_notes(root / "done").notes == "mine"

@@ -207,7 +207,7 @@ def test_the_doctor_is_shown_as_it_looks(lab):
 def test_a_scan_that_cannot_begin_says_why(lab):
     lab.rig.pi.end()
     folder = lab.start("sixth", rows=3)
-    lab.browser.wait("document.getElementById('program-log').innerText.includes('does not answer')", "why", LIMIT_S)
+    lab.browser.wait("document.getElementById('program-log').innerText.includes('did not answer')", "why", LIMIT_S)
     assert not (folder / "manifest.jsonl").exists()
     lab.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
     assert _program(folder).status not in (0, None)

@@ -262,7 +262,12 @@ def hostile(port: int) -> list[bytes]:
         b"%s /api/control/abort?scan=one HTTP/1.1\r\n%s%s\r\n" % (m, host, good)
         for m in (b"GET", b"PUT", b"DELETE", b"OPTIONS", b"TRACE", b"CONNECT", b"BREW")
     ]
-    out += [
+    return out + misshapen(host, good)
+
+
+def misshapen(host: bytes, good: bytes) -> list[bytes]:
+    """Names, lengths, bodies and heads that are none; some with the right token."""
+    out = [
         b"GET /api/%s?scan=%s HTTP/1.1\r\n%s\r\n" % (w, n, host)
         for w in (b"scan", b"result", b"file/image.npz", b"thumbnail")
         for n in (b"..", b"%2e%2e%2f", b"/etc", b"one%00", b"a" * 9000, b"%ff%fe")

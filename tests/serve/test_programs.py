@@ -16,7 +16,7 @@ from polysight.host.jobs.live_scan import _check_new
 from polysight.host.serve import launcher
 from polysight.host.serve.programs import Programs, program_of
 from polysight.host.store import validate
-from polysight.shared.errors import ConfigError, ScanError
+from polysight.shared.errors import ConfigError, DeviceError, ScanError
 from tests.support.page.asking import TOKEN, get, post
 from tests.support.page.live_view import served_folder
 from tests.support.paths import RIG_FILE
@@ -133,3 +133,21 @@ def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):
     (tmp_path / "one" / "operator.json").write_text('{"notes": "", "tags": []}')
     (tmp_path / "one" / "export").mkdir()
     assert validate(tmp_path / "one") == before
+
+
+@pytest.mark.parametrize("name", ["", "scan.log", "scan.json", "scan.status", "scan.part"])
+def test_nothing_is_written_through_a_link(programs, tmp_path, name):
+    """A scan folder from elsewhere may hold links where logs go."""
+    (tmp_path / "victim").mkdir()
+    (tmp_path / "victim" / "file").write_text("as it was")
+    if name:
+        (tmp_path / "scan" / PROGRAM).mkdir(parents=True)
+        (tmp_path / "scan" / PROGRAM / name).symlink_to(tmp_path / "victim" / "file")
+    else:
+        (tmp_path / "scan").mkdir()
+        (tmp_path / "scan" / PROGRAM).symlink_to(tmp_path / "victim")
+    assert program_of(tmp_path / "scan", "scan") is None
+    with pytest.raises(DeviceError):
+        programs.start(tmp_path / "scan", "scan", ["--version"])
+    assert [p.name for p in (tmp_path / "victim").iterdir()] == ["file"]
+    assert (tmp_path / "victim" / "file").read_text() == "as it was"

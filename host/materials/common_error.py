@@ -80,7 +80,7 @@ def explanations(
     for evidence, start in _distinct([(_evidence(seen, e, cost), e) for e in first]):
         if found and evidence < found[0][0] - _UNLIKELY:
             continue
-        error = start
+        error, cost_of_none = start, cost
         for _ in range(_TURNS):
             cost_of_none = none(error)
             error = _turns(seen, error, cost_of_none, _ROUNDS)

@@ -25,7 +25,7 @@ demo: $(VENV)/installed  ## the whole rig, simulated: scan nine materials, end w
 
 test: $(VENV)/installed  ## install what is missing, then run every test
 	@./tests/install-tools.sh
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest -n $(JOBS) $(COSTS)
 
 test-long: $(VENV)/installed  ## tests at full length: random rows, records, messages, faults and kills by the ten thousand (hours)
 	@./tests/install-tools.sh

@@ -22,6 +22,7 @@ os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 pytest.register_assert_rewrite("tests.support")  # before the first import of it: its asserts show their values
 
 from tests.support.rigs import published_rig  # noqa: E402
+from tests.support.suite.costs import Costs  # noqa: E402
 from tests.support.suite.scheduling import ByFile, longest_first  # noqa: E402
 
 # A shell that starts the tests in the background has Ctrl-C ignored, and so would every program the tests start.
@@ -44,12 +45,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--pi-box", action="store_true", help="build a Debian for a Pi and run it on QEMU's Raspberry Pi 3B"
     )
+    group.addoption("--costs", action="store_true", help="list what the tests cost, in processor time and by the clock")
     group.addoption("--long", action="store_true", help="the full number of randomised rows and random bytes")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--long"):
         settings.load_profile("searching")
+    if config.getoption("--costs"):
+        config.pluginmanager.register(Costs())
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +66,9 @@ def scan_of() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def two_plates(scan_of: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scan of copper and PET."""
-    return scan_of(tmp_path_factory.mktemp("two") / "scan", scene_of(COPPER, PET, columns=15, rows=17))
+def two_plates(scan_of: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A scan of copper and PET; a test that writes into it takes a copy."""
+    scan = scan_of(tmp_path_factory.mktemp("two") / "scan", scene_of(COPPER, PET, columns=15, rows=17))
+    files = sorted(scan.rglob("*"))
+    yield scan
+    assert sorted(scan.rglob("*")) == files, "a test changed the scan that all share"

@@ -32,7 +32,7 @@ def without_rows(scan: Path, to: Path, *rows: int) -> Path:
 
 
 def test_a_whole_scan_has_everything_that_was_planned(two_plates, tmp_path):
-    told, quality, report = processed(two_plates, tmp_path / "out")
+    told, quality, report = processed(shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out")
     assert quality["coverage"] == {
         "rows_planned": ROWS, "rows_recorded": ROWS, "rows_absent": [], "positions_planned": COLUMNS * ROWS,
         "positions_absent": 0, "frames_planned": FRAMES, "frames_received": FRAMES, "manifest": [],

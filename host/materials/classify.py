@@ -124,6 +124,8 @@ class PatchName:
         Of each material that is not unlikely, and of "unknown", likeliest first; empty for models that give none.
     why
         The reason of the name in one sentence (`explain.py`); empty where permittivities are not known.
+    nearest
+        The likeliest material, also of a patch that is unknown; None without usable pixels.
     """
 
     name: str
@@ -133,11 +135,7 @@ class PatchName:
     pixels: int
     probabilities: dict[str, float] = field(default_factory=dict)
     why: str = ""
-
-    @property
-    def nearest(self) -> str | None:
-        """The likeliest material, also of a patch that is unknown."""
-        return next((name for name in self.probabilities if name != UNKNOWN), None)
+    nearest: str | None = None
 
 
 @dataclass(frozen=True)
@@ -247,7 +245,9 @@ class Classifier:
             probabilities = {name: round(every[name], 4) for name in order if every[name] >= LIKELY}
             if far > 1:  # farther from all than one of them should be
                 confidence = max(every[UNKNOWN], 1 - confidence)
-        return PatchName(str(found.names[row]) if far <= 1 else UNKNOWN, confidence, {}, far, 0, probabilities)
+        nearest = str(found.names[row])
+        name = nearest if far <= 1 else UNKNOWN
+        return PatchName(name, confidence, {}, far, 0, probabilities, nearest=nearest)
 
     def pixels(
         self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike

@@ -151,7 +151,7 @@ class ErrorDiscriminant(Model):
             q, cost = costs(mean - error.shift[:, None], own + (mine + error.spread)[:, None])
             each = probabilities(cost, self._none(x, patch, placed, error))
             probability += weight * _doubted(each, q - self.patch_level)
-            known = weight * np.maximum(each[:, :-1], 1e-12)
+            known = weight * np.maximum(probabilities(cost, np.full(ids.size, np.inf))[:, :-1], 1e-12)  # were it one
             share, distance2 = share + known, distance2 + known * q
         far = np.sqrt(distance2 / share / self.patch_level)
         at, scene = (np.arange(ids.size), np.argmax(share, axis=1)), found[0][1]

@@ -232,5 +232,6 @@ def _lines(scan: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tu
     right = sum(r["name"] == r["truth"]["name"] for r in known)
     accuracy = pixel_accuracy(found)
     share = "" if accuracy is None else f", {100 * accuracy:.1f} % of their pixels"
-    aside = f"; {len(strange)} not in the library, and told so" if strange else ""
-    return head, f"{right} of {len(known)} plates named right{share}{aside}"
+    aside = f"{len(strange)} not in the library, and called unknown" if strange else ""
+    named = f"{right} of {len(known)} plates named right{share}" if known else ""
+    return head, "; ".join(part for part in (named, aside) if part)

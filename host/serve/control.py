@@ -29,7 +29,7 @@ from polysight.shared.errors import ConfigError, DeviceError, ScanError
 from polysight.shared.tables import to_builtins
 
 RIG = "instrument.toml"
-FORMATS = ("csv", "mat", "png", "hdf5", "netcdf")
+FORMATS = ("csv", "mat", "png", "hdf5", "netcdf", "cphd")
 """What a page may have written for other programs, into `<scan>/export`."""
 _LARGEST = 2000  # positions of a row, rows
 Text = Annotated[str, msgspec.Meta(max_length=200)]

@@ -177,3 +177,15 @@ def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
     told = [explained(n, eps, None, classifier).verdict.why for n, eps in zip(named, KINDS.values(), strict=True)]
     assert all("looks like" in why for why in told)
     assert any("no other material" in why for why in told) == (model == "discriminant")
+
+
+def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
+    """However far it is: a person wants to know where to begin."""
+    classifier = Classifier(entries(drawn((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
+    x = drawn((0.0, 0.0), 1, 3, kinds={"glass": 7.5 - 0.05j, "water": 9.4 - 18j})
+    named = classifier.scan([x.x[x.patches == p] for p in np.unique(x.patches)])
+    known = classifier.permittivities
+    for n, eps in zip(named, (7.5 - 0.05j, 9.4 - 18j), strict=True):
+        assert n.verdict.name == UNKNOWN
+        assert n.verdict.nearest in known
+        assert f"nearest: {n.verdict.nearest}" in explained(n, eps, None, classifier).verdict.why

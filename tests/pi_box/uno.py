@@ -76,5 +76,7 @@ class Uno:
         """Switch it off."""
         self._process.terminate()
         self._process.wait(30)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
         self._listener.close()
         self._reader.join(30)

@@ -45,6 +45,8 @@ def direct_path_timed(into: Seconds) -> Iterator[None]:
 class _NoImage:
     """Takes synchronised rows and does nothing with them."""
 
+    live = False
+
     def add_row(self, *_: object) -> None:
         """Drop it."""
 

@@ -160,7 +160,8 @@ def taken_with(plate, make_rig, believe_rig, tmp_path):
 
     def make(metal, change=lambda _table: None):
         folder = shutil.copytree(plate, tmp_path / f"scan-{len(list(tmp_path.iterdir()))}")
-        believe_rig(folder, make_rig(change, **SMALL, calibration={"metal": str(metal)}))
+        inside = shutil.copytree(metal.parent, folder / "calibration") / metal.name  # where a scan keeps its files
+        believe_rig(folder, make_rig(change, **SMALL, calibration={"metal": str(inside)}))
         return ScanFolder.load(folder)
 
     return make

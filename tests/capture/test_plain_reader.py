@@ -18,7 +18,7 @@ from polysight.host.capture.receiver import ReceiverProcess
 from polysight.host.capture.segment import write_index
 from polysight.host.store.events import EventWriter
 from polysight.host.store.manifest import ManifestWriter
-from polysight.pi_controller.journal import Journal
+from polysight.pi_controller.journal import JournalFile
 from polysight.shared.messages import Capture, RunStopped, pack
 from polysight.simulators.scene import load_scene, simulate
 from tests.support.rigs import published_rig
@@ -139,7 +139,7 @@ def test_whole_scan(tmp_path):
 
 def test_journal(tmp_path):
     """Magic, then `<length, seq, crc32(seq + payload)>`, little-endian, and the event: with struct and zlib alone."""
-    journal = Journal(tmp_path / "s.journal")
+    journal = JournalFile(tmp_path / "s.journal")
     sent = [{"scan_id": "s", "seq": k, "t_mono_ns": k, "exit_status": "abort", "reason": "x" * k} for k in (1, 2, 3)]
     journal.write([pack(RunStopped(**event)) for event in sent])
     journal.close()

@@ -27,7 +27,7 @@ def products(scan_of, tmp_path_factory):
     known = seen.valid & (seen.x_m < seen.x_m.mean())
     gains = np.broadcast_to(np.exp((4 + 10j) * (seen.x_m - seen.x_m.mean())), seen.h.shape)
     made = replace(seen, h=(seen.h * gains).astype(np.complex64), valid=known)
-    path = write_metal(made, [SourceScan("plate", str(scan), True, 8)], folder / "calibration")
+    path = write_metal(made, [SourceScan("plate", str(scan), True, 8)], scan / "calibration")
     facts = manifest.read(scan / MANIFEST).facts
     facts[0]["instrument"]["calibration"] = {"metal": str(path)}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))

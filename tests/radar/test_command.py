@@ -265,9 +265,9 @@ def test_what_is_no_file_of_a_sane_size_is_refused_unread(rig, rig_file, capsys,
     with_it = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, firmware=str(path)))
     here = rig_file()
     for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):
-        assert run(file, *args) == 2
+        assert run(file, *args) == 3
         assert said in capsys.readouterr().err
-    assert run(rig_file(with_it), "check", "RH") == 2
+    assert run(rig_file(with_it), "check", "RH") == 3
     assert said in capsys.readouterr().err
     assert opened == []
 

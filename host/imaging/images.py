@@ -7,6 +7,7 @@ of the sweep that overlap by half.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib import import_module
 
 import msgspec
 import numpy as np
@@ -147,6 +148,8 @@ class ImageBuilder:
         gate_m: tuple[float, float] | None = None,
     ) -> None:
         self.rig, self.grid, self.live = rig, image_grid(rig), live
+        if live:
+            import_module("scipy.ndimage")  # scipy loads it at its first use: now, not behind the last row
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.of(rig, board) for board in rig.receivers)
         self.gate_m = needed_gate_m(rig, depth_m) if gate_m is None else gate_m

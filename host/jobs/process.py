@@ -149,7 +149,7 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
         return
     images = pipeline.form_images(from_sums=True)  # within 1e-6 of those that `make_products` puts in their place
     with making_products(out, pipeline.source.scan_id) as new:
-        save_images(new, pipeline.source, pipeline.rig, images, pipeline.quality)
+        save_images(new, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
     with suppress(OSError):  # that nobody reads it is no reason not to make the rest
         sys.stderr.write(f"image: {out / IMAGE}\n")
 

@@ -104,20 +104,22 @@ class Findings:
     plates: tuple[TruthPlate, ...] = ()
 
 
-def save_images(out: Path, scan: Scan, rig: Instrument, images: ChannelImages, quality: Quality) -> None:
+def save_images(
+    out: Path, scan: Scan, rig: Instrument, images: ChannelImages, quality: Quality, backlash: bool = True
+) -> None:
     """image.npz before any metal reference is known (p is h / v in arbitrary units), scan.json, quality.json.
 
-    `rig` is the one the images were made with.
+    `rig` is the one the images were made with; without `backlash` quality.json says nothing of it yet.
     """
     p = ratio(images.h, images.v)
     write_image(out / IMAGE, images.h, images.v, p, images.x_m, images.y_m, images.valid)
     write_scan_facts(out, scan, rig, images)
-    write_json(out / QUALITY, quality_content(quality))
+    write_json(out / QUALITY, quality_content(quality, backlash))
 
 
-def quality_content(quality: Quality) -> dict[str, Any]:
+def quality_content(quality: Quality, backlash: bool = True) -> dict[str, Any]:
     """Content of quality.json of images in which no material was looked for."""
-    return quality.to_dict(verdict=verdict_of(recording_verdict(quality)).to_dict())
+    return quality.to_dict(backlash, verdict=verdict_of(recording_verdict(quality)).to_dict())
 
 
 def save_materials(

@@ -11,6 +11,7 @@ import platform
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -133,12 +134,15 @@ def new_scan_id(now: datetime | None = None) -> str:
 def versions() -> dict[str, str]:
     """Releases of everything that shapes the data."""
     found = {"python": platform.python_version(), "numpy": np.__version__, "polysight": __version__}
-    for package in ("scipy", "scikit-learn"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+    return found | {package: _release(package) for package in ("scipy", "scikit-learn")}
+
+
+@cache
+def _release(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
 
 
 class ScanFolder:

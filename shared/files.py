@@ -9,12 +9,31 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, BinaryIO
 
 from polysight.shared.errors import DataError
 
 MOST_JSON_BYTES = 256 << 20
 """Of a JSON file: a hundred times the manifest of a scan of ten thousand rows."""
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file to be read; a pipe without a writer hangs nobody.
+
+    Raises
+    ------
+    DataError
+        when it is a folder, a device or a pipe.
+    OSError
+        when it cannot be opened.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise DataError(f"{path}: is no regular file", "a folder, a device or a pipe", "give a file")
+        return os.fdopen(os.dup(descriptor), "rb")
+    finally:
+        os.close(descriptor)
 
 
 def read_bounded(path: Path, most: int) -> bytes:
@@ -27,17 +46,11 @@ def read_bounded(path: Path, most: int) -> bytes:
     OSError
         when it cannot be read.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe without a writer does not hang
-    try:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
-            raise DataError(f"{path}: is no regular file", "a folder, a device or a pipe", "give a file")
-        with os.fdopen(os.dup(descriptor), "rb") as file:
-            data = file.read(most + 1) if found.st_size <= most else b""
-    finally:
-        os.close(descriptor)
-    if found.st_size > most or len(data) > most:
-        size = max(found.st_size, len(data))
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(most + 1) if size <= most else b""
+    if size > most or len(data) > most:
+        size = max(size, len(data))
         raise DataError(f"{path}: {size} bytes, {most} at most are read", "another file", "check which file it is")
     return data
 

@@ -75,13 +75,15 @@ def box(text: str) -> tuple[float, float, float, float]:
 
 
 def joined(words: Sequence[str]) -> list[str]:
-    """A command line in which numbers that begin with a minus are their option's: `--metal -45,0,40,40` too."""
+    """A command line in which numbers that begin with a minus are no options: `--metal -45,0,40,40`, `probe -60,0`."""
     out: list[str] = []
     for word in words:
-        if out and out[-1].startswith("--") and "=" not in out[-1] and re.fullmatch(r"-[\d.]+(,[-\d.]+)+", word):
+        if not re.fullmatch(r"-[\d.]+(,[-\d.]+)+", word):
+            out.append(word)
+        elif out and out[-1].startswith("--") and "=" not in out[-1]:
             out[-1] += f"={word}"
         else:
-            out.append(word)
+            out.append(f" {word}")  # argparse takes a word with a minus in front for an option
     return out
 
 

@@ -45,9 +45,11 @@ _TAIL_BYTES, _TRACE_BYTES, _KEY_BYTES, _MANIFEST_BYTES = 64 << 10, 4 << 20, 64 <
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
 _NAMED = re.compile(
-    r"""(?ix)((?:[\w-]*(?:secret|token|password|passphrase)[\w-]*|(?:private|public|curve|api)[_-]?key)
-    ["']?\s*[=:]\s*["']?)([^\s"',}]{4,})"""
+    r"""(?ix)((?:[\w-]*(?:secret|token|password|passphrase)[\w-]*|(?:private|public|curve|api)[_-]?key|authorization)
+    ["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)([^\s"',}]{2,})"""
 )
+_IN_URL = re.compile(r"(://[^\s/:@]+:)[^\s/@]+(?=@)")
+_TOKENS = re.compile(r"\b(?:gh[opsu]_|github_pat_|glpat-|sk-|xox[abp]-|AKIA)[A-Za-z0-9_-]{10,}")
 _PEM = re.compile(r"-----BEGIN [^-]*KEY-----.*?(?:-----END [^-]*KEY-----|\Z)", re.DOTALL)
 
 
@@ -68,7 +70,10 @@ class Redactor:
         """The text without them."""
         for word in self._words:
             text = text.replace(word, HIDDEN)
-        return _NAMED.sub(rf"\1{HIDDEN}", _PEM.sub(HIDDEN, text))
+        text = _PEM.sub(HIDDEN, text)
+        for pattern in (_NAMED, _IN_URL):
+            text = pattern.sub(rf"\1{HIDDEN}", text)
+        return _TOKENS.sub(HIDDEN, text)
 
 
 def write_bundle(

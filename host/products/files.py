@@ -106,9 +106,23 @@ def read_image(path: Path) -> dict[str, npt.NDArray]:
     names = ("h", "v", "p", "x_m", "y_m", "valid")
     try:
         with open_npz(path) as z:
-            return {k: z[k] for k in (*names, *(k for k in _OPTIONAL if k in z))}
+            image = {k: z[k] for k in (*names, *(k for k in _OPTIONAL if k in z))}
+        _check_image(image)
+        return image
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(f"{path}: not an image product: {e}", "made by polysight process or image") from None
+
+
+def _check_image(image: dict[str, npt.NDArray]) -> None:
+    """Refuse arrays that do not belong together. Raises ValueError."""
+    shape = image["y_m"].size, image["x_m"].size
+    if min(shape) < 2:
+        raise ValueError(f"an image has two pixels at least each way, not {shape[1]} x {shape[0]}")
+    for name, array in image.items():
+        if array.dtype.kind not in "cfb":
+            raise ValueError(f"{name} holds {array.dtype}, not numbers")
+        if name not in ("x_m", "y_m") and array.shape != shape:
+            raise ValueError(f"{name} is {' x '.join(map(str, array.shape))}, x_m and y_m say {shape[0]} x {shape[1]}")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

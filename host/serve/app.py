@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import traceback
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -11,7 +13,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, RedirectResponse, Response
 from starlette.routing import Route
 
-from polysight.host.serve.control import control_routes
+from polysight.host.serve.control import UnknownWishError, control_routes
 from polysight.host.serve.guard import Guard, refused
 from polysight.host.serve.reading import reading_routes
 from polysight.host.serve.site import Site
@@ -42,7 +44,7 @@ def make_app(site: Site) -> Starlette:
     return Starlette(
         routes=routes,
         middleware=[Middleware(Guard, access=site.access)],
-        exception_handlers={PolysightError: _told, LookupError: _unknown, 404: _nothing, Exception: _fault},
+        exception_handlers={PolysightError: _told, UnknownWishError: _unknown, 404: _nothing, Exception: _fault},
     )
 
 
@@ -74,5 +76,6 @@ async def _nothing(request: Request, e: Exception) -> Response:
 
 
 async def _fault(request: Request, e: Exception) -> Response:
-    del request
+    sys.stderr.write(f"{request.method} {request.url.path}\n{''.join(traceback.format_exception(e))}")
+    sys.stderr.flush()
     return refused(500, f"A fault of the server: {type(e).__name__}", "report it, with what its terminal says")

@@ -29,6 +29,12 @@ from polysight.shared.errors import ConfigError, DeviceError, ScanError
 from polysight.shared.tables import to_builtins
 
 RIG = "instrument.toml"
+
+
+class UnknownWishError(LookupError):
+    """What a running scan is asked for is nothing that it can be asked for."""
+
+
 FORMATS = ("csv", "mat", "png", "hdf5", "netcdf", "cphd")
 """What a page may have written for other programs, into `<scan>/export`."""
 _LARGEST = 2000  # positions of a row, rows
@@ -175,7 +181,7 @@ async def _wish(site: Site, request: Request, wanted: Request_) -> dict[str, Any
     try:
         wish = Wish(request.path_params["wish"])
     except ValueError:
-        raise LookupError(f"one of {', '.join(Wish)}") from None
+        raise UnknownWishError(f"one of {', '.join(Wish)}") from None
     watch = await site.act(site.watches.of, name, site.scans.folder(name))
     await site.act(watch.ask, wish)
     return {"what": "asked"}

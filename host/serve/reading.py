@@ -79,7 +79,10 @@ def _lists(site: Site) -> list[Route]:
 
     async def small(request: Request) -> Response:
         folder = site.scans.folder(site.name(request))
-        png = await site.compute(site.drawn, folder, ("thumbnail",), thumbnail)
+        try:
+            png = await site.compute(site.drawn, folder, ("thumbnail",), thumbnail)
+        except DataError:  # no image, or a damaged one, of which the scan's own page tells
+            return Response(status_code=204)
         return Response(png, media_type="image/png", headers={"Cache-Control": "private, max-age=5"})
 
     async def program(request: Request) -> Response:

@@ -13,6 +13,7 @@ import numpy as np
 
 from polysight.host.capture import kind_of
 from polysight.shared.errors import DataError
+from polysight.shared.files import open_regular
 
 _MAY_BE_LINK = "products"
 MOST_BYTES = 2 << 30
@@ -100,11 +101,11 @@ def open_npz(path: Path) -> Iterator[Any]:
     Raises
     ------
     DataError
-        when its arrays would take more than :data:`MOST_BYTES`.
+        when it is no regular file, or its arrays would take more than :data:`MOST_BYTES`.
     OSError, ValueError, KeyError, EOFError
         when it is no such archive, as numpy does.
     """
-    with path.open("rb") as f:
+    with open_regular(path) as f:
         try:
             with zipfile.ZipFile(f) as archive:
                 size = sum(member.file_size for member in archive.infolist())

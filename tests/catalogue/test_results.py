@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
-from polysight.host.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of
+from polysight.host.catalogue import MAPS, Pixels, compare, draw_comparison, draw_products, probe, result_of, thumbnail
 from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.products import read_products
 from polysight.shared.errors import DataError
@@ -136,3 +138,35 @@ def test_every_map_is_drawn_in_the_size_of_the_image(processed):
     for draw in (lambda: draw_products(pixels, "x"), lambda: draw_comparison(found, "x")):
         with pytest.raises(DataError):
             draw()
+
+
+DAMAGED = {
+    "smaller": lambda image: image | {"h": image["h"][:3, :3]},
+    "of words": lambda image: image | {"h": image["h"].astype(str)},
+    "empty": lambda image: {k: a[:0] if a.ndim == 1 else a[:0, :0] for k, a in image.items()},
+    "of one pixel": lambda image: {k: a[:1] if a.ndim == 1 else a[:1, :1] for k, a in image.items()},
+}
+
+
+@pytest.mark.parametrize("change", DAMAGED.values(), ids=DAMAGED)
+def test_images_whose_arrays_do_not_belong_together_are_refused(tmp_path, change):
+    folder = judged_products(tmp_path / "a", "good")
+    with np.load(folder / "image.npz") as stored:
+        image = dict(stored)
+    np.savez(folder / "image.npz", **change(image))
+    for look in (
+        lambda: probe(folder, 0.0, 0.0),
+        lambda: compare(folder, folder),
+        lambda: thumbnail(Pixels(read_products(folder))),
+    ):
+        with pytest.raises(DataError, match="not an image product"):
+            look()
+
+
+def test_a_pipe_in_the_image_s_place_keeps_nobody_waiting(tmp_path):
+    folder = judged_products(tmp_path / "a", "good")
+    (folder / "image.npz").unlink()
+    os.mkfifo(folder / "image.npz")
+    for look in (lambda: probe(folder, 0.0, 0.0), lambda: thumbnail(Pixels(read_products(folder)))):
+        with pytest.raises(DataError, match="no regular file"):
+            look()

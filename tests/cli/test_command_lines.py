@@ -88,8 +88,14 @@ def test_a_place_left_of_the_middle_needs_no_equals_sign(words, value):
 
 
 def test_other_words_are_left_as_they_are():
-    words = ["process", "-x", "--out", "-o", "--json", "-1", "--a=b", "-1,2", "-1,2"]
+    words = ["process", "-x", "--out", "-o", "--json", "-1", "--a=b"]
     assert joined(words) == words
+
+
+@pytest.mark.parametrize("place", ["-60,0", "-.5,-1", "60,-1"])
+def test_a_place_in_the_left_half_is_no_option(place):
+    given = build_parser().parse_args(joined(["probe", "scan", place]))
+    assert given.at == tuple(map(float, place.split(",")))
 
 
 def test_materials_of_a_scan_or_of_its_products(scan, capsys):

@@ -103,12 +103,28 @@ def test_a_folder_that_is_not_there_is_said_before_the_rig_is_walked(tmp_path: P
 
 @pytest.mark.parametrize(
     "text",
-    ['secret-key = "{}"', "token: {}", '{{"password": "{}"}}', "http://h/?token={}", "-----BEGIN A KEY-----\n{}\n"],
+    [
+        'secret-key = "{}"',
+        "token: {}",
+        '{{"password": "{}"}}',
+        "http://h/?token={}",
+        "-----BEGIN A KEY-----\n{}\n",
+        "Authorization: Bearer {}",
+        "authorization=Basic {}",
+        "sent bearer {}",
+        'api_key="{}"',
+        "APIKEY={}",
+    ],
 )
 def test_what_is_called_a_key_is_taken_out_wherever_it_came_from(text: str) -> None:
     key = zmq.curve_keypair()[1].decode()
     for word in (key.replace('"', "a").replace("'", "a").replace(",", "a").replace("}", "a"), "short-but-secret"):
         assert word not in Redactor([])(text.format(word))
+
+
+def test_tokens_of_well_known_forms_need_no_name() -> None:
+    assert "abcdefghijklmnop" not in Redactor([])("pushed with ghp_abcdefghijklmnopqrst")
+    assert "pw99" not in Redactor([])("from http://u:pw99@host:80/x")
 
 
 def test_what_is_no_key_stays() -> None:

@@ -10,6 +10,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -89,6 +90,15 @@ class Scans:
         found = {name: self._summary(name) for name in names}
         self._kept = {name: kept for name, kept in self._kept.items() if name in found}
         return sorted(found.values(), key=lambda s: (-s.seconds, s.name))
+
+    def left_out(self) -> list[str]:
+        """Names in the folder that hold a scan and are not listed: links, and names that cannot be shown; in ASCII."""
+        if self.only is not None:
+            return []
+        with suppress(OSError), os.scandir(self.root) as entries:
+            odd = [e for e in entries if not e.name.startswith(".") and (e.is_symlink() or not _is_name(e.name))]
+            return sorted(ascii(e.name)[1:-1] for e in odd if _is_scan(Path(e.path)))
+        return []
 
     def summary(self, name: str) -> Summary:
         """One of them. Raises DataError as :meth:`folder`."""

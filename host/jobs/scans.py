@@ -18,7 +18,10 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     """Print the scans under a folder, the newest first; returns 0. Raises DataError when there is no such folder."""
     if not root.is_dir():
         raise no_such(root)
-    found = [s for s in Scans(root).list() if set(tags) <= set(s.tags) and text.casefold() in _words(s)]
+    catalogue, odd = Scans(root), ""
+    if left_out := catalogue.left_out():
+        odd = f"; not shown, for they are links or have names that cannot be shown: {', '.join(left_out)}"
+    found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _words(s)]
     if as_json:
         rows = [asdict(s) | {"bytes": folder_bytes(root / s.name)} for s in found]
         sys.stdout.write(json.dumps({"scans": rows}, indent=1, ensure_ascii=False) + "\n")
@@ -34,7 +37,7 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
         ]
         told += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
         sys.stdout.write(f"{s.name:{width}}  {size:8.1f} MB  {'  '.join(t for t in told if t)}\n")
-    sys.stdout.write(f"{len(found)} scans under {root}\n")
+    sys.stdout.write(f"{len(found)} scans under {root}{odd}\n")
     return 0
 
 

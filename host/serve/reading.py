@@ -63,8 +63,11 @@ def _lists(site: Site) -> list[Route]:
         del request
         found = await site.compute(site.scans.list)
         rows = [asdict(s) | {"bytes": site.size(s.name)} for s in found]
+        left_out = await site.compute(site.scans.left_out)
         free = shutil.disk_usage(site.scans.root).free if site.scans.root.is_dir() else None
-        return JSONResponse({"scans": rows, "free_bytes": free, "libraries": list(site.libraries())})
+        return JSONResponse(
+            {"scans": rows, "free_bytes": free, "libraries": list(site.libraries()), "left_out": left_out}
+        )
 
     async def scan(request: Request) -> Response:
         name = site.name(request)
@@ -210,5 +213,5 @@ def _number(request: Request, key: str) -> float:
     except ValueError:
         value = float("nan")
     if not abs(value) < 1e6:
-        raise DataError(f"{key} = {text[:40]!r} is no number of millimetres", "the address is wrong", "click a place")
+        raise DataError(f"{key} = {text[:40]!r} is no number below a million", "the address is wrong", "use the page")
     return value

@@ -30,6 +30,14 @@ def root(processed: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_scans_that_are_not_listed_are_named(root):
+    (root / "linked").symlink_to(root / "done")
+    shutil.copytree(root / "done", root / "a\u202eb")
+    scans = Scans(root)
+    assert scans.left_out() == ["a\\u202eb", "linked"]
+    assert not {"linked", "a\u202eb"} & {s.name for s in scans.list()}
+
+
 def test_every_scan_is_listed_with_its_state(root):
     found = {s.name: s for s in Scans(root).list()}
     assert {n: (s.state, s.committed, s.rows) for n, s in found.items()} == {

@@ -75,6 +75,7 @@ function show() {
   if (nodes.length !== now.length || nodes.some((node, i) => node !== now[i])) by("list").replaceChildren(...nodes);
   const all = told.scans.length;
   by("count").textContent = `${found.length === all ? "" : `${found.length} of `}${all} scan${all === 1 ? "" : "s"}`
+    + (told.left_out?.length ? ` · not shown (links, odd names): ${told.left_out.slice(0, 3).join(", ")}${told.left_out.length > 3 ? ", …" : ""}` : "")
     + (told.free_bytes ? ` · ${bytes(told.free_bytes)} free` : "");
   if (!all) by("told").textContent = server.starts ? "No scan is here yet: begin with New scan." : "No scan is here yet.";
   else if (!by("told").classList.contains("wrong")) by("told").textContent = found.length ? "" : "None of them matches.";

@@ -81,7 +81,7 @@ function showPatches() {
   by("patches-note").textContent = result.metal_reference.how ? `metal reference: ${result.metal_reference.how}` : "";
   by("rows").replaceChildren(...result.patches.map((p) => {
     const row = make("tr", null, null, { id: `patch-${p.label}` });
-    const sure = p.confidence === null || p.confidence === undefined ? "" : ` ${Math.round(100 * p.confidence)} %`;
+    const sure = p.confidence === null || p.confidence === undefined || p.name === "unknown" ? "" : ` ${Math.round(100 * p.confidence)} %`;
     const dominated = p.permittivity?.dominated_by ?? "", why = p.refused ? `${p.refused.what}: ${p.refused.why}` : p.why ?? "";
     const name = nest(make("td", `${patchName(p)}${p.metal_reference ? "" : sure}`), ...(p.box ? [make("div", `drawn as ${p.box}`, "soft")] : []));
     const error = nest(make("td", dominated), ...(p.permittivity?.do ? [nest(make("div", null, "soft"), ...rich(p.permittivity.do))] : []));

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import zipfile
 from collections.abc import Iterator
@@ -105,6 +106,8 @@ def open_npz(path: Path) -> Iterator[Any]:
     OSError, ValueError, KeyError, EOFError
         when it is no such archive, as numpy does.
     """
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "it is a folder", str(path))
     with open_regular(path) as f:
         try:
             with zipfile.ZipFile(f) as archive:

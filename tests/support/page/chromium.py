@@ -27,6 +27,10 @@ def find_chromium() -> str | None:
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
+class NavigatedError(Exception):
+    """The page went elsewhere while it was asked: ask again."""
+
+
 class Browser:
     """One window of a browser with a profile of its own.
 
@@ -97,6 +101,8 @@ class Browser:
         while True:
             told = json.loads(self._socket.recv(timeout=LIMIT_S))
             if told.get("id") == self._count:
+                if "navigated" in str(told.get("error", "")):
+                    raise NavigatedError(method)
                 assert "error" not in told, (method, told["error"])
                 return told["result"]
             self._note(told.get("method", ""), told.get("params", {}))
@@ -136,9 +142,15 @@ class Browser:
     def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
         """Until an expression is true in the page."""
         deadline = time.monotonic() + limit_s
-        while not self.value(f"Boolean({expression})"):
+        while not self._true(expression):
             assert time.monotonic() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"
             time.sleep(0.05)
+
+    def _true(self, expression: str) -> bool:
+        try:
+            return bool(self.value(f"Boolean({expression})"))
+        except NavigatedError:
+            return False
 
     def screenshot(self, path: Path) -> None:
         """The whole page as PNG."""

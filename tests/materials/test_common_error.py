@@ -21,7 +21,9 @@ def never(_: CommonError) -> np.ndarray:
 def before() -> CommonError:
     width = ROW.shape[1]
     known = COMMON**2 * np.eye(width)
-    return CommonError(np.tile(np.eye(width), (COUNT, 1, 1)), np.zeros(width), known, np.linalg.inv(known))
+    return CommonError(
+        np.tile(np.eye(width), (COUNT, 1, 1)), np.zeros(width), known, np.asarray(np.linalg.inv(known), np.float64)
+    )
 
 
 def drawn(seed: int) -> tuple[np.ndarray, Patches]:

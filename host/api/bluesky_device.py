@@ -112,7 +112,9 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
     async def kickoff(self) -> None:
         """Begin; done when the first row is being taken. Raises PolysightError when it does not come to that."""
         if self._place is None or self._scanning is not None:
-            raise ScanError(f"{self.name}: not prepared, or a scan runs", "", "prepare it with a folder first")
+            raise ScanError(
+                f"{self.name}: not prepared, or a scan runs", "a scan needs a folder of its own", "prepare it first"
+            )
         self._scanning = asyncio.create_task(asyncio.to_thread(self._scan, self._place, asyncio.get_running_loop()))
         while not self._begun.is_set() and not self._scanning.done():
             await asyncio.sleep(_LOOK_S / 4)
@@ -124,7 +126,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         """Wait for the last row. Raises ScanError when the scan ends before it; committed rows stay."""
         scanning = self._scanning
         if scanning is None:
-            raise ScanError(f"{self.name}: no scan runs", "", "kick it off first")
+            raise ScanError(f"{self.name}: no scan runs", "none was begun, or it has ended", "kick it off first")
         began = time.monotonic()
         while not scanning.done():
             committed, planned = self._progress
@@ -181,7 +183,11 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     def _checked(self, result: ScanResult) -> None:
         if result.exit_status != "success":
-            raise ScanError(f"{self._place}: {result.reason}", "", f"polysight resume {self._place}")
+            raise ScanError(
+                f"{self._place}: {result.reason}",
+                "the scan ended before its last row; committed rows stay",
+                f"polysight resume {self._place}",
+            )
 
 
 def radar_scan(scan: RadarScan, folder: Path | str, md: dict[str, Any] | None = None) -> Iterator[Any]:

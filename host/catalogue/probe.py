@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import skimage
 
 from polysight.host.catalogue.pixels import Pixels
 from polysight.host.materials import SIMULATED_LIBRARY, Library, is_metal
 from polysight.host.pipeline import Pipeline
+from polysight.host.polarimetry import permittivity_from_ratio
 from polysight.host.products import read_products, scan_folder_of
 from polysight.host.store import MANIFEST, ScanFolder
 from polysight.shared.errors import PolysightError
@@ -82,18 +84,10 @@ def _permittivity(pixels: Pixels, row: int, column: int) -> dict[str, Any]:
 def _patch(segments: list[dict[str, Any]], x_mm: float, y_mm: float) -> dict[str, Any] | None:
     """The segment whose outline holds a place."""
     for segment in segments:
-        if _holds([tuple(point) for point in segment.get("outline_mm") or []], x_mm, y_mm):
+        outline = segment.get("outline_mm") or []
+        if len(outline) > 2 and skimage.measure.points_in_poly([(x_mm, y_mm)], outline)[0]:
             return segment
     return None
-
-
-def _holds(outline: list[tuple[float, ...]], x: float, y: float) -> bool:
-    """Whether a polygon holds a point, by the crossings of a ray."""
-    inside = False
-    for (x0, y0), (x1, y1) in zip(outline, outline[1:] + outline[:1], strict=True):
-        if (y0 > y) != (y1 > y) and x < x0 + (y - y0) / (y1 - y0) * (x1 - x0):
-            inside = not inside
-    return inside
 
 
 @lru_cache(maxsize=4)
@@ -129,8 +123,6 @@ def _nearest(pixels: Pixels, row: int, column: int, library: Path | None) -> lis
 
 
 def _half_space(inverse: complex, theta_rad: float) -> dict[str, float | None] | None:
-    from polysight.host.polarimetry import permittivity_from_ratio
-
     eps = complex(permittivity_from_ratio(1 / inverse, theta_rad)) if inverse else complex(np.nan)
     return _parts(eps) if np.isfinite(eps) else None
 

@@ -134,10 +134,10 @@ class Scans:
             raise DataError(
                 f"no scan is called {name[:80]!r} here", "the name leads elsewhere, or is none", "see the list"
             )
+        if not path.exists() and not there:
+            raise no_such(path)
         if not there:
-            raise (
-                no_such(path) if not path.exists() else DataError(f"{path}: no scan", "nothing was recorded there", "")
-            )
+            raise DataError(f"{path}: no scan", "nothing was recorded there", "see the list")
         return path
 
     def _summary(self, name: str) -> Summary:

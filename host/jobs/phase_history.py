@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from polysight.host.report import PhaseHistory
 
 FILE = "phase-history.cphd"
-_UNKNOWN_START = "1970-01-01T00:00:00Z"
 
 
 def export_cphd(folder: Path, out: Path | None) -> int:
@@ -98,8 +97,9 @@ def phase_history(pipeline: Pipeline) -> PhaseHistory:
 
 
 def _started(source: object) -> str:
+    """When the scan began; empty where nothing tells."""
     facts = source.facts("scan_started") if isinstance(source, ScanFolder) else []
-    return str(facts[0].get("started_utc", _UNKNOWN_START)) if facts else _UNKNOWN_START
+    return str(facts[0].get("started_utc", "")) if facts else ""
 
 
 def _met(rig: Instrument) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

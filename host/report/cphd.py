@@ -26,6 +26,8 @@ Floats = NDArray[np.float64]
 EARTH_RADIUS_M = 6_378_137.0
 """WGS 84, at the equator."""
 NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
+_NO_START = "1970-01-01T00:00:00Z"
+"""The standard wants a start; where none is known this stands for it, and a parameter says so."""
 _EACH = (
     ("TxTime", 1), ("TxPos", 3), ("TxVel", 3), ("RcvTime", 1), ("RcvPos", 3), ("RcvVel", 3), ("SRPPos", 3),
     ("aFDOP", 1), ("aFRR1", 1), ("aFRR2", 1), ("FX1", 1), ("FX2", 1), ("TOA1", 1), ("TOA2", 1), ("TDTropoSRP", 1),
@@ -55,6 +57,8 @@ class PhaseHistory:
 
     Attributes
     ----------
+    started_utc
+        When the scan began, ISO 8601; empty: not known.
     channels
         All receiving antennas.
     time_s, tx_m, velocity_m_s
@@ -169,7 +173,8 @@ def _vectors(history: PhaseHistory, channel: Channel) -> dict[str, Any]:
 
 def _tables(history: PhaseHistory, vectors: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """All of the XML but the reference geometry, in the order of the schema."""
-    f, t = history.frequencies_hz, history.time_s
+    f, t, started = history.frequencies_hz, history.time_s, history.started_utc or _NO_START
+    known = "as recorded" if history.started_utc else "unknown; the times of this file count from no real one"
     toa = [np.min([v["TOA1"] for v in vectors.values()]), np.max([v["TOA2"] for v in vectors.values()])]
     return {
         "CollectionID": {
@@ -183,13 +188,14 @@ def _tables(history: PhaseHistory, vectors: Mapping[str, Mapping[str, Any]]) -> 
             "Parameter": [
                 {"@name": "simulated", "#": str(history.simulated).lower()},
                 {"@name": "place", "#": "a laboratory: latitude, longitude and height are not where it is"},
+                {"@name": "start", "#": known},
                 {"@name": "samples", "#": "range-gated, Hann-weighted over the sweep, direct path taken out"},
             ],
         },
         "Global": {
             "DomainType": "FX",
             "SGN": "+1",
-            "Timeline": {"CollectionStart": history.started_utc, "TxTime1": t.min(), "TxTime2": t.max()},
+            "Timeline": {"CollectionStart": started, "TxTime1": t.min(), "TxTime2": t.max()},
             "FxBand": {"FxMin": f[0], "FxMax": f[-1]},
             "TOASwath": {"TOAMin": toa[0], "TOAMax": toa[1]},
         },
@@ -212,7 +218,7 @@ def _tables(history: PhaseHistory, vectors: Mapping[str, Mapping[str, Any]]) -> 
         "ProductInfo": {
             "CreationInfo": {
                 "Application": f"polysight {versions()['polysight']}",
-                "DateTime": history.started_utc,
+                "DateTime": started,
             }
         },
     }

@@ -29,12 +29,6 @@ from polysight.shared.errors import ConfigError, DeviceError, ScanError
 from polysight.shared.tables import to_builtins
 
 RIG = "instrument.toml"
-
-
-class UnknownWishError(LookupError):
-    """What a running scan is asked for is nothing that it can be asked for."""
-
-
 FORMATS = ("csv", "mat", "png", "hdf5", "netcdf", "cphd")
 """What a page may have written for other programs, into `<scan>/export`."""
 _LARGEST = 2000  # positions of a row, rows
@@ -44,6 +38,10 @@ Box = tuple[Number, Number, Number, Number]
 Few = Annotated[int, msgspec.Meta(ge=1, le=_LARGEST)]
 Size = Annotated[float, msgspec.Meta(gt=0, le=1e5)]
 T = TypeVar("T", bound="Request_")
+
+
+class UnknownWishError(Exception):
+    """What a running scan is asked for is nothing that it can be asked for."""
 
 
 class Request_(msgspec.Struct, frozen=True, forbid_unknown_fields=True):  # noqa: N801
@@ -130,7 +128,7 @@ class TrainRequest(Request_, frozen=True):
 class ExportRequest(Request_, frozen=True):
     """Formats to write."""
 
-    formats: Annotated[tuple[str, ...], msgspec.Meta(min_length=1, max_length=5)]
+    formats: Annotated[tuple[str, ...], msgspec.Meta(min_length=1, max_length=len(FORMATS))]
 
 
 Answer = Callable[[Site, Request, Any], Awaitable[Any]]

@@ -78,7 +78,8 @@ def _calibration(rig: Instrument, path: Path) -> dict[str, dict[str, dict[str, s
         try:
             (path / copy).parent.mkdir(exist_ok=True)
             (path / copy).write_bytes(source.read_bytes())
-            for images in source.parent.glob(f"{source.stem}.npz"):  # of a metal reference
+            images = source.with_suffix(".npz")  # of a metal reference
+            if images.exists():
                 (path / "calibration" / images.name).write_bytes(images.read_bytes())
         except OSError as e:
             raise DataError(

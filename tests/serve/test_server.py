@@ -8,11 +8,13 @@ import json
 import re
 import socket
 
+import msgspec
 import pytest
 
 from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
 from polysight.host.cli.main import build_parser
 from polysight.host.serve.app import STATIC
+from polysight.host.serve.control import FORMATS, ExportRequest
 from polysight.host.serve.guard import TOKEN_HEADER
 from polysight.host.serve.server import is_loopback
 from tests.support.page.live_view import served
@@ -207,3 +209,10 @@ def test_pictures_are_served_as_they_are_shown(finished, watching):
 def test_the_how_to_names_every_wish():
     page = (REPO / "docs/how-to/live-view.md").read_text(encoding="utf-8")
     assert all(f"control/{wish}" in page for wish in Wish)
+
+
+def test_all_formats_may_be_asked_for_at_once():
+    wanted = msgspec.json.decode(json.dumps({"formats": FORMATS}), type=ExportRequest)
+    assert wanted.formats == FORMATS
+    page = (STATIC / "scan.html").read_text(encoding="utf-8")
+    assert set(re.findall(r'type="checkbox" name="(\w+)"', page)) == set(FORMATS)

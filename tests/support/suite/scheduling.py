@@ -26,6 +26,8 @@ FIRST = (
     "tests/materials",
     "tests/process/test_laws.py",
     "tests/e2e/test_killed_processes.py",
+    "tests/e2e/test_operator_page.py",
+    "tests/serve/test_pages.py",
     "tests/api",
     "tests/stage/test_dialogues.py",
     "tests/doctor/test_live_rig.py",

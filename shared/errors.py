@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
+from polysight.shared.error_codes import ErrorCode
+
 
 class PolysightError(Exception):
     """Base of every error this project raises on purpose.
@@ -18,13 +20,15 @@ class PolysightError(Exception):
         The likely cause.
     remedy
         What to do next.
+    code
+        The kind of error, for programs and tests; people read the sentences.
     """
 
     exit_status = 1
 
-    def __init__(self, what: str, why: str = "", remedy: str = "") -> None:
+    def __init__(self, what: str, why: str = "", remedy: str = "", *, code: ErrorCode = ErrorCode.OTHER) -> None:
         super().__init__(what)
-        self.what, self.why, self.remedy = what, why, remedy
+        self.what, self.why, self.remedy, self.code = what, why, remedy, code
 
     def __str__(self) -> str:
         parts = [self.what]
@@ -65,7 +69,10 @@ def no_such(path: Path) -> DataError:
     except OSError:
         near = f"{path.parent} is not there either"
     return DataError(
-        f"{path}: does not exist", "the path is wrong", near or "give the path of what was recorded or made"
+        f"{path}: does not exist",
+        "the path is wrong",
+        near or "give the path of what was recorded or made",
+        code=ErrorCode.FILE_MISSING,
     )
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, did_you_mean
 from polysight.shared.files import read_bounded
 
@@ -62,16 +63,23 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         path = path.rstrip("`") or "$"
         value = _lookup(raw, path)
         key = path.removeprefix("$").lstrip(".")
+        code = ErrorCode.VALUE_INVALID
         if unknown := re.search(r"unknown field `(.*)`", rule):
-            rule = f"no key {unknown[1]!r}: {_likelier(unknown[1], kind)}"
+            rule = f"no key {unknown[1]!r}: {_suggest_key(unknown[1], kind)}"
+            code = ErrorCode.KEY_UNKNOWN
+        elif "missing required field" in rule:
+            code = ErrorCode.KEY_MISSING
+        elif ", got `" in rule:
+            code = ErrorCode.TYPE_WRONG
         raise ConfigError(
             f"{source}: {key}{' = ' + value if value else ''}{': ' if key else ''}{rule}",
             "the file does not follow its declaration",
             f"correct {key or 'that'} in {source}; {keys or _RIG_KEYS}",
+            code=code,
         ) from None
 
 
-def _likelier(key: str, kind: Any) -> str:
+def _suggest_key(key: str, kind: Any) -> str:
     """What to write instead of an unknown key: the table it belongs to, or a key like it."""
     known: dict[str, set[str]] = {}
     _collect(msgspec.inspect.type_info(kind), "", known)

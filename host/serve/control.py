@@ -19,7 +19,7 @@ from polysight.host.acquisition import Wish
 from polysight.host.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
 from polysight.host.jobs.label import save_labels
 from polysight.host.materials import Labels
-from polysight.host.plan import Changes, forecast, numbers
+from polysight.host.plan import Changes, forecast, forecast_values
 from polysight.host.products import find_labels, label_place, read_products
 from polysight.host.serve.guard import cookie_name, refused
 from polysight.host.serve.programs import Programs, program_of
@@ -188,7 +188,7 @@ async def _wish(site: Site, request: Request, wanted: Request_) -> dict[str, Any
 async def _plan(site: Site, request: Request, wanted: PlanRequest) -> dict[str, Any]:
     del request
     config = _config(site)
-    told = await site.compute(lambda: numbers(forecast(wanted.of(config))))
+    told = await site.compute(lambda: forecast_values(forecast(wanted.of(config))))
     rig = load_instrument(config)
     return told | {"rig": rig.name, "config": str(config), "begun_with": to_builtins(rig)["grid"]}
 

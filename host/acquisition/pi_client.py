@@ -53,7 +53,7 @@ from polysight.shared.messages import (
     unpack_event,
     unpack_reply,
 )
-from polysight.shared.sockets import Refusals, requester, subscriber
+from polysight.shared.sockets import HandshakeMonitor, requester, subscriber
 
 ATTEMPTS = 3  # to ask a question
 REAL_TIME = 1  # of the heartbeat: below the receiving processes
@@ -144,7 +144,7 @@ class PiClient:
         keys = Path(instrument.pi.key_dir)
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
-        self._refusals = Refusals(self._commands)
+        self._handshake = HandshakeMonitor(self._commands)
         self._owner = secrets.token_hex(16)  # of the runs that this client begins
         self._scan_id = ""
         self._last_seq = 0
@@ -275,7 +275,7 @@ class PiClient:
         return reply
 
     def _silent(self, command: str) -> DeviceError:
-        if self._refusals.seen():
+        if self._handshake.refused():
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",
                 "the key was revoked or never allowed, or pi.key here is another Pi's",
@@ -352,7 +352,7 @@ class PiClient:
         """Close the sockets."""
         self._fall_silent()
         self._events.close()
-        self._refusals.close()
+        self._handshake.close()
         self._commands.close()
 
     def _fall_silent(self) -> None:

@@ -19,9 +19,9 @@ from polysight.shared.config import Instrument, Stage
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import HelloReply, StatusReply
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
 
-_HOMING_LIMIT_S = HOMING_LIMIT_S + 30.0  # longer than the Pi, whose reason is the exact one
+_HOMING_LIMIT_S = HOMING_TIMEOUT_S + 30.0  # longer than the Pi, whose reason is the exact one
 STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # homed by hand, after a look: `polysight-pi home`
 UNTOLD = "the Pi does not tell its [stage], so nobody compares it with this rig file's: install this release on the Pi"
 
@@ -148,7 +148,7 @@ def pi_fact(hello: HelloReply) -> Fact:
 
 def differences(stage: Stage, hello: HelloReply) -> list[str]:
     """Each placing key of `[stage]` that the Pi has otherwise, with both values; [] for a Pi that does not tell."""
-    own = stage.placing
+    own = stage.placement_settings
     return [
         f"stage.{key} is {own[key]:.10g} here and {hello.stage[key]:.10g} on the Pi"
         for key in own

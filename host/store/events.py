@@ -15,7 +15,7 @@ import msgpack
 
 from polysight.host.store.append_only import AppendFile
 from polysight.shared.errors import DataError, DeviceError, ProtocolError
-from polysight.shared.messages import AnyEvent, pack_kept, unpack_kept
+from polysight.shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
 
 DAMAGED = ".damaged"  # suffix of the copy that is kept of a damaged file
 
@@ -48,7 +48,7 @@ def read_events(path: Path) -> EventLog:
     log = EventLog([], 0)
     try:
         for end in _ends(raw):
-            log.events.append(unpack_kept(raw[log.length : end]))
+            log.events.append(unpack_with_crc(raw[log.length : end]))
             log.length = end
     except ProtocolError as e:
         log.damage = f"event {len(log.events) + 1} is damaged: {e.what}"
@@ -128,7 +128,7 @@ class EventWriter:
 
     def append(self, event: AnyEvent) -> None:
         """Take one event; :meth:`sync` writes it."""
-        self._batch.append(pack_kept(event))
+        self._batch.append(pack_with_crc(event))
         self.last_seq = event.seq
 
     def sync(self) -> None:

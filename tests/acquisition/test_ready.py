@@ -15,7 +15,7 @@ from polysight.host.doctor.check_host import check_time
 from polysight.host.plan.forecast import forecast
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import PiFault
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
 
 
 class HomingPi:
@@ -57,7 +57,7 @@ def homing_error(monkeypatch, limit_s: float) -> ScanError:
 
 
 def test_the_pi_s_reason_is_told_when_homing_fails(monkeypatch):
-    assert "not homed after" in homing_error(monkeypatch, HOMING_LIMIT_S).what
+    assert "not homed after" in homing_error(monkeypatch, HOMING_TIMEOUT_S).what
 
 
 def test_a_pi_that_never_ends_homing_is_not_waited_for_for_ever(monkeypatch):
@@ -67,7 +67,7 @@ def test_a_pi_that_never_ends_homing_is_not_waited_for_for_ever(monkeypatch):
 def test_the_machine_and_the_host_wait_by_the_same_limit():
     from polysight.pi_controller import machine, stage
 
-    assert machine.LIMITS_S["homing"] == stage.MOTION_LIMIT_S == HOMING_LIMIT_S < ready._HOMING_LIMIT_S
+    assert machine.LIMITS_S["homing"] == stage.MOTION_LIMIT_S == HOMING_TIMEOUT_S < ready._HOMING_LIMIT_S
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4])

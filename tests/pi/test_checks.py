@@ -193,7 +193,7 @@ def test_addresses(tmp_path):
         taken.listen()
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         found = checks.attempt("command address", checks._address, replier, address, tmp_path)
-    assert (found.verdict, "holds this port" in found.found) == ("fail", True)
+    assert found.verdict == "fail"
     found = checks.attempt("event address", checks._address, publisher, "tcp://0.0.0.0:*", tmp_path)
     assert (found.verdict, "polysight-pi keys" in found.remedy) == ("fail", True)
     found = checks.attempt("event address", checks._address, publisher, "tcp//x", tmp_path)

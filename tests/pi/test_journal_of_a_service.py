@@ -83,4 +83,4 @@ def test_the_pis_client_prints_each_event_once_also_behind_a_lost_journal(pi, in
 
 
 def test_hello_tells_what_places_rows(pi, instrument):
-    assert pi.host.ask(m.Hello()).stage == instrument.stage.placing
+    assert pi.host.ask(m.Hello()).stage == instrument.stage.placement_settings

@@ -50,7 +50,7 @@ def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage):
 
 def test_refusals_carry_the_table(dry_stage):
     link, _ = connect(dry_stage)
-    with pytest.raises(StageRefusedError, match="does not know where it is") as e:
+    with pytest.raises(StageRefusedError) as e:
         link.request("MOVE", 1, 2, 3)
     assert e.value.number == StageError.NOT_HOMED
     assert e.value.remedy

@@ -8,22 +8,29 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from polysight.host.acquisition import last_sign_of_life
-from polysight.host.catalogue.notes import NOTES, Notes, is_plain, read_notes
+from polysight.host.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes
 from polysight.host.products import IMAGE, MATERIALS, QUALITY, SavedProducts
 from polysight.host.store import MANIFEST, Fact, manifest
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, PolysightError, no_such
 
 PROGRAM = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
+READ_S = 3.0
+"""Time limit for reading one folder of the list; it is then listed as `silent` until the read returns."""
 _DEEP, _MOST = 4, 5000  # folders below the first, and scans, that are looked at
+_TAIL_BYTES = 16384
+_UNPRINTABLE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 _LAPSE_S = 15.0
 _GRACE_S = 20.0  # from a manifest's last line to the first sign of life
 _ROW = re.compile(rb'"row":(\d+)')
@@ -41,7 +48,8 @@ class Summary:
         Its path below the folder that is listed, with `/`.
     state
         `running`, `paused`, `finished`, `stopped`, `failed`, `lost` (no program writes it, and none said why), `begun`
-        (a folder in which a program was started and no scan is yet), `products` (no rows beside), `damaged`.
+        (a folder in which a program was started and no scan is yet), `products` (no rows beside), `damaged`, `silent`
+        (its folder does not answer: a network drive that is gone).
     rows, committed
         Of the plan, and those that count.
     verdict
@@ -83,13 +91,54 @@ class Scans:
     def __init__(self, root: Path, only: str | None = None) -> None:
         self.root, self.only = root, only
         self._kept: dict[str, tuple[Stamp, Summary]] = {}
+        self._found: dict[str, list[Summary]] = {}  # by entry of the root
+        self._reading: set[str] = set()  # entries of the root
+        self._lock = threading.Lock()
 
     def list(self) -> list[Summary]:
-        """Every scan, the newest first; what has changed since the last call is read again."""
-        names = [self.only] if self.only is not None else list(_names(self.root))
-        found = {name: self._summary(name) for name in names}
-        self._kept = {name: kept for name, kept in self._kept.items() if name in found}
-        return sorted(found.values(), key=lambda s: (-s.seconds, s.name))
+        """Every scan, the newest first; what has changed since the last call is read again.
+
+        A folder that takes longer than `READ_S` is listed as `silent`. Its thread cannot be ended: the folder is read
+        again when that has returned.
+        """
+        with self._lock:
+            entries = [self.only] if self.only is not None else [name for name, _ in _folders(self.root)]
+            self._read_all(deque(entry for entry in entries if entry not in self._reading))
+            found: list[Summary] = []
+            for entry in entries:
+                known = self._found.get(entry, [])
+                if entry in self._reading:
+                    known = [replace(s, state="silent") for s in known] or [Summary(entry, "silent")]
+                found += known
+            names = {s.name for s in found}
+            self._kept = {name: kept for name, kept in list(self._kept.items()) if name in names}
+        return sorted(found, key=lambda s: (-s.seconds, s.name))
+
+    def _read_all(self, todo: deque[str]) -> None:
+        """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread goes on."""
+        while todo:
+            worker = threading.Thread(target=self._read_entries, args=(todo,), name="list", daemon=True)
+            worker.start()
+            left = -1
+            while worker.is_alive() and left != len(todo):
+                left = len(todo)
+                worker.join(READ_S)
+
+    def _read_entries(self, todo: deque[str]) -> None:
+        with suppress(IndexError):  # nothing is left
+            while True:
+                entry = todo.popleft()
+                self._reading.add(entry)
+                try:
+                    self._found[entry] = self._summaries(entry)
+                finally:
+                    self._reading.discard(entry)
+
+    def _summaries(self, entry: str) -> list[Summary]:
+        """The scan that an entry of the root is, or those below it."""
+        if self.only is not None or is_scan(self.root / entry):
+            return [self._summary(entry)]
+        return [self._summary(name) for name in _names(self.root / entry, f"{entry}/", 2)]
 
     def left_out(self) -> list[str]:
         """Names in the folder that hold a scan and are not listed: links, and names that cannot be shown; in ASCII."""
@@ -97,7 +146,7 @@ class Scans:
             return []
         with suppress(OSError), os.scandir(self.root) as entries:
             odd = [e for e in entries if not e.name.startswith(".") and (e.is_symlink() or not _is_name(e.name))]
-            return sorted(ascii(e.name)[1:-1] for e in odd if _is_scan(Path(e.path)))
+            return sorted(ascii(e.name)[1:-1] for e in odd if is_scan(Path(e.path)))
         return []
 
     def summary(self, name: str) -> Summary:
@@ -127,17 +176,26 @@ class Scans:
         path = self.root / PurePosixPath(name) if good else self.root
         try:
             good = good and path.resolve() == self.root.resolve() / name  # no link on the way
-            there = good and (new or name == self.only or _is_scan(path))
+            inside = next((p for p in path.parents if self.root in p.parents and is_scan(p)), None)
+            there = good and (new or name == self.only or is_scan(path))
         except (OSError, ValueError):
-            there = False
+            there, inside = False, None
         if not good:
             raise DataError(
-                f"no scan is called {name[:80]!r} here", "the name leads elsewhere, or is none", "see the list"
-            )
+                f"no scan is called {name[:80]!r} here", "the name leads elsewhere, or is none", "see the list",
+                code=ErrorCode.PATH_OUTSIDE,
+            )  # fmt: skip
+        if inside is not None:
+            raise DataError(
+                f"{path}: no scan", f"it lies inside the scan {inside.name}", "give the scan's own name",
+                code=ErrorCode.FILE_MISSING,
+            )  # fmt: skip
         if not path.exists() and not there:
             raise no_such(path)
         if not there:
-            raise DataError(f"{path}: no scan", "nothing was recorded there", "see the list")
+            raise DataError(
+                f"{path}: no scan", "nothing was recorded there", "see the list", code=ErrorCode.FILE_MISSING
+            )
         return path
 
     def _summary(self, name: str) -> Summary:
@@ -163,16 +221,10 @@ def folder_bytes(folder: Path) -> int:
 
 def _names(root: Path, prefix: str = "", deep: int = 1) -> Iterator[str]:
     """Names of the scans below a folder. Links, hidden folders and the insides of scans are not looked at."""
-    try:
-        entries = sorted(os.scandir(root), key=lambda e: e.name)
-    except OSError:
-        return
     count = 0
-    for entry in entries:
-        if not _is_name(entry.name) or not entry.is_dir(follow_symlinks=False):
-            continue
-        name, path = f"{prefix}{entry.name}", Path(entry.path)
-        if _is_scan(path):
+    for entry, path in _folders(root):
+        name = f"{prefix}{entry}"
+        if is_scan(path):
             yield name
             count += 1
         elif deep < _DEEP:
@@ -181,17 +233,26 @@ def _names(root: Path, prefix: str = "", deep: int = 1) -> Iterator[str]:
             return
 
 
+def _folders(root: Path) -> list[tuple[str, Path]]:
+    """Names and paths of the folders in a folder, sorted; links and names that cannot be shown are left out."""
+    with suppress(OSError), os.scandir(root) as entries:
+        folders = [e for e in entries if _is_name(e.name) and e.is_dir(follow_symlinks=False)]
+        return sorted((e.name, Path(e.path)) for e in folders)
+    return []
+
+
 def _is_name(part: str) -> bool:
     return bool(part) and not part.startswith(".") and part.isprintable() and "\\" not in part and len(part) <= 200
 
 
-def _is_scan(path: Path) -> bool:
+def is_scan(path: Path) -> bool:
+    """True if a folder holds a scan, products, or programs that a page started."""
     return any((path / name).exists() for name in (MANIFEST, IMAGE, PROGRAM))
 
 
 def _stamp(folder: Path) -> Stamp:
     """What changes when anything of a summary does."""
-    files = (MANIFEST, NOTES, f"products/{IMAGE}", f"products/{QUALITY}", IMAGE, QUALITY)
+    files = (MANIFEST, NOTES, f"products/{IMAGE}", f"products/{QUALITY}", IMAGE, QUALITY, f"{PROGRAM}/scan.status")
     out = []
     for name in files:
         try:
@@ -214,7 +275,9 @@ def summary_of(folder: Path, name: str) -> Summary:
     except OSError:
         raw = None
     if raw is None:
-        return Summary(state="products" if told["processed"] else "begun", **{"seconds": _age(folder), **told})
+        reason = "" if told["processed"] else _start_failure(folder)
+        state = "products" if told["processed"] else "failed" if reason else "begun"
+        return Summary(state=state, reason=reason, **{"seconds": _age(folder), **told})
     first, rows, last = _read(raw)
     if first is None:
         return Summary(state="damaged", **{"seconds": _age(folder), **told})
@@ -226,6 +289,35 @@ def summary_of(folder: Path, name: str) -> Summary:
         "rows": int(plan.get("rows", 0)) if isinstance(plan, dict) else 0, "seconds": _seconds(started) or _age(folder),
     }  # fmt: skip
     return Summary(state=_state(last, told), reason=str(last.get("reason", ""))[:300], **told)
+
+
+def _start_failure(folder: Path) -> str:
+    """Why the program of a scan ended before its first row, from its log; "" if it runs, or was killed."""
+    status = folder / PROGRAM / "scan.status"
+    try:
+        if not is_plain(status) or status.read_text(encoding="ascii")[:8].strip() in ("", "0"):
+            return ""
+    except (OSError, ValueError):
+        return ""
+    lines = log_tail(folder / PROGRAM / "scan.log").splitlines()
+    errors = [line.partition(": ")[2] for line in lines if line.startswith(("polysight scan: ", "polysight resume: "))]
+    return (errors or lines or ["its program ended without a message"])[-1][:300]
+
+
+def log_tail(path: Path) -> str:
+    """The end of a program's log since its last start, without control sequences; "" if there is none."""
+    if not is_plain(path):
+        return ""
+    try:
+        with path.open("rb") as f:
+            f.seek(max(0, f.seek(0, 2) - _TAIL_BYTES))
+            text = f.read().decode("utf-8", errors="replace")
+    except OSError:
+        return ""
+    lines = text.replace("\r\n", "\n").split("\n")
+    starts = [k for k, line in enumerate(lines) if line.startswith("--- ")]
+    text = "\n".join(lines[starts[-1] + 1 :] if starts else lines)
+    return printable(_UNPRINTABLE.sub("", text), keep="\n\t").strip()
 
 
 def _read(raw: bytes) -> tuple[Fact | None, set[int], Fact]:

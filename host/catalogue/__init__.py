@@ -20,7 +20,8 @@ from polysight.host.catalogue.pictures import (
 from polysight.host.catalogue.pixels import Pixels
 from polysight.host.catalogue.probe import probe
 from polysight.host.catalogue.result import EXPORT, files_of, result_of
-from polysight.host.catalogue.scans import PROGRAM, Scans, Summary, folder_bytes, log_tail, summary_of
+from polysight.host.catalogue.scans import Scans, folder_bytes
+from polysight.host.catalogue.summary import PROGRAM, Summary, log_tail, summary_of
 
 __all__ = [
     "AMPLITUDE",

@@ -251,7 +251,7 @@ def judge(rig: Instrument, board: Board, signal: DirectSignal) -> Finding:
             f"start_offset_hz = {offset:.0f} for {board.name}",
             **facts,
         )
-    apart = -signal.later_s(rig)[0]  # what the crystals explain is taken off
+    apart = -signal.start_delay_s(rig)[0]  # what the crystals explain is taken off
     if abs(apart) > APART_S:
         return warning(
             f"{told}; {predicted}, {apart * 1e9:+.1f} ns away",
@@ -305,7 +305,7 @@ def check_skew(bench: Bench) -> Finding:
 def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     """What is to be said of two receivers' direct paths."""
     h, v = rig.receivers
-    later = {b.name: signals[b.name].later_s(rig) for b in (h, v)}
+    later = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}
     skew = later[v.name][0] - later[h.name][0]
     unsure = float(np.hypot(later[h.name][1], later[v.name][1]))
     jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s

@@ -6,7 +6,7 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-from polysight.host.calibration import checked
+from polysight.host.calibration import checked_calibration
 from polysight.host.capture import PRIORITY_REMEDY
 from polysight.host.doctor.bench import Bench, Finding, error, not_checked, ok, warning
 from polysight.host.doctor.receiver_load import SEND_US, rates
@@ -99,7 +99,7 @@ def check_config(bench: Bench) -> Finding:
 def check_calibration(bench: Bench) -> Finding:
     """What a scan would copy into its folder."""
     simulated = bench.hello is not None and is_simulated(bench.hello.backend)
-    facts = checked(bench.rig, simulated).facts()
+    facts = checked_calibration(bench.rig, simulated).facts()
     if not facts:
         return ok("none named: geometry, filters and metal as the rig file and the scene have them")
     return ok("; ".join(f"{kind} of {fact['made_utc'][:10]}" for kind, fact in facts.items()), **facts)

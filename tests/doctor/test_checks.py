@@ -7,7 +7,7 @@ import msgspec
 import pytest
 import tomli_w
 
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.host.capture.network import route_interface
 from polysight.host.cli.main import main
 from polysight.host.doctor import bench as kernel
@@ -61,8 +61,8 @@ def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
 )
 def test_calibration_files(tmp_path, backend, verdict):
     board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    file = FilterFile(**head("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
-    bench = bench_of(programmed_rig(calibration={"hpf": str(write(file, tmp_path))}))
+    file = FilterFile(**header("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
+    bench = bench_of(programmed_rig(calibration={"hpf": str(write_calibration(file, tmp_path))}))
     bench.hello = HelloReply(pi_release="", firmware="", backend=backend, state="homed", scan_id="", last_seq=0)
     found = walk_one(bench, "calibration")
     assert (found.verdict, "simulated" in found.found) == (verdict, verdict == "error")

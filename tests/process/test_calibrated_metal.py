@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.host.calibration.files import SourceScan
-from polysight.host.calibration.metal import write_metal
+from polysight.host.calibration.files import SourceScan, write_metal
 from polysight.host.jobs.calibrate import load_reference
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.shared.geometry import rx_positions_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from tests.support.commands import content, told_by
@@ -23,8 +23,8 @@ def scan(scan_of, tmp_path_factory):
     """A scan whose filters were measured before it."""
     folder = tmp_path_factory.mktemp("sync")
     found = BoardFilter(TRUE_KHZ, [1.0, 1.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    made = head("hpf", [SourceScan("sweep", "sweep", True, 3)])
-    path = write(FilterFile(**made, boards={"RH": found, "RV": found}), folder / "calibration")
+    made = header("hpf", [SourceScan("sweep", "sweep", True, 3)])
+    path = write_calibration(FilterFile(**made, boards={"RH": found, "RV": found}), folder / "calibration")
     true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     more = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
     scan = scan_of(folder / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **more), true)

@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 
 from polysight.host.calibration.files import (
+    CalibrationFile,
     FilterFile,
     MetalFile,
     PlacesFile,
@@ -57,7 +58,7 @@ class Calibration:
             return rig
         if places_crc32(rig) != self.places.rig_crc32:
             raise ConfigError(
-                f"{self._path('direct_path')}: made for other mounts, antennas or another object distance",
+                f"{self.path('direct_path')}: made for other mounts, antennas or another object distance",
                 "the rig file was changed after the calibration",
                 "calibrate again with this rig file, or empty calibration.direct_path",
                 code=ErrorCode.MISMATCH,
@@ -74,7 +75,7 @@ class Calibration:
             if found is None or [float(khz) for khz in found.programmed_khz if khz] != programmed:
                 what = "is not in it" if found is None else f"was measured with {found.programmed_khz} kHz programmed"
                 raise ConfigError(
-                    f"{self._path('hpf')}: {board.name} {what}, the rig file says {programmed}",
+                    f"{self.path('hpf')}: {board.name} {what}, the rig file says {programmed}",
                     "the boards or chirp.hpf1_khz, hpf2_khz were changed after the calibration",
                     "calibrate again with this rig file, or empty calibration.hpf",
                     code=ErrorCode.MISMATCH,
@@ -94,7 +95,7 @@ class Calibration:
 
     def reference(self) -> PlaneReference | None:
         """Return the metal reference, pixel by pixel; None without one. Raises DataError if its images have changed."""
-        return None if self.metal is None else read_metal(self.metal, self._path("metal").parent / self.metal.images)
+        return None if self.metal is None else read_metal(self.metal, self.path("metal").parent / self.metal.images)
 
     def high_passes(self, rig: Instrument) -> dict[str, HighPass | None]:
         """Return the measured filter of every receiver, by name; None: as programmed."""
@@ -125,7 +126,7 @@ class Calibration:
         """
         plane, name = chosen, "the metal reference"
         if plane is None and not in_scene:
-            plane, name = self.reference(), self.name_of("metal")
+            plane, name = self.reference(), str(self.path("metal"))
         if plane is not None:
             plane.check_rig(self.imaged_with(rig), name)
             plane.check_bands(bands, name)
@@ -136,24 +137,20 @@ class Calibration:
         return ImagedWith.of(placed, self.high_passes(placed))
 
     def facts(self) -> dict[str, Any]:
-        """Return the active files by kind: path, date, and whether they come from simulated data."""
-        kinds = {"direct_path": self.places, "hpf": self.filters, "metal": self.metal}
-        return {
-            kind: {"file": str(self._path(kind)), "made_utc": file.made_utc, "simulated": file.simulated}
-            for kind, file in kinds.items()
-            if file is not None
+        """Return `calibration` of quality.json: the active files by kind, with date and origin; empty without files."""
+        active = {
+            kind: {"file": str(self.path(kind)), "made_utc": file.made_utc, "simulated": file.simulated}
+            for kind, file in self.files().items()
         }
-
-    def quality_facts(self) -> dict[str, Any]:
-        """Return `calibration` of quality.json: :meth:`facts`; empty without calibration."""
-        active = self.facts()
         return {"calibration": active} if active else {}
 
-    def name_of(self, kind: str) -> str:
-        """Return the path of a kind's file, for messages."""
-        return str(self._path(kind))
+    def files(self) -> dict[str, CalibrationFile]:
+        """Return the active calibration files by kind."""
+        files = {"direct_path": self.places, "hpf": self.filters, "metal": self.metal}
+        return {kind: file for kind, file in files.items() if file is not None}
 
-    def _path(self, kind: str) -> Path:
+    def path(self, kind: str) -> Path:
+        """Return the path of an active file."""
         return (self.paths or {}).get(kind, Path(kind))
 
 
@@ -229,13 +226,13 @@ def checked_calibration(rig: Instrument, simulated: bool) -> Calibration:
     calibration = calibration_of_rig(rig)
     placed, reference = calibration.rig(rig), calibration.reference()
     if reference is not None:
-        reference.check_rig(calibration.imaged_with(placed), calibration.name_of("metal"))
+        reference.check_rig(calibration.imaged_with(placed), str(calibration.path("metal")))
         grid = image_grid(placed)
         reference.check_axes(grid.x_m, grid.y_m)
-    for kind, fact in calibration.facts().items():
-        if fact["simulated"] and not simulated:
+    for kind, file in calibration.files().items():
+        if file.simulated and not simulated:
             raise ConfigError(
-                f"{fact['file']}: made from simulated data",
+                f"{calibration.path(kind)}: made from simulated data",
                 "simulated data do not describe a real rig",
                 f"calibrate with the rig, or empty calibration.{kind}",
                 code=ErrorCode.MISMATCH,

@@ -168,8 +168,8 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
                 raise
             if (out / REPORT).exists():
                 where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
-                raise DataError(e.what, e.why, advice(e.remedy, where)) from None
-            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"))
+                raise DataError(e.what, e.why, advice(e.remedy, where), code=e.code) from None
+            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
 
 

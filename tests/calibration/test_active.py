@@ -97,7 +97,7 @@ def test_without_files_nothing_changes(make_rig):
     calibration = calibration_of_rig(rig)
     assert calibration.rig(rig) is rig
     assert calibration.high_pass("RH") is calibration.reference() is None
-    assert calibration.facts() == {}
+    assert calibration.files() == calibration.facts() == {}
 
 
 def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, hpf):
@@ -112,14 +112,14 @@ def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, 
     assert after.filters == before.filters
     assert after.high_pass("RH").corners_hz == (180.5e3, 355.25e3)
     np.testing.assert_array_equal(after.reference().h, before.reference().h)
-    assert set(after.facts()) == {"hpf", "metal"}
+    assert set(after.files()) == {"hpf", "metal"}
 
 
 def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_naming, hpf):
     metal = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "b")
     hpf, metal = (path.rename(path.with_name("latest.toml")) for path in (hpf, metal))
     calibration = calibration_of_scan(create(tmp_path / "s", rig_naming(hpf=hpf, metal=metal)))
-    assert set(calibration.facts()) == {"hpf", "metal"}
+    assert set(calibration.files()) == {"hpf", "metal"}
 
 
 def test_metal_of_other_pixels_is_refused_before_the_scan(tmp_path, make_rig, rig_naming):

@@ -50,7 +50,7 @@ class Pipeline:
         """Form both images on the rig file's plane, divided by the footprint, not referenced; `from_sums`: live."""
         with self.quality.timed("image"):
             images = self.images.current() if from_sums else self.images.finish()
-        self.quality.note(**self.calibration.facts(), **self.synchroniser.recording_facts())
+        self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 
     def metal_plane(self, options: process.Options, in_scene: bool = False) -> polarimetry.PlaneReference | None:

@@ -137,12 +137,15 @@ class Calibration:
         return ImagedWith.of(placed, self.high_passes(placed))
 
     def facts(self) -> dict[str, Any]:
-        """Return `calibration` of quality.json: the active files by kind, with date and origin; empty without files."""
-        active = {
+        """Return path, date and origin of the active files, by kind."""
+        return {
             kind: {"file": str(self.path(kind)), "made_utc": file.made_utc, "simulated": file.simulated}
             for kind, file in self.files().items()
         }
-        return {"calibration": active} if active else {}
+
+    def quality_facts(self) -> dict[str, Any]:
+        """Return :meth:`facts` as the entry `calibration` of quality.json; empty without files."""
+        return {"calibration": self.facts()} if self.files() else {}
 
     def files(self) -> dict[str, CalibrationFile]:
         """Return the active calibration files by kind."""

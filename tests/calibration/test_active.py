@@ -97,7 +97,7 @@ def test_without_files_nothing_changes(make_rig):
     calibration = calibration_of_rig(rig)
     assert calibration.rig(rig) is rig
     assert calibration.high_pass("RH") is calibration.reference() is None
-    assert calibration.files() == calibration.facts() == {}
+    assert calibration.files() == {}
 
 
 def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, hpf):

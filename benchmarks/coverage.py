@@ -1,6 +1,6 @@
 """Do the error bars hold? Simulated scenes with drawn nuisances, judged by the program; coverage of its regions.
 
-Every scene is drawn at random: materials with their specimens' spread, leakage of any phase, the plane's distance and tilt,
+Scenes are random: materials with their specimens' spread, leakage of any phase, the plane's distance and tilt,
 each plate's tilt, height and roughness, a weak or strong direct path, metal in the scene or scanned on its own. Most
 scenes start from samples as perfect synchronisation leaves them (`synced_cube`), some from raw data. All is simulated,
 by simulators that share nothing with the host's optics; for a real rig the figures are an expectation.

@@ -211,8 +211,8 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
     percent = {key: 100 * entry[key] for key in entry}
     print(
         f"{title:22s} {len(rows):4d} cases, {len(rows) - len(fits)} not fitted   within 5 %: {percent['right']:5.1f} %"
-        f"   flagged ambiguous: {percent['ambiguous']:5.1f} % ({percent['rivals']:.1f} % with rivals)   wrong, not"
-        f" flagged: {entry['wrong, not flagged']:.0f} of {len(sure)}\n{'':22s} regions without rivals ({everywhere.size}): 68 %"
+        f"   ambiguous: {percent['ambiguous']:5.1f} % ({percent['rivals']:.1f} % with rivals)   wrong, not flagged:"
+        f" {entry['wrong, not flagged']:.0f} of {len(sure)}\n{'':22s} regions without rivals ({everywhere.size}): 68 %"
         f" {percent['in_68, no rivals']:5.1f}, 95 % {percent['in_95, no rivals']:5.1f}; of those not flagged 68 %"
         f" {percent['in_68']:5.1f}, 95 % {percent['in_95']:5.1f}   median error {percent['median_error']:.1f} %, stated"
         f" {percent['median_std']:.1f} %, not explained {percent['unexplained']:.1f} %",

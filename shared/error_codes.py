@@ -43,3 +43,8 @@ class ErrorCode(StrEnum):
     NO_DATA = "no-data"
     NOT_ENOUGH_DATA = "not-enough-data"
     MISMATCH = "mismatch"  # two pieces of data that do not belong together
+
+    # Acquisition
+    ROW_INCOMPLETE = "row-incomplete"  # all retakes of a row are used up
+    STAGE_NOT_READY = "stage-not-ready"  # not homed, in a fault, or another host's
+    STAGE_DIFFERS = "stage-differs"  # the Pi's [stage] places rows elsewhere

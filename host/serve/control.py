@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from polysight.host.acquisition import Wish
+from polysight.host.acquisition import ScanCommand
 from polysight.host.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
 from polysight.host.jobs.label import save_labels
 from polysight.host.materials import Labels
@@ -177,9 +177,9 @@ async def _wish(site: Site, request: Request, wanted: Request_) -> dict[str, Any
     del wanted
     name = site.name(request)
     try:
-        wish = Wish(request.path_params["wish"])
+        wish = ScanCommand(request.path_params["wish"])
     except ValueError:
-        raise UnknownWishError(f"one of {', '.join(Wish)}") from None
+        raise UnknownWishError(f"one of {', '.join(ScanCommand)}") from None
     watch = await site.act(site.watches.of, name, site.scans.folder(name))
     await site.act(watch.ask, wish)
     return {"what": "asked"}

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames
-from polysight.host.acquisition.slipped_row import describe, write_in_place
+from polysight.host.acquisition.slipped_row import describe, rewrite_row
 from polysight.host.capture.receiver import ReceiverProcess
 from polysight.host.capture.segment import read_index, write_index
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, US, Load, pulse_times, receive
@@ -137,7 +137,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
     received.tofile(path)
     write_index(path.with_suffix(".idx"), {"missing": [[0, 30 * frame]]}, np.array([[1, extent]], dtype=np.int64))
     where = PlacedFrames(np.where(np.isin(slots, list(unsure)), -1, slots), sorted(missed), 30)
-    capture = write_in_place(path, _capture(30 * frame, holes), where, frame)
+    capture = rewrite_row(path, _capture(30 * frame, holes), where, frame)
     got = np.fromfile(path, dtype=np.uint8)
     np.testing.assert_array_equal(got, want)
     mask = np.zeros(got.size, dtype=bool)
@@ -212,7 +212,7 @@ def _placed_or_masked(make_instrument, folder: Path, burners: int) -> bool:
     if result.reason:  # too busy to tell
         assert (result.slots == -1).all()
         return False
-    moved = write_in_place(path, row, result, FRAME)
+    moved = rewrite_row(path, row, result, FRAME)
     got = np.fromfile(path, dtype="<u4").reshape(-1, FRAME // 4)[:, 0]
     sure = result.slots[result.slots >= 0]
     np.testing.assert_array_equal(got[sure], sure + 1)

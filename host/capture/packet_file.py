@@ -46,7 +46,7 @@ class Evidence(msgspec.Struct, frozen=True):
 def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
     """Write a row's packets durably; returns the file's CRC-32. Without `placed` all of the payload goes in here.
 
-    Raises DeviceError when the disk fails.
+    Raises DeviceError if the disk fails.
     """
     kept = log.kept
     sizes, sequences, counts = log.sizes[:kept], log.sequences[:kept], log.byte_counts[:kept]
@@ -93,7 +93,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
     Raises
     ------
     DataError
-        when the file is absent or damaged, or does not belong to the row.
+        if the file is absent or damaged, or does not belong to the row.
     """
     try:
         line, _, tail = read_bounded(path, PacketLog.most_kept(row.size) + _MOST_RUN_BYTES).partition(b"\n")

@@ -39,7 +39,7 @@ class AppendFile:
     Raises
     ------
     DeviceError
-        when it cannot be opened.
+        if it cannot be opened.
     """
 
     def __init__(self, path: Path, create: bool) -> None:
@@ -56,9 +56,9 @@ class AppendFile:
             raise self._failed("made" if fresh else "opened", e) from None
 
     def lock(self) -> bool:
-        """Keep other programs from locking this file, until it is closed; False when one has.
+        """Keep other programs from locking this file, until it is closed; False if one has.
 
-        Raises DeviceError when the file system cannot lock; the file is closed then.
+        Raises DeviceError if the file system cannot lock; the file is closed then.
         """
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

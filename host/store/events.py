@@ -43,7 +43,7 @@ class EventLog:
 
 
 def read_events(path: Path) -> EventLog:
-    """Read an event file up to its first damage; an absent one is empty. Raises DataError when it cannot be read."""
+    """Read an event file up to its first damage; an absent one is empty. Raises DataError if it cannot be read."""
     raw = _bytes_of(path)
     log = EventLog([], 0)
     try:
@@ -62,7 +62,7 @@ def read_events(path: Path) -> EventLog:
 
 
 def _is_beginning(raw: bytes) -> bool:
-    """Whether this could be the beginning of an event, and no more."""
+    """True if this could be the beginning of an event, and no more."""
     try:
         return not any(True for _ in _ends(raw))
     except (ValueError, msgpack.UnpackException):
@@ -105,7 +105,7 @@ class EventWriter:
     Raises
     ------
     DataError, DeviceError
-        when the file cannot be read or written.
+        if the file cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:

@@ -94,7 +94,7 @@ def digest_of(line: bytes) -> str:
 
 
 def decode_line(line: bytes) -> Fact | None:
-    """A line's fact without its CRC; None when the line is not one or its CRC is wrong."""
+    """A line's fact without its CRC; None if the line is not one or its CRC is wrong."""
     try:
         fact = json.loads(line)
     except (ValueError, RecursionError):
@@ -161,7 +161,7 @@ def _compare(link: tuple[int, str], found: Manifest, due: int, number: int) -> N
 
 
 def read(path: Path) -> Manifest:
-    """Read a manifest. Raises DataError when the file is absent or unreadable."""
+    """Read a manifest. Raises DataError if the file is absent or unreadable."""
     try:
         return parse(read_bounded(path, MOST_JSON_BYTES))
     except OSError as e:
@@ -178,7 +178,7 @@ class ManifestWriter:
     Raises
     ------
     DeviceError
-        when another program holds the scan, or the file cannot be written.
+        if another program holds the scan, or the file cannot be written.
     """
 
     def __init__(self, path: Path, create: bool) -> None:

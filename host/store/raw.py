@@ -62,7 +62,7 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
     Raises
     ------
     ScanError
-        when rows are missing: they could still be taken, and the image made again from all of them.
+        if rows are missing: they could still be taken, and the image made again from all of them.
     """
     rows = scan.committed()
     missing = scan.plan.rows - len(rows)
@@ -98,7 +98,7 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
     Raises
     ------
     DeviceError
-        when the scan is in use, or the disk fails; what was not removed yet is removed by the next call.
+        if the scan is in use, or the disk fails; what was not removed yet is removed by the next call.
     """
     sync_folder(products)  # what was made from them must not be lost to a power cut
     inside = products.resolve().is_relative_to(scan.path.resolve())

@@ -70,7 +70,7 @@ def place_again(path: Path) -> PlacedAgain:
 
 
 def damage_of(scan: ScanFolder, path: Path) -> str:
-    """What is wrong with a row's files beside the manifest; "" when nothing is."""
+    """What is wrong with a row's files beside the manifest; "" if nothing is."""
     for row in scan.committed().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():
@@ -87,7 +87,7 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
     Raises
     ------
     DeviceError
-        when the scan is in use, or the disk fails; rows that were not done yet are as they were.
+        if the scan is in use, or the disk fails; rows that were not done yet are as they were.
     """
     found = []
     with scan.writer() as writer:
@@ -121,7 +121,7 @@ def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, Place
 
 
 def _strange(path: Path, board: BoardRow) -> str:
-    """Which of a row's files is not the one that was committed; "" when all are. Raises OSError."""
+    """Which of a row's files is not the one that was committed; "" if all are. Raises OSError."""
     committed = (
         (".bin", board.crc32, "its bytes are not those that were committed"),
         (".idx", board.index_crc32, "its index is not the one that was committed"),

@@ -193,7 +193,7 @@ class ScanFolder:
         Raises
         ------
         DeviceError
-            when the folder holds a scan already or cannot be written.
+            if the folder holds a scan already or cannot be written.
         """
         fact: Fact = {
             **(extra or {}),
@@ -215,7 +215,7 @@ class ScanFolder:
 
     @staticmethod
     def load(path: Path) -> ScanFolder:
-        """Read a scan folder. Raises DataError or ConfigError when it is not one, or links lead out of it."""
+        """Read a scan folder. Raises DataError or ConfigError if it is not one, or links lead out of it."""
         if (path / MANIFEST).exists():
             check_links(path)
         return ScanFolder(path, manifest.read(path / MANIFEST))
@@ -226,7 +226,7 @@ class ScanFolder:
         self.instrument = self._latest()
 
     def writer(self) -> ManifestWriter:
-        """Open the scan for appending; a torn last line is cut off. Raises DeviceError when the scan is in use."""
+        """Open the scan for appending; a torn last line is cut off. Raises DeviceError if the scan is in use."""
         writer = ManifestWriter(self.path / MANIFEST, create=False)
         try:
             for board in self.instrument.recorded:
@@ -302,7 +302,7 @@ class ScanFolder:
 
     @property
     def complete(self) -> bool:
-        """Whether every row of the plan is committed."""
+        """True if every row of the plan is committed."""
         return len(self.committed()) == self.plan.rows
 
     def row_path(self, board: str, row: int) -> Path:
@@ -315,7 +315,7 @@ class ScanFolder:
         Raises
         ------
         DataError
-            when the row is not committed, or its files are absent or damaged.
+            if the row is not committed, or its files are absent or damaged.
         """
         found = self._committed().get(row)
         board = None if found is None else found.boards.get(board_name)

@@ -44,7 +44,7 @@ class RowData:
 
     @property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Bool [bytes], True where a byte is missing; None when the row is complete."""
+        """Bool [bytes], True where a byte is missing; None if the row is complete."""
         if not self.missing:
             return None
         mask = np.zeros(self.payload.size, dtype=np.bool_)
@@ -88,7 +88,7 @@ class Scan(Protocol):
 
     @property
     def simulated(self) -> bool:
-        """Whether the data was simulated."""
+        """True if the data was simulated."""
         ...
 
     @property
@@ -102,12 +102,12 @@ class Source(Scan, Protocol):
 
     @property
     def mirrored(self) -> bool:
-        """Whether it was recorded column by column: rig, plan and images are then mirrored in x = y."""
+        """True if it was recorded column by column: rig, plan and images are then mirrored in x = y."""
         ...
 
     @property
     def synchronised(self) -> bool:
-        """Whether another program has synchronised it already: the chirps are not in it."""
+        """True if another program has synchronised it already: the chirps are not in it."""
         ...
 
     @property
@@ -120,7 +120,7 @@ class Source(Scan, Protocol):
         ...
 
     def read_row(self, board_name: str, row: int) -> RowData | CubeRow:
-        """One board's recording of one row. Raises DataError when it is absent or damaged."""
+        """One board's recording of one row. Raises DataError if it is absent or damaged."""
         ...
 
     def recording_facts(self) -> dict[str, Any]:
@@ -132,7 +132,7 @@ class RawSource(Source, Protocol):
     """A source with the chirps still in it. Build with :func:`raw_source`."""
 
     def read_row(self, board_name: str, row: int) -> RowData:
-        """One board's recording of one row. Raises DataError when it is absent or damaged."""
+        """One board's recording of one row. Raises DataError if it is absent or damaged."""
         ...
 
 
@@ -142,7 +142,7 @@ def raw_source(source: Source, where: Path) -> RawSource:
     Raises
     ------
     DataError
-        when another program has synchronised it.
+        if another program has synchronised it.
     """
     if source.synchronised:
         raise DataError(

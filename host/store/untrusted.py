@@ -36,7 +36,7 @@ def inside(folder: Path, name: str, within: str = "") -> Path:
     Raises
     ------
     DataError
-        when it lies elsewhere, links followed.
+        if it lies elsewhere, links followed.
     """
     path, root = folder / name, (folder / within).resolve()
     try:
@@ -102,9 +102,9 @@ def open_npz(path: Path) -> Iterator[Any]:
     Raises
     ------
     DataError
-        when it is no regular file, or its arrays would take more than :data:`MOST_BYTES`.
+        if it is no regular file, or its arrays would take more than :data:`MOST_BYTES`.
     OSError, ValueError, KeyError, EOFError
-        when it is no such archive, as numpy does.
+        if it is no such archive, as numpy does.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "it is a folder", str(path))

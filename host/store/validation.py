@@ -39,7 +39,7 @@ class Finding:
 
 
 def validate(path: Path) -> list[Finding]:
-    """Every fault of a scan folder; empty when it is whole and finished. Raises DataError when it is no scan."""
+    """Every fault of a scan folder; empty if it is whole and finished. Raises DataError if it is no scan."""
     content = manifest.read(path / MANIFEST)
     found = []
     if content.torn:
@@ -73,7 +73,7 @@ def validate(path: Path) -> list[Finding]:
 def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
     """Committed rows that are not, on the disk, what was committed: row to what is wrong with it. Reads every byte.
 
-    Raises DeviceError when the disk does not give a file back: it may be whole, and must not be taken again.
+    Raises DeviceError if the disk does not give a file back: it may be whole, and must not be taken again.
     """
     found = {row.row: _row(scan, row) for row in scan.committed().values()}
     if unreadable := [f for faults in found.values() for f in faults if f.unreadable]:
@@ -91,7 +91,7 @@ def _lost_lines(fault: ManifestFault, lost: str) -> Finding:
 
 
 def _what_is_lost(scan: ScanFolder) -> str:
-    """Which rows are not committed; "" when every row is, whatever a lost line said."""
+    """Which rows are not committed; "" if every row is, whatever a lost line said."""
     absent = scan.rows_absent
     if not absent:
         return ""

@@ -14,7 +14,7 @@ from polysight.shared.errors import DataError, no_such
 
 
 def is_source(path: Path) -> bool:
-    """Whether a folder is a scan folder, or `unsynced/<scan>` or `raw/<scan>` of the published data."""
+    """True if a folder is a scan folder, or `unsynced/<scan>` or `raw/<scan>` of the published data."""
     known = (MANIFEST, COLLECTION)
     return path.is_dir() and (any((path / name).exists() for name in known) or any(path.glob("*" + SYNCED)))
 
@@ -35,9 +35,9 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
     Raises
     ------
     DataError
-        when it is none of them, when its raw rows were dropped, or when an authors' scan is opened without `base`.
+        if it is none of them, when its raw rows were dropped, or when an authors' scan is opened without `base`.
     ConfigError
-        when the rig file is wrong.
+        if the rig file is wrong.
     """
     if (path / MANIFEST).exists():
         scan = ScanFolder.load(path)

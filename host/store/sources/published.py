@@ -86,7 +86,7 @@ class _Published:
 
     @property
     def simulated(self) -> bool:
-        """Whether the description says so."""
+        """True if the description says so."""
         return "simulated" in self._settings.description.lower()
 
     @property
@@ -101,7 +101,7 @@ class PublishedScan(_Published):
     Raises
     ------
     DataError
-        when the files are not of that form.
+        if the files are not of that form.
     """
 
     def __init__(self, path: Path, base: Instrument) -> None:
@@ -145,7 +145,7 @@ class PublishedScan(_Published):
         Raises
         ------
         DataError
-            when the row is absent, or file and log contradict each other.
+            if the row is absent, or file and log contradict each other.
         """
         stream = self._stream(board_name, row)
         if stream is None:
@@ -243,7 +243,7 @@ class PublishedCubes(_Published):
         Raises
         ------
         DataError
-            when the cube is absent or has another shape than the scan's settings.
+            if the cube is absent or has another shape than the scan's settings.
         """
         file = self.path / f"{board_name}{SYNCED}"
         try:

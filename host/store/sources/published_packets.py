@@ -84,7 +84,7 @@ class Bursts(NamedTuple):
 
 
 def read_log(path: Path) -> PacketLog | None:
-    """A row's packet log; None when there is none. A header line is skipped.
+    """A row's packet log; None if there is none. A header line is skipped.
 
     The last packet, when it is not full, counts as come with the one before it: the card holds it back for 2 s, and it
     would look like one more position.
@@ -144,7 +144,7 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     Raises
     ------
     DataError
-        when file and log are not of one recording.
+        if file and log are not of one recording.
     """
     raw = np.fromfile(file, np.uint8)
     none = np.zeros(0, np.int64)

@@ -51,7 +51,7 @@ class Collection(msgspec.Struct, frozen=True):
 
     @property
     def by_columns(self) -> bool:
-        """Whether the stage ran along y, column after column."""
+        """True if the stage ran along y, column after column."""
         return self.moving_direction == "col"
 
 
@@ -63,7 +63,7 @@ class Rig(NamedTuple):
 
 
 def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
-    """A JSON object from a file; empty when it is absent and may be. Raises DataError."""
+    """A JSON object from a file; empty if it is absent and may be. Raises DataError."""
     if missing_ok and not path.exists():
         return {}
     try:

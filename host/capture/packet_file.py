@@ -18,6 +18,7 @@ from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed
 from polysight.host.capture.segment import damaged, write_durably
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_bounded
 
@@ -111,7 +112,8 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
             raise ValueError("it does not hold what it says")
         log.malformed = int(head["malformed"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as e:
-        raise DataError(f"{path}: not a readable packet log: {e}", *damaged(path)) from None
+        what = f"{path}: not a readable packet log: {e}"
+        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
     return evidence, log
 
 

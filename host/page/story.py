@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from polysight.host.acquisition import FaultKind, typical_row_s
 from polysight.host.plan import scan_time
-from polysight.host.store import Fact, reconnected
+from polysight.host.store import Fact, with_connection
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain
@@ -267,7 +267,7 @@ class Story:
         self.ended, self.paused = None, False
         self.run_started_s = seconds(fact["resumed_utc"])
         if fact.get("rig"):  # the Pi is somewhere else from now on
-            self.instrument = reconnected(self.instrument, fact["rig"])
+            self.instrument = with_connection(self.instrument, fact["rig"])
 
     def _scan_paused(self, fact: Fact) -> None:
         self.paused, self._paused_at = True, seconds(fact["paused_utc"])

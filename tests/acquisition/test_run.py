@@ -281,7 +281,7 @@ def test_port_in_use_is_named(rig, tmp_path):
 def test_existing_scan_is_not_overwritten(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
     before = digests(ScanFolder.load(tmp_path / "s"))
-    with pytest.raises(DeviceError, match="manifest"):
+    with refused(ErrorCode.FILE_EXISTS, "manifest"):
         run_scan(rig.instrument, tmp_path / "s")
     assert digests(ScanFolder.load(tmp_path / "s")) == before
 

@@ -293,5 +293,5 @@ def test_a_whole_scan_does_not_fail_because_the_pi_could_not_be_told(rig, tmp_pa
     monkeypatch.setattr(PiClient, "end_run", refused)
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.folder.complete) == ("success", True)
-    assert any("could not be told" in w for w in result.warnings)
+    assert any("the Pi did not write it down" in w for w in result.warnings)
     assert [f["exit_status"] for f in result.folder.facts("scan_ended")] == ["success"]

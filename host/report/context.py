@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
+from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, expected_pixel_accuracy, pixel_accuracy
 from polysight.host.products import SavedProducts, withhold
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.raster import RasterPlan
@@ -54,6 +54,8 @@ class ReportContext:
         One sentence: which patch is the metal reference and how it was chosen.
     pixel_accuracy
         Share of interior pixels named right, where the truth is known.
+    expected_accuracy
+        Share that the best classifier is expected to reach on the same pixels, by their own probabilities.
     library_note
         Where the classifier's library comes from and how well it does on scans left out.
     quality
@@ -94,6 +96,7 @@ class ReportContext:
     truth: list[dict[str, Any]] | None = None
     metal_how: str = ""
     pixel_accuracy: float | None = None
+    expected_accuracy: float | None = None
     library_note: str = ""
     quality: dict[str, Any] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
@@ -114,7 +117,8 @@ class ReportContext:
         nothing: dict[str, Any] = {
             "materials": [{**row, "metal_reference": False} for row in bare],
             "quality": _without_results(self.quality),
-            **{"pixel_names": {}, "truth": None, "pixel_accuracy": None, "library_note": "", "metal_how": ""},
+            **{"pixel_names": {}, "truth": None, "pixel_accuracy": None, "expected_accuracy": None},
+            **{"library_note": "", "metal_how": ""},
         }
         for name, value in nothing.items():
             object.__setattr__(self, name, value)
@@ -172,6 +176,7 @@ def context_of(
         truth=[{"name": t.name, "box_mm": t.box_mm, "permittivity": t.permittivity} for t in plates] or None,
         metal_how=result.metal.how,
         pixel_accuracy=pixel_accuracy(result),
+        expected_accuracy=expected_pixel_accuracy(result),
         library_note=named_by,
         quality=quality or {},
         config=config or {},

@@ -186,7 +186,9 @@ def key_numbers(ctx: ReportContext, rows: list[dict[str, Any]]) -> list[dict[str
     elif rows:
         add(str(len(rows)), "patches found")
     if ctx.pixel_accuracy is not None:
-        add(f"{100 * ctx.pixel_accuracy:.1f} %", "of interior pixels named right")
+        expected = ctx.expected_accuracy
+        aside = "" if expected is None else f"; their own confidence expects {100 * expected:.1f} %"
+        add(f"{100 * ctx.pixel_accuracy:.1f} %", f"of interior pixels named right{aside}")
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")

@@ -119,6 +119,7 @@ def ctx():
         truth=TRUTH,
         metal_how="given as patch 1",
         pixel_accuracy=0.5,
+        expected_accuracy=0.96,
         library_note="a library.",
         quality=QUALITY,
         config={"grid": "140 x 120"},
@@ -181,7 +182,7 @@ def test_results_stand_beside_the_truth(page):
     _, html = page
     words = Page(html).words
     assert "1 of 3 plates named right" in words
-    assert "50.0 % of interior pixels" in words
+    assert "50.0 % of interior pixels named right; their own confidence expects 96.0 %" in words
     assert "✗ acrylic" in words
     assert "✓ copper" in words
     assert "Not found: cork" in words

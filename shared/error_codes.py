@@ -43,3 +43,9 @@ class ErrorCode(StrEnum):
     NO_DATA = "no-data"
     NOT_ENOUGH_DATA = "not-enough-data"
     MISMATCH = "mismatch"  # two pieces of data that do not belong together
+
+    # host/serve
+    HOST_UNKNOWN = "host-unknown"  # the request's Host is no name of this server
+    ORIGIN_FOREIGN = "origin-foreign"  # the request comes from a page of another site
+    READ_ONLY = "read-only"
+    TOKEN_WRONG = "token-wrong"

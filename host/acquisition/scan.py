@@ -17,7 +17,7 @@ from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult
 from polysight.host.acquisition.ready import check_same_stage, differences, pi_fact
 from polysight.host.acquisition.scan_loop import RunningScan
-from polysight.host.calibration import keep_in_scan
+from polysight.host.calibration import copy_into_scan
 from polysight.host.radar import RadarControl, radar_control
 from polysight.host.store import (
     ManifestWriter,
@@ -84,7 +84,7 @@ def run_scan(
             scan_id=new_scan_id(),
             extra={
                 "pi": pi_fact(hello),
-                "calibration": keep_in_scan(instrument, folder, simulated),
+                "calibration": copy_into_scan(instrument, folder, simulated),
             },
         )
         writer = stack.enter_context(scan.writer())

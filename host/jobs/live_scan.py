@@ -27,7 +27,7 @@ from polysight.host.acquisition import (
     resume_scan,
     run_scan,
 )
-from polysight.host.calibration import Calibration, of_rig, of_scan
+from polysight.host.calibration import Calibration, calibration_of_rig, calibration_of_scan
 from polysight.host.imaging import image_grid
 from polysight.host.jobs.process import check_options, load_options, make_products, publish_images, truth_of
 from polysight.host.materials import TRUTH, read_truth
@@ -205,7 +205,7 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
     if truth is not None and not truth.is_file():
         raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
     if process:
-        _check_options(options, rig, of_rig(rig))
+        _check_options(options, rig, calibration_of_rig(rig))
         if truth is not None:
             read_truth(truth)
 
@@ -236,7 +236,7 @@ def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config
     if rig_now is not None:
         check_same_scan(source.instrument, rig_now, str(config))
     if process:
-        _check_options(options, source.instrument, of_scan(source))
+        _check_options(options, source.instrument, calibration_of_scan(source))
         check_products_folder(folder / PRODUCTS, source.scan_id)
 
     def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:

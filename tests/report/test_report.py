@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from polysight.host.process.quality import masked_runs
+from polysight.host.process import masked_runs
 from polysight.host.products import plain, read_image, write_atomically, write_image, write_json
 from polysight.host.report import ReportContext, write_report
 from polysight.host.report.maps import coverage_figure

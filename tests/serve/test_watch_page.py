@@ -39,6 +39,7 @@ def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size
         assert browser.text("headline") == "The scan is finished"
         assert browser.text("count") == "3 of 3 rows"
         assert "✓ whole" in browser.text("board-table")
+        assert browser.text("p_note") == "not referenced to metal: not processed"
         assert "direct path" in browser.text("profile") or browser.value(
             "document.getElementById('profile').textContent.includes('direct path')"
         )

@@ -75,20 +75,37 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         path = path.rstrip("`") or "$"
         value = _lookup(raw, path)
         key = path.removeprefix("$").lstrip(".")
-        code = ErrorCode.VALUE_INVALID
-        if unknown := re.search(r"unknown field `(.*)`", rule):
-            rule = f"no key {unknown[1]!r}: {_suggest_key(unknown[1], kind)}"
-            code = ErrorCode.KEY_UNKNOWN
-        elif "missing required field" in rule:
-            code = ErrorCode.KEY_MISSING
-        elif ", got `" in rule:
-            code = ErrorCode.TYPE_WRONG
+        rule, code = _plain_rule(rule, kind)
         raise ConfigError(
             f"{source}: {key}{' = ' + value if value else ''}{': ' if key else ''}{rule}",
             "the file breaks a rule of its format",
             f"correct {key or 'that'} in {source}; {keys or _RIG_KEYS}",
             code=code,
         ) from None
+
+
+_TYPES = {  # names of the types of JSON and TOML for messages
+    "int": "a whole number", "float": "a number", "str": "text", "bool": "true or false",
+    "array": "a list", "object": "a table", "null": "nothing",
+}  # fmt: skip
+
+
+def _plain_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
+    """Rewrite a message of msgspec in plain words, with its code; keep a rule of `require` as it is."""
+    if found := re.search(r"unknown field `(.*)`", rule):
+        return f"no key {found[1]!r}: {_suggest_key(found[1], kind)}", ErrorCode.KEY_UNKNOWN
+    if found := re.search(r"missing required field `(.*)`", rule):
+        return f"the key {found[1]!r} is missing", ErrorCode.KEY_MISSING
+    if found := re.fullmatch(r"Invalid enum value (.*)", rule):
+        return f"{found[1]} is not an allowed value", ErrorCode.VALUE_INVALID
+    found = re.fullmatch(r"Expected `(.+?)`( .+?)?(?:, got `?(.+?)`?)?", rule)
+    if found is None:
+        return rule, ErrorCode.VALUE_INVALID
+    wanted = " or ".join(_TYPES.get(name, name) for name in found[1].split(" | ") if name != "null")
+    limit = (found[2] or "").replace("matching regex", "of the form")
+    given = f", not {_TYPES.get(found[3], found[3])}" if found[3] else ""
+    code = ErrorCode.TYPE_WRONG if given and not limit else ErrorCode.VALUE_INVALID
+    return f"must be {wanted}{limit}{given}", code
 
 
 def _suggest_key(key: str, kind: Any) -> str:

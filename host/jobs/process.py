@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from polysight.host.calibration import of_scan
+from polysight.host.calibration import calibration_of_scan
 from polysight.host.imaging import (
     AS_IN_RIG_FILE,
     PLANE_REACH_M,
@@ -34,12 +34,12 @@ from polysight.host.process import (
     Options,
     ProcessRequest,
     Products,
-    Tell,
+    Progress,
     coverage_lines,
-    each_row,
+    map_rows,
+    no_progress,
     quality_content,
     save_images,
-    untold,
 )
 from polysight.host.products import (
     IMAGE,
@@ -86,7 +86,7 @@ def all_rows(
     if isinstance(source, ScanFolder) and not pipeline.samples.holds(rows):
         require_raw(source)
     console = Console(stderr=True)
-    done = each_row(pipeline.add_row, rows, threads)
+    done = map_rows(pipeline.add_row, rows, threads)
     for _ in track(done, "rows", total=len(rows), console=console, disable=not console.is_terminal):
         pass
     return pipeline
@@ -160,25 +160,25 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
     When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
     are. Raises PolysightError.
     """
-    with making_products(out, pipeline.source.scan_id) as new, _telling() as tell:
+    with making_products(out, pipeline.source.scan_id) as new, _progress() as progress:
         try:
-            return replace(pipeline.finish(new, options, plates, tell), folder=out)
+            return replace(pipeline.finish(new, options, plates, progress), folder=out)
         except DataError as e:
             if not (new / IMAGE).exists():
                 raise
             if (out / REPORT).exists():
                 where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
-                raise DataError(e.what, e.why, advice(e.remedy, where)) from None
-            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"))
+                raise DataError(e.what, e.why, advice(e.remedy, where), code=e.code) from None
+            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
 
 
 @contextmanager
-def _telling() -> Iterator[Tell]:
-    """Shows the step that is being done, on a terminal."""
+def _progress() -> Iterator[Progress]:
+    """Show the current step on a terminal."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield untold
+        yield no_progress
         return
     with console.status("image") as status:
         yield status.update
@@ -341,7 +341,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     from polysight.host.sync import BoardSetup, synchronise_row
 
     source = raw_source(open_source(data, config), data)
-    calibration = of_scan(source)
+    calibration = calibration_of_scan(source)
     rig = calibration.rig(source.instrument)
     chirp, reports = rig.chirp, {}
     for board in rig.receivers:

@@ -49,3 +49,8 @@ class ErrorCode(StrEnum):
     ORIGIN_FOREIGN = "origin-foreign"  # the request comes from a page of another site
     READ_ONLY = "read-only"
     TOKEN_WRONG = "token-wrong"
+
+    # host/acquisition
+    ROW_INCOMPLETE = "row-incomplete"  # all retakes of a row are used up
+    STAGE_NOT_READY = "stage-not-ready"  # not homed, in a fault, or another host's
+    STAGE_DIFFERS = "stage-differs"  # the Pi's [stage] places rows elsewhere

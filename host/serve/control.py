@@ -15,7 +15,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from polysight.host.acquisition import Wish
+from polysight.host.acquisition import ScanCommand
 from polysight.host.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
 from polysight.host.jobs.label import save_labels
 from polysight.host.materials import Labels
@@ -179,13 +179,13 @@ def _session(site: Site) -> Callable[[Request], Awaitable[Response]]:
 async def _control(site: Site, request: Request, body: Body) -> dict[str, Any]:
     del body
     name, given = site.name(request), request.path_params["wish"]
-    if given not in list(Wish):
+    if given not in list(ScanCommand):
         raise DataError(
-            f"a scan cannot be asked to {given[:40]!r}", "the name is wrong", f"one of {', '.join(Wish)}",
+            f"a scan cannot be asked to {given[:40]!r}", "the name is wrong", f"one of {', '.join(ScanCommand)}",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     watch = await site.read_scan(request, lambda folder: site.watches.of(name, folder))
-    await site.act(watch.ask, Wish(given))
+    await site.act(watch.ask, ScanCommand(given))
     return {"what": "asked"}
 
 

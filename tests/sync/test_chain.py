@@ -102,7 +102,8 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     df, phase = 0.35 + rng.uniform(-0.08, 0.08, shape), rng.uniform(-np.pi, np.pi, shape)
     frames = signal[0][:, None, None] * np.exp(2j * np.pi * df[..., None] * n + 1j * phase[..., None])
     frames = 800 * (frames + noise(frames.shape, -snr_db, rng))
-    done = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), replace(setup, examined=positions))
+    whole = replace(setup, examined=positions)
+    done = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), whole)
 
     echo = (done.samples[:, :, :192] / 800 - 1).astype(complex)
     mean = echo.mean(axis=1, keepdims=True)

@@ -337,10 +337,7 @@ M = TypeVar("M")
 
 def pack(message: AnyEvent | AnyCommand | AnyReply) -> bytes:
     """Pack a message as msgpack."""
-    packed = msgpack.packb(msgspec.to_builtins(message), use_bin_type=True)
-    if packed is None:
-        raise ProtocolError(f"{type(message).__name__} cannot be packed", code=ErrorCode.MESSAGE_INVALID)
-    return packed
+    return msgpack.packb(msgspec.to_builtins(message), use_bin_type=True) or b""
 
 
 def _unpack(raw: bytes, kind: Any, what: str) -> Any:

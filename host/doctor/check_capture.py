@@ -265,7 +265,7 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             _better_start(rig, board, median),
             **facts,
         )
-    delay_s = -signal.later_s(rig)[0]  # without the crystals' share
+    delay_s = -signal.start_delay_s(rig)[0]  # without the crystals' share
     if abs(delay_s) > _MAX_DELAY_S:
         start = board.start_offset_hz + delay_s * rig.chirp.slope_hz_per_s
         return warning(
@@ -293,7 +293,7 @@ def check_skew(context: CheckContext) -> Finding:
 def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     """Judge the receivers' start times. Relative to the transmitter they are as exact as the start frequencies."""
     h, v = rig.receivers
-    delay = {b.name: signals[b.name].later_s(rig) for b in (h, v)}  # mean and standard error, s
+    delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}  # mean and standard error, s
     skew = delay[v.name][0] - delay[h.name][0]
     uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
     jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s

@@ -6,7 +6,7 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-from polysight.host.calibration import checked
+from polysight.host.calibration import checked_calibration
 from polysight.host.capture import PRIORITY_REMEDY
 from polysight.host.doctor.context import CheckContext, Finding, error, not_checked, ok, warning
 from polysight.host.doctor.receiver_load import PACKET_TIME_US, card_rates
@@ -70,7 +70,7 @@ def check_pi_clock(context: CheckContext) -> Finding:
 def check_calibration(context: CheckContext) -> Finding:
     """Check the calibration files that a scan would copy into its folder."""
     simulated = context.hello is not None and is_simulated(context.hello.backend)
-    facts = checked(context.rig, simulated).facts()
+    facts = checked_calibration(context.rig, simulated).facts()
     if not facts:
         return ok("no calibration file is configured: geometry, filters and metal as in the rig file and the scene")
     return ok("; ".join(f"{kind} of {fact['made_utc'][:10]}" for kind, fact in facts.items()), **facts)

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 import tomli_w
 
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.host.capture.network import route_interface
 from polysight.host.cli.main import main
 from polysight.host.doctor import checks, kernel
@@ -60,8 +60,8 @@ def verdict_of(context, name):
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
     board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    file = FilterFile(**head("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
-    context = context_of(programmed_rig(calibration={"hpf": str(write(file, tmp_path))}))
+    file = FilterFile(**header("hpf", [SourceScan("s", "scans/s", True, 6)]), boards={"RH": board, "RV": board})
+    context = context_of(programmed_rig(calibration={"hpf": str(write_calibration(file, tmp_path))}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
     assert check_calibration(dataclasses.replace(context, hello=hello)).verdict == "ok"
     real = msgspec.structs.replace(hello, backend=GPIOD)

@@ -11,7 +11,7 @@ import pytest
 
 from polysight.host.acquisition.pi_client import RefusedError
 from polysight.host.acquisition.scan import run_scan
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
 from polysight.host.cli.main import main
 from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
@@ -135,7 +135,9 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     board = BoardFilter([180.5, 355.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
     other = BoardFilter([172.5, 347.0], [1.0, 2.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
     sources = [SourceScan("sweep", "scans/sweep", True, 6)]
-    path = write(FilterFile(**head("hpf", sources), boards={"RH": board, "RV": other}), live.folder / "calibration")
+    path = write_calibration(
+        FilterFile(**header("hpf", sources), boards={"RH": board, "RV": other}), live.folder / "calibration"
+    )
 
     def small(table):
         table["calibration"] = {"hpf": str(path)}

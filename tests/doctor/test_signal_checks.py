@@ -87,7 +87,7 @@ def test_trigger_skew_between_the_boards_is_recovered(skew_ns, verdict):
 def test_a_crystal_and_a_late_trigger_are_distinguished(ppm):
     signal = signal_of("RH", crystal_ppm={"receive_h": ppm}, sync_skew_ns={"receive_h": 3.0})
     assert signal.crystal_ppm(RIG) == pytest.approx(ppm, abs=0.15)
-    mean, unsure = signal.later_s(RIG)
+    mean, unsure = signal.start_delay_s(RIG)
     assert mean * 1e9 == pytest.approx(3.0, abs=5 * unsure * 1e9 + 0.3)
 
 

@@ -64,7 +64,7 @@ def test_each_row_sends_the_line_once_over_one_connection(server):
             radars.arm(48)
             assert client.recv(100) == b"Retrigger\n"
             assert radars.states()["RH"].state is RadarState.UNKNOWN
-            assert "never answers" in radars.states()["RH"].detail
+            assert "never replies" in radars.states()["RH"].detail
     assert client.recv(1) == b""
 
 
@@ -142,7 +142,7 @@ def test_half_open_connection_is_noticed():
     done = subprocess.run(
         ["unshare", "-rn", sys.executable, "-c", HALF_OPEN], capture_output=True, text=True, check=True, timeout=60
     )
-    assert "has not taken the line within 0.5 s" in done.stdout
+    assert "did not acknowledge the line within 0.5 s" in done.stdout
     assert "half-open" in done.stdout
 
 
@@ -253,7 +253,7 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
     radar = Radar("line_server", dict.fromkeys((b.name for b in rig.instrument.boards), server.address))
     with pytest.raises(ScanError, match="RH: no data") as e:
         run_scan(msgspec.structs.replace(rig.instrument, radar=radar), tmp_path / "s")
-    assert f"asked to re-arm at {server.address}, which never answers" in e.value.why
+    assert f"re-armed through {server.address}, which never replies" in e.value.why
     lines = [server.accept().recv(1000) for _ in rig.instrument.boards]
     assert lines == [LINE * 3] * 3
     rejected = reasons(ScanFolder.load(tmp_path / "s"))

@@ -13,7 +13,7 @@ NAMES = ("capture", "sync", "image", "whole", "waits", "scaling", "accuracy", "c
 
 
 def main(argv: list[str]) -> int:
-    """Run what is asked for; every benchmark prints its own table."""
+    """Run one benchmark or all; each prints its own table."""
     one_thread_each()
     modules = {name: importlib.import_module(f"benchmarks.{name}") for name in NAMES}
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)

@@ -1,8 +1,8 @@
-"""What the stage's travel within a burst costs an image, by speed, simulated: `python -m benchmarks.burst_motion`.
+"""Image error from the stage's travel within a burst, by speed, simulated: `python -m benchmarks.burst_motion`.
 
 Four points, nothing disturbed but the trigger's phase, steps of 2.5 mm: at 100 mm/s a burst of 16 pulses fills nearly
 all of one. Each speed is scanned with the stage in motion and, for comparison, standing still at each burst's mean
-position; what the images differ by is the motion's.
+position; the images differ by the motion alone.
 """
 
 from __future__ import annotations
@@ -82,20 +82,20 @@ def figure(found: dict[tuple[float, float], tuple[dict[str, float], Images]], pa
     speeds, amplitudes = (sorted({key[i] for key in found}) for i in (0, 1))
     for i, amplitude in enumerate(amplitudes):
         ax = fig.add_subplot(grid[0, 3 * i : 3 * i + 3])
-        for name, told in TREATMENTS.items():
-            ax.semilogy(speeds, [100 * found[s, amplitude][0][name] for s in speeds], "o-", label=told)
+        for name, label in TREATMENTS.items():
+            ax.semilogy(speeds, [100 * found[s, amplitude][0][name] for s in speeds], "o-", label=label)
         ax.set(xlabel="stage speed (mm/s)", ylabel="image error (%)")
         ax.set_title(f"points of {amplitude:g} of the direct path each", fontsize=9, loc="left")
         ax.grid(alpha=0.3)
     fig.axes[0].legend(fontsize=8, frameon=False)
     apart = found[speeds[-1], amplitudes[-1]][1]
     reach = [n * IMAGE["pixel_mm"] / 2 for n in (IMAGE["columns"], IMAGE["rows"])]
-    for i, (name, told) in enumerate(TREATMENTS.items()):
+    for i, (name, label) in enumerate(TREATMENTS.items()):
         ax = fig.add_subplot(grid[1, 2 * i : 2 * i + 2])
         level = 20 * np.log10(np.maximum(np.abs(apart[name]), 1e-6))
         extent = (-reach[0], reach[0], -reach[1], reach[1])
         shown = ax.imshow(level, origin="lower", extent=extent, vmin=-80, vmax=-40, cmap="cividis")
-        ax.set_title(f"{told}, {speeds[-1]:g} mm/s", fontsize=9, loc="left")
+        ax.set_title(f"{label}, {speeds[-1]:g} mm/s", fontsize=9, loc="left")
         ax.set(xlabel="x (mm)", ylabel="y (mm)" if i == 0 else "")
         if i == len(TREATMENTS) - 1:
             fig.colorbar(shown, ax=fig.axes[len(amplitudes) :], label="dB of the peak", shrink=0.8)

@@ -1,4 +1,4 @@
-"""Cards that send at a pace, on a loopback subnet of their own, and what waits for their receivers."""
+"""Cards that send at a pace, on a loopback subnet of their own, and a wait for their receivers."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
 
     Returns
     -------
-    CPU and wall seconds in all (`cpu_s`, `wall_s`); of what is done once, before the first row and after the last
+    CPU and wall seconds in all (`cpu_s`, `wall_s`); of the steps done once, before the first row and after the last
     (`once_cpu_s`); wall seconds from the last committed row to both images, again and again (`last_row_wall_s`); wall
     seconds by stage (`stages`).
     """

@@ -1,4 +1,4 @@
-"""Helper processes of a benchmark: told what to do in lines, answering in lines of JSON."""
+"""Helper processes of a benchmark: commands in lines, answers in lines of JSON."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Child:
 
 
 def ask(beside: Child | None) -> dict[str, Any]:
-    """What the processing beside has done so far."""
+    """Progress of the processing beside."""
     if beside is None:
         return {"rows": 0, "cpu_s": 0.0}
     beside.say()

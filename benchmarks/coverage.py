@@ -1,9 +1,9 @@
 """Do the error bars hold? Simulated scenes with drawn nuisances, judged by the program; coverage of its regions.
 
-Every scene is drawn anew: materials with their specimens' spread, leakage of any phase, the plane's distance and tilt,
+Scenes are random: materials with their specimens' spread, leakage of any phase, the plane's distance and tilt,
 each plate's tilt, height and roughness, a weak or strong direct path, metal in the scene or scanned on its own. Most
 scenes start from samples as perfect synchronisation leaves them (`synced_cube`), some from raw data. All is simulated,
-by simulators that share nothing with the host's optics; what it says of a real rig is an expectation.
+by simulators that share nothing with the host's optics; for a real rig the figures are an expectation.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ CLASSES = {"low loss": 0.05, "medium": 0.18, "lossy": np.inf}
 GRID = {"columns": 45, "rows": 43, "step_x_mm": 10.0, "step_y_mm": 6.0}
 PLACES = [(x, y) for y in (-34.0, 34.0) for x in (-66.0, 0.0, 66.0)]
 KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet")
-"""What a scene is drawn as; "sheet" is "full" with one thin sheet in air that nobody declares."""
+"""Kinds of scenes; "sheet" is "full" with one thin sheet in air that is not declared."""
 WHOLE = ("full", "sheet")
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
 CHI2_68, CHI2_95 = 2.279, 5.991
@@ -58,7 +58,7 @@ CHI2_68, CHI2_95 = 2.279, 5.991
 
 @dataclass(frozen=True)
 class PatchFigures:
-    """One judged patch: squared distance of the truth in its region, errors, and what it was named."""
+    """One judged patch: squared distance of the truth in its region, errors, and its name."""
 
     scene: int
     material: str
@@ -99,7 +99,7 @@ class Cubes:
 
 
 def draw_scene(seed: int, kind: str = "full") -> Scene:
-    """A scene of six plates, or of what `kind` says, with every nuisance drawn."""
+    """Draw a scene of six plates, or another of `KINDS`, with every nuisance at random."""
     rng = np.random.default_rng([20261122, seed, KINDS.index(kind)])
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
     materials = KNOWN if kind == "named" else MATERIALS
@@ -109,9 +109,9 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
     for i, (x, y) in enumerate(PLACES):
         place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
         relief = {"height_mm": rng.uniform(-0.5, 0.5), "tilt_deg": (rng.uniform(-1, 1, 2) * tilted).tolist()}
-        what = {"name": "metal", "metal": True} if i == metal else {
+        material = {"name": "metal", "metal": True} if i == metal else {
             "name": names[i], "permittivity": list(materials[names[i]]), "rough_mm": rng.uniform(0, 0.2)}  # fmt: skip
-        plates.append({**place, **relief, **what})
+        plates.append({**place, **relief, **material})
     if kind == "no metal":
         plates = plates[: int(rng.integers(1, len(PLACES) + 1))]
     measured = 0.003 if rng.random() < 0.5 else None
@@ -170,7 +170,7 @@ def judged(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene, Ins
 
 
 def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigures]:
-    """What coverage is counted from: the patches of one full scene, or of one with a thin sheet."""
+    """Judged patches of one scene: the sample from which coverage is counted."""
     scene, rig, findings, _ = judged(seed, kind, raw)
     plates, found = truth_plates(truth(rig, scene, scene.seed)), findings.found
     true, out = match_truth([r.patch for r in found.patches], plates), []
@@ -193,7 +193,7 @@ def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigur
     return out
 
 
-def _table(rows: list[PatchFigures], what: str) -> dict[str, float]:
+def _table(rows: list[PatchFigures], title: str) -> dict[str, float]:
     d = np.array([r.distance2 for r in rows])
     if d.size == 0:
         return {}
@@ -203,7 +203,7 @@ def _table(rows: list[PatchFigures], what: str) -> dict[str, float]:
         "median_std": float(np.median([r.relative_std for r in rows])),
     }  # fmt: skip
     print(
-        f"{what:36s} {d.size:5d} patches   68 %: {100 * entry['in_68']:5.1f}   95 %: {100 * entry['in_95']:5.1f}"
+        f"{title:36s} {d.size:5d} patches   68 %: {100 * entry['in_68']:5.1f}   95 %: {100 * entry['in_95']:5.1f}"
         f"   rms z {entry['rms_z']:.2f}   median error {100 * entry['median_error']:.1f} %,"
         f" stated {100 * entry['median_std']:.1f} %",
         flush=True,
@@ -323,11 +323,11 @@ def run(args: argparse.Namespace) -> int:
     for name in CLASSES:
         out[name] = _table([r for r in rows if r.kind == name], f"  {name}")
     for measured in (True, False):
-        what = f"  leakage {'measured' if measured else 'not measured'}"
-        out[what.strip()] = _table([r for r in rows if r.leakage_measured == measured], what)
+        title = f"  leakage {'measured' if measured else 'not measured'}"
+        out[title.strip()] = _table([r for r in rows if r.leakage_measured == measured], title)
     for inside in (True, False):
-        what = f"  metal {'in the scene' if inside else 'scanned on its own'}"
-        out[what.strip()] = _table([r for r in rows if r.metal_in_scene == inside], what)
+        title = f"  metal {'in the scene' if inside else 'scanned on its own'}"
+        out[title.strip()] = _table([r for r in rows if r.metal_in_scene == inside], title)
     out["beside a sheet"] = _table([r for r in thin if not r.sheet], "  beside a thin sheet, undeclared")
     out["sheet"] = _table([r for r in thin if r.sheet], "  the sheet itself, as a half space")
     print(f"  sheets: {args.sheets}; without a permittivity {args.sheets - sum(r.sheet for r in thin)}")

@@ -154,6 +154,6 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
 
 
 def as_synced(samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
-    """What the imagers read of a synchronised row: samples [rx, position, sample], and which positions are valid."""
+    """The part of a synchronised row that the imagers read: samples [rx, position, sample] and valid [position]."""
     valid = np.ones(samples.shape[1], bool) if valid is None else valid
     return cast(SyncedRow, SimpleNamespace(samples=samples, valid=valid, turn=None))

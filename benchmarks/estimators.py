@@ -127,7 +127,7 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     """Phase error of the direct path beside an equal echo: rms error (rad), and the same over its Cramer-Rao bound.
 
     The bound is of the joint estimate from all RX: the direct path's amplitude, phase and frequency, and the echo's
-    complex amplitude and frequency, with the directions of both known, as geometry tells them.
+    complex amplitude and frequency, with the directions of both known, from the geometry.
     """
     rng = np.random.default_rng([SEED, 2, round(10 * snr_db), round(100 * bins)])
     rig = at_bins(rig, board, bins)

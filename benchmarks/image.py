@@ -28,7 +28,7 @@ from polysight.shared.raster import plan_raster
 
 __all__ = ["add_arguments", "run"]
 REPEATS = 5
-ROUNDS = 3  # of what takes seconds
+ROUNDS = 3  # of methods that take seconds
 PEERS = (
     peers.Peer("the best time-domain sum", "numba", peers.time_domain_image, every=10, limits=(150.0, 250.0)),
     peers.Peer("FastSAR", "fastsar", peers.fastsar_image, every=40),
@@ -200,7 +200,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     lines = []
     for where, rows, batch, limits in (
         ("the cube on disk", "rows from disk", "batch from disk", (5.0, 3.0)),
-        ("reduced samples", "rows", "batch", (None, None)),  # leaves out what both do: for information
+        ("reduced samples", "rows", "batch", (None, None)),  # without the steps both share: for information
     ):
         ours, theirs = took[rows].median, took[batch].median
         name, note = f"all row updates in batch images, both from {where}", f"{1e3 * ours / len(starts):.2f} ms a row"

@@ -1,6 +1,6 @@
-"""Layers of unknown thickness: are permittivity and thickness right, told ambiguous, or wrong and not told?
+"""Layers of unknown thickness: are permittivity and thickness right, reported ambiguous, or wrong without a warning?
 
-Every scene holds five sheets and a liquid, drawn anew: sheets in air and sheets on metal of 0.5 to 5 mm, permittivity 2
+A scene holds five random sheets and a liquid: sheets in air and sheets on metal of 0.5 to 5 mm, permittivity 2
 to 7, loss tangent up to 0.1; liquids behind a wall of glass of known thickness. Each scene has its own plane distance,
 heights and roughness. Each rig (five scenes) has its own leakage, measured to 0.003, and one scan of a metal plate on
 its own: no half spaces are there that would show a plate in the scene to be metal. Samples are as perfect
@@ -78,8 +78,8 @@ class Case:
         return self.error < ENOUGH and self.thickness_error < ENOUGH
 
     @property
-    def told(self) -> bool:
-        """Whether the program tells that it may be farther off: ambiguous, or an error bar that reaches 5 %."""
+    def flagged(self) -> bool:
+        """True if the program reports that the error may exceed 5 %: ambiguous, or an error bar that long."""
         return self.ambiguous or 2 * self.relative_std > ENOUGH
 
 
@@ -187,19 +187,19 @@ def cases(seeds: Sequence[int]) -> list[Case]:
     return out
 
 
-def table(rows: list[Case], what: str) -> dict[str, float]:
+def table(rows: list[Case], title: str) -> dict[str, float]:
     """Print and return the shares of one kind of stack."""
     fits = [r for r in rows if r.found is not None]
     everywhere = np.array([r.distance2 for r in fits if not r.rivals])
-    sure = [r for r in fits if not r.told]
+    sure = [r for r in fits if not r.flagged]
     if not fits:
         return {}
     d = np.array([r.distance2 for r in sure])
     entry = {
         "cases": float(len(rows)), "not fitted": float(len(rows) - len(fits)),
-        "right": float(np.mean([r.right for r in fits])), "ambiguous": float(np.mean([r.told for r in fits])),
+        "right": float(np.mean([r.right for r in fits])), "ambiguous": float(np.mean([r.flagged for r in fits])),
         "rivals": float(np.mean([r.rivals > 0 for r in fits])),
-        "wrong, not told": float(sum(not r.right for r in sure)),
+        "wrong, not flagged": float(sum(not r.right for r in sure)),
         "in_68, no rivals": float(np.mean(everywhere < CHI2_68)) if everywhere.size else float("nan"),
         "in_95, no rivals": float(np.mean(everywhere < CHI2_95)) if everywhere.size else float("nan"),
         "in_68": float(np.mean(d < CHI2_68)) if sure else float("nan"),
@@ -208,14 +208,14 @@ def table(rows: list[Case], what: str) -> dict[str, float]:
         "median_error": float(np.median([max(r.error, r.thickness_error) for r in fits])),
         "unexplained": float(np.mean([r.unexplained for r in fits])),
     }  # fmt: skip
-    told = {key: 100 * entry[key] for key in entry}
+    percent = {key: 100 * entry[key] for key in entry}
     print(
-        f"{what:22s} {len(rows):4d} cases, {len(rows) - len(fits)} not fitted   within 5 %: {told['right']:5.1f} %"
-        f"   told ambiguous: {told['ambiguous']:5.1f} % ({told['rivals']:.1f} % with rivals)   wrong and not told:"
-        f" {entry['wrong, not told']:.0f} of {len(sure)}\n{'':22s} regions without rivals ({everywhere.size}): 68 %"
-        f" {told['in_68, no rivals']:5.1f}, 95 % {told['in_95, no rivals']:5.1f}; of those not told 68 %"
-        f" {told['in_68']:5.1f}, 95 % {told['in_95']:5.1f}   median error {told['median_error']:.1f} %, stated"
-        f" {told['median_std']:.1f} %, not explained {told['unexplained']:.1f} %",
+        f"{title:22s} {len(rows):4d} cases, {len(rows) - len(fits)} not fitted   within 5 %: {percent['right']:5.1f} %"
+        f"   ambiguous: {percent['ambiguous']:5.1f} % ({percent['rivals']:.1f} % with rivals)   wrong, not flagged:"
+        f" {entry['wrong, not flagged']:.0f} of {len(sure)}\n{'':22s} regions without rivals ({everywhere.size}): 68 %"
+        f" {percent['in_68, no rivals']:5.1f}, 95 % {percent['in_95, no rivals']:5.1f}; of those not flagged 68 %"
+        f" {percent['in_68']:5.1f}, 95 % {percent['in_95']:5.1f}   median error {percent['median_error']:.1f} %, stated"
+        f" {percent['median_std']:.1f} %, not explained {percent['unexplained']:.1f} %",
         flush=True,
     )
     return entry
@@ -232,7 +232,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the table; 1 when more than 5 % of the fits not told ambiguous are beyond 5 %."""
+    """Print the table; 1 when more than 5 % of the fits not flagged are beyond 5 %."""
     scenes = range(args.first, args.first + -(-args.cases // len(PLACES)))
     rigs = [list(one) for _, one in itertools.groupby(scenes, lambda seed: seed // A_RIG)]
     print(f"simulated sheets and liquids, {BANDS} sub-bands")
@@ -248,5 +248,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps({"summary": out, "cases": [asdict(r) for r in rows]}, indent=1) + "\n")
-    sure = [r for r in rows if not r.told]
+    sure = [r for r in rows if not r.flagged]
     return int(sum(not r.right for r in sure) > 0.05 * len(sure))

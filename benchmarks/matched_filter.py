@@ -21,7 +21,7 @@ def image_error(rig: Instrument, board: Board) -> float:
     """Largest difference at some pixels, of the image's peak.
 
     Points lie anywhere in the image, positions anywhere in the grid (2000 of them, the others masked), and each holds
-    its direct path. The matched filter takes all linear samples with the window that the imager is told, after the
+    its direct path. The matched filter takes all linear samples with the imager's window, after the
     direct path is taken out of every position as the range gate does (`Reduction.direct`).
     """
     rng = np.random.default_rng(SEED)

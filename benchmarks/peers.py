@@ -26,7 +26,7 @@ class PeerImage:
 
 @dataclass(frozen=True)
 class Peer:
-    """An imager beside ours: its package, what forms its image, and of how many rows one is timed."""
+    """An imager beside ours: its package, the function that forms its image, and the rows per timed one."""
 
     name: str
     package: str
@@ -36,7 +36,7 @@ class Peer:
 
 
 def installed(name: str) -> bool:
-    """Whether a package that only benchmarks need is here, and what compiles its kernels."""
+    """True if a package that only benchmarks need is installed, with the compiler of its kernels."""
     return importlib.util.find_spec(name) is not None and (name != "fastsar" or shutil.which("g++") is not None)
 
 

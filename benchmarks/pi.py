@@ -67,7 +67,7 @@ def _rig(folder: Path, points: int) -> Instrument:
 
 
 def _start(stack: ExitStack, module: str, *args: object, **environment: str) -> tuple[subprocess.Popen[str], str]:
-    """A process that says `ready`, ended with the stack; and what else it said in that line."""
+    """A process that says `ready`, ended with the stack; and the rest of that line."""
     command = [sys.executable, "-m", module, *map(str, args)]
     process = stack.enter_context(
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, **environment})
@@ -110,12 +110,12 @@ def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> di
         "edge to first pulse, us: p50, p99.9, worst": _quantiles(late_us),
         "period off by, us: p50, p99.9, worst": _quantiles(error_us),
         "pulse width, us: p50, p99.9, worst": _quantiles(high_us),
-        "bound told of a burst's widest, us: p50, p99.9": _quantiles(width_us)[:2],
+        "reported bound of a burst's widest, us: p50, p99.9": _quantiles(width_us)[:2],
     }
 
 
 class _Rows:
-    """Rows, one after another, and what was seen of them on the wires."""
+    """Run rows one after another and record their edges on the wires."""
 
     def __init__(self, client: PiClient, rig: Instrument, wires: WireClient, pid: int) -> None:
         self._client, self._wires, self._pid = client, wires, pid
@@ -162,7 +162,7 @@ class _Rows:
         if finished.fault:
             self.faults.append(finished.fault)
         if len(edges) != 2 * finished.pulses:
-            raise SystemExit(f"{len(edges)} edges on the wires, {finished.pulses} pulses told")
+            raise SystemExit(f"{len(edges)} edges on the wires, {finished.pulses} pulses reported")
         start = 0
         for c in captures:
             if not (finished.fault and c is captures[-1]):

@@ -52,7 +52,7 @@ ITERATIONS = 40
 
 @dataclass(frozen=True)
 class Result:
-    """One way to scan: what it takes and what came of it."""
+    """One plan: its cost and its result."""
 
     name: str
     plan: str
@@ -209,7 +209,7 @@ def wide(rig: Instrument, scene: Scene) -> Iterator[Made]:
 
 
 def proposed(rig: Instrument, scene: Scene) -> Iterator[Made]:
-    """What `polysight plan --minutes 30` proposes first for the published rig."""
+    """The first proposal of `polysight plan --minutes 30` for the published rig."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm, pulses=55, period_us=730.0).apply(rig)
     yield "first proposal for 30 minutes", rig, as_scanned(rig, scene)[0].finish(), 1
 
@@ -218,7 +218,7 @@ SCANS = (fast, published, wide, short, proposed)
 
 
 def figure(results: list[Result], pictures: list[tuple[str, ChannelImages]], path: Path) -> None:
-    """Image error against time, and what H looks like."""
+    """Image error against time, and images of H."""
     fig = Figure(figsize=(12.5, 7.6 if pictures else 4.6), dpi=110, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
     fig.suptitle("SIMULATED: nine plates, aperture 698 x 398 mm", color="#b3261e", fontsize=11, x=0.01, ha="left")

@@ -21,7 +21,7 @@ from polysight.host.capture.network import _Header, _IoVec, _Message
 from polysight.host.capture.scheduling import take_priority
 from polysight.shared.config import load_instrument
 
-BEHIND_S = 0.005  # a card never catches up on more than its own buffer: what is later than this is sent later
+BEHIND_S = 0.005  # a card catches up on its own buffer at most; packets later than this are delayed
 TURN_S = 0.0005  # packets due within this time go together, as the card's own pace is finer than this process can wait
 
 

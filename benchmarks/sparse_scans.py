@@ -1,9 +1,9 @@
 """Image error against scan time for scans that leave positions out, simulated: `python -m benchmarks.sparse_scans`.
 
-Every example scene is simulated once with all positions, without noise or disturbances: what is seen is what leaving
-out does. Then rows or columns are masked, and the image is made by matched filter and by reconstruction
+Every example scene is simulated once with all positions, without noise or disturbances, so that only the
+missing positions matter. Then rows or columns are masked, and the image is made by matched filter and by reconstruction
 (host/imaging/sparse.py). The error is that of the whole image against the matched filter of all positions, both
-channels' mean; a reconstruction is compared through what it predicts there.
+channels' mean; a reconstruction is compared through the samples it predicts.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def scan_minutes(rig: Instrument) -> float:
 
 
 def predicted(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """What a reconstructed image's matched filter over all positions would be."""
+    """Matched filter over all positions of the samples that a reconstructed image predicts."""
     imager, _ = choose_imager(board.aperture)
     samples = imager.samples(image)
     gated = (board.model.astype(np.complex64) @ samples.reshape(*samples.shape[:2], -1)).reshape(samples.shape)
@@ -125,8 +125,8 @@ def main() -> int:
         for scene in args.scenes:
             folder = (args.keep or Path(temporary)) / f"ideal-{scene}"
             if not folder.exists():
-                what = load_scene(ROOT / "examples" / f"{scene}.toml").with_disturbances(ideal=True)
-                simulate(rig, what, folder)
+                ideal = load_scene(ROOT / "examples" / f"{scene}.toml").with_disturbances(ideal=True)
+                simulate(rig, ideal, folder)
             results[scene] = measure(folder, args.iterations)
             print(f"\n{scene} (simulated)\n\n| positions | minutes | matched filter | reconstruction |")
             print("| --- | --- | --- | --- |")

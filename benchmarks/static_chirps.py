@@ -1,8 +1,8 @@
 """Residuals of synchronisation on many simulated chirps of one scene that stands still: the paper's Fig. 15.
 
 `python -m benchmarks.static_chirps --out DIR` simulates 640,000 chirps (40,000 positions of 16) of a metal plate, the
-stage at rest, row by row in memory, and writes what `polysight sync-report` does. Everything else is disturbed as on
-the published rig, at the noise that the paper's figures imply: 138 Hz and 0.022 rad are the Cramer-Rao bounds of one
+stage at rest, row by row in memory, and writes the report of `polysight sync-report`. Everything else is disturbed as
+on the published rig, at the noise that the paper's figures imply: 138 Hz and 0.022 rad are the Cramer-Rao bounds of one
 tone of 192 samples at 7.2 dB.
 """
 

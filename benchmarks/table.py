@@ -19,13 +19,13 @@ class Line:
     Attributes
     ----------
     quantity
-        What was measured.
+        The measured quantity.
     ours, theirs
         The two figures as text with their units; `theirs` may be empty.
     value
-        What is judged: a ratio (higher is better) or an amount (lower is better).
+        The judged value: a ratio (higher is better) or an amount (lower is better).
     at_least, aim
-        What it must and should reach.
+        Required and desired limits.
     higher_is_better
         Whether `value` is such a ratio.
     note

@@ -1,4 +1,4 @@
-"""What somebody waits for: last row to image and report, another plane from kept samples, lists of scans, commands."""
+"""Waiting times of a user: last row to image and report, another plane from kept samples, lists of scans, commands."""
 
 from __future__ import annotations
 
@@ -105,10 +105,10 @@ def run(args: argparse.Namespace) -> int:
         typed = {name: [command(name.format(made=made).split()) for _ in range(repeats)] for name in COMMANDS}
     boards = len(rig.receivers)
     lines = []
-    for what, limit in (("image", 0.1), ("report", 4.0)):
-        waited = [found[what] for found in behind]
+    for stage, limit in (("image", 0.1), ("report", 4.0)):
+        waited = [found[stage] for found in behind]
         note = ", ".join(f"{seconds:.2f}" for seconds in waited)
-        lines.append(_least(f"last committed row to {what}, wall s", statistics.median(waited), limit, limit, note))
+        lines.append(_least(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note))
     for name, took in (("its own plane", same), ("another plane", other)):
         lines.append(_least(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1))
     for name, took in (("first look", first), ("later", again)):
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         cpu, wall = (statistics.median(t[k] for t in times) for k in (0, 1))
         note = f"{wall:.2f} s wall"
         lines.append(_least(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
-    show("what is waited for, simulated rows", lines, args.quick)
+    show("waiting times, simulated rows", lines, args.quick)
     write(args.json, "waits", lines, behind=behind, commands=typed)
     return 0
 

@@ -37,7 +37,7 @@ def rows_that_fit(rig: Instrument, rows: int, folder: Path) -> int:
 
 
 class Published:
-    """What the published method needs for the whole scan, from a part: every position and every board cost the same."""
+    """Scale a part of the published method's time to the whole scan: every position and every board cost the same."""
 
     def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool) -> None:
         self._rig, self._tuned, self._grid = rig, tuned, image_grid(rig)

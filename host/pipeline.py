@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Unpack
 
 from polysight.host import calibration, imaging, materials, polarimetry, process, store, sync
+from polysight.host.process import Progress, no_progress
 
 
 class Pipeline:
-    """Processes one scan, row by row as they are committed, then to the end.
+    """Processes one scan: add its rows, in any order, then `finish`.
 
-    `choices` (`process.Choices`) say how far to look around the plane, which sub-bands, plane and pixels to image,
-    whether the images so far can be looked at after every row, and whether kept samples are read and written.
+    `choices` are the settings of imaging and kept samples, see `process.Choices`.
     """
 
     def __init__(self, source: store.Source, **choices: Unpack[process.Choices]) -> None:
-        self.source, self.calibration = source, calibration.of_scan(source)
+        self.source, self.calibration = source, calibration.calibration_of_scan(source)
         rig = self.calibration.rig(source.instrument)
         filters, self.plane = self.calibration.high_passes(rig), imaging.UNKNOWN_PLANE
         self.synchroniser, self.quality = sync.RowSynchroniser(source, rig, filters), process.Quality(rig, source)
@@ -26,14 +26,14 @@ class Pipeline:
         self.rig = store.mirrored(self.images.rig) if source.mirrored else self.images.rig  # x from TX to RX
 
     def add_row(self, row: int) -> None:
-        """Have one row of every board in the images: from kept samples, or from raw data."""
+        """Add one row of every board to the images: from kept samples, or from raw data."""
         if not self.samples.restore(row):
             self.synchronise_row(row)
             self.samples.save(row)
 
     def synchronise_row(self, row: int) -> dict[str, sync.SyncedRow]:
-        """Read, synchronise and reduce one row of every board for the images; returns the synchronised rows."""
-        return process.of_each(self.quality.boards, lambda board: self._synchronise(board, row), self.images.live)
+        """Read, synchronise and reduce one row of every board for the images; return the synchronised rows."""
+        return process.map_boards(self.quality.boards, lambda board: self._synchronise(board, row), self.images.live)
 
     def _synchronise(self, board: str, row: int) -> sync.SyncedRow:
         with self.quality.timed("read and decode"):
@@ -47,19 +47,19 @@ class Pipeline:
         return synced
 
     def form_images(self, from_sums: bool = False) -> imaging.ChannelImages:
-        """Both channels, flattened by footprint, on the rig file's plane, not referenced; `from_sums`: of live rows."""
+        """Form both images on the rig file's plane, divided by the footprint, not referenced; `from_sums`: live."""
         with self.quality.timed("image"):
             images = self.images.current() if from_sums else self.images.finish()
         self.quality.note(**self.calibration.quality_facts(), **self.synchroniser.recording_facts())
         return images.transposed() if self.source.mirrored else images
 
     def metal_plane(self, options: process.Options, in_scene: bool = False) -> polarimetry.PlaneReference | None:
-        """Metal scanned on its own: as asked for, or as calibrated unless metal `in_scene` is named."""
+        """Return the metal plate given in `options`, or the calibrated one unless metal `in_scene` is given."""
         named = in_scene or options.metal_box_mm is not None
         return self.calibration.metal_plane(self.rig, options.reference, named, options.bands)
 
     def place_plane(self, images: imaging.ChannelImages, move: bool = True) -> imaging.ChannelImages:
-        """Find the plane that the plates lie on; the images on it. They stay as they are when `move` is False."""
+        """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.timed("plane"):
             masks, swapped = materials.insides(images), self.source.mirrored
             self.plane, images = imaging.on_their_plane(self.images, images, masks, swapped, move)
@@ -73,7 +73,7 @@ class Pipeline:
         classifier: materials.Classifier | None = None,
         incidence: polarimetry.Incidence = "one",
     ) -> materials.MaterialsResult:
-        """Patches (found, unless known), metal reference, joint inversion, names; sub-bands where imaged."""
+        """Find patches (unless known), metal reference, permittivities and names; in sub-bands too, if imaged."""
         with self.quality.timed("materials"):
             rig, std = self.plane.applied_to(self.rig), self.plane.incidence_std_rad(self.rig)
             angles = polarimetry.incidence_choice(rig, images.x_m, images.y_m, incidence)
@@ -88,7 +88,7 @@ class Pipeline:
     def examine(
         self, images: imaging.ChannelImages, options: process.Options, plates: materials.Plates = ()
     ) -> process.Findings:
-        """From the images to the verdict; without a result nothing is said of any patch."""
+        """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
         classifier, boxes = options.classifier(self.rig), options.drawn(images.x_m, images.y_m)
         plane = self.metal_plane(options, boxes.metal is not None)
         images = self.place_plane(images)
@@ -102,14 +102,14 @@ class Pipeline:
         return process.Findings(images, shown, verdict, self.plane, classifier, plates)
 
     def finish(
-        self, out: Path, options: process.Options, plates: materials.Plates = (), tell: process.Tell = process.untold
+        self, out: Path, options: process.Options, plates: materials.Plates = (), progress: Progress = no_progress
     ) -> process.Products:
-        """Images, then point response, materials, verdict and report into `out`; the images stay in any case."""
+        """Write all products into `out`: images first, so that they stay if a later step fails."""
         images = self.form_images()
         process.save_images(out, self.source, self.rig, images, self.quality)
-        tell("point response")
+        progress("point response")
         self.quality.note_imaging(self.images, images)
-        tell("materials")
+        progress("materials")
         findings = self.examine(images, options, plates)
-        tell("figures and report")
+        progress("figures and report")
         return process.save_materials(out, self.source, self.rig, findings, options.unnamed(self.rig), self.quality)

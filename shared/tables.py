@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, did_you_mean
 from polysight.shared.files import read_bounded
 
@@ -42,7 +43,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, DataError) as e:
         raise ConfigError(f"{path}: cannot be read: {e}", "not a readable text file", "check the path") from None
     except (tomllib.TOMLDecodeError, RecursionError) as e:
-        raise ConfigError(f"{path}: not valid TOML: {e}", "a typing error", "correct that line") from None
+        raise ConfigError(
+            f"{path}: not valid TOML: {e}", "a typing error", "correct that line", code=ErrorCode.FILE_DAMAGED
+        ) from None
 
 
 def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T:
@@ -62,13 +65,38 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         path = path.rstrip("`") or "$"
         value = _lookup(raw, path)
         key = path.removeprefix("$").lstrip(".")
-        if unknown := re.search(r"unknown field `(.*)`", rule):
-            rule = f"no key {unknown[1]!r}: {_likelier(unknown[1], kind)}"
+        rule, code = _plain_rule(rule, kind)
         raise ConfigError(
             f"{source}: {key}{' = ' + value if value else ''}{': ' if key else ''}{rule}",
-            "the file does not follow its declaration",
+            "the file does not follow its declaration" if not keys else "it does not follow its declaration",
             f"correct {key or 'that'} in {source}; {keys or _RIG_KEYS}",
+            code=code,
         ) from None
+
+
+_TYPES = {
+    "int": "a whole number", "float": "a number", "str": "text", "bool": "true or false",
+    "array": "a list", "object": "a table", "null": "nothing",
+}  # fmt: skip
+"""How messages call the types of JSON and TOML."""
+
+
+def _plain_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
+    """A message of msgspec in the words of a person, and its code; a rule of our own stays as it is."""
+    if found := re.search(r"unknown field `(.*)`", rule):
+        return f"no key {found[1]!r}: {_likelier(found[1], kind)}", ErrorCode.KEY_UNKNOWN
+    if found := re.search(r"missing required field `(.*)`", rule):
+        return f"the key {found[1]!r} is missing", ErrorCode.KEY_MISSING
+    if found := re.fullmatch(r"Invalid enum value (.*)", rule):
+        return f"{found[1]} is none of its values", ErrorCode.VALUE_INVALID
+    found = re.fullmatch(r"Expected `(.+?)`( .+?)?(?:, got `?(.+?)`?)?", rule)
+    if found is None:
+        return rule, ErrorCode.VALUE_INVALID
+    wanted = " or ".join(_TYPES.get(name, name) for name in found[1].split(" | ") if name != "null")
+    limit = (found[2] or "").replace("matching regex", "of the form")
+    given = f", not {_TYPES.get(found[3], found[3])}" if found[3] else ""
+    code = ErrorCode.TYPE_WRONG if given and not limit else ErrorCode.VALUE_INVALID
+    return f"must be {wanted}{limit}{given}", code
 
 
 def _likelier(key: str, kind: Any) -> str:

@@ -1,5 +1,5 @@
-"""The published method, plainly: what the instrument's processing is measured against.
+"""The published method in plain form: the peer of the instrument's processing.
 
-The steps, sizes and number formats of the authors' public code and of its notebooks' settings, written anew for one
+The steps, sizes and number formats of the authors' public code and of its notebooks' settings, rewritten for one
 core with NumPy and SciPy; no line is theirs. `docs/benchmarks.md` says how its time compares with their code's.
 """

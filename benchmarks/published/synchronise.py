@@ -26,7 +26,7 @@ class Synchroniser:
     rig, board
         Rig file and one of its receiving boards: the linear samples, and where the direct path comes from.
     tuned
-        The same numbers without what is done twice or too precisely: single precision throughout, I and Q copied
+        The same numbers without repeated or too precise steps: single precision throughout, I and Q copied
         instead of multiplied, transforms without their reordering, one transform of the RX's sum instead of one of
         each, and the closer look as a product with a matrix that is made once.
     """

@@ -1,10 +1,18 @@
-"""What the rig is, measured with the rig: places, filters, metal, start frequencies; and what applies to a scan.
+"""Calibration from recorded scans: antenna positions, high-pass filters, metal reference, start frequencies.
 
-`polysight calibrate` writes dated files (`files`), one module a kind. The rig file names those that apply; a scan keeps
-copies of them. `of_scan` gives a scan's `Calibration`, which turns the rig file into the rig as measured.
+`polysight calibrate` estimates one kind at a time (`fit_places`, `fit_filter`, `fit_start`, `write_metal`) and writes a
+dated calibration file. The rig file names the files that apply; a new scan gets copies (`copy_into_scan`).
+`calibration_of_scan` loads the active calibration of a scan: its `Calibration` corrects the rig, and gives the measured
+filters and the metal reference.
 """
 
-from polysight.host.calibration.active import Calibration, checked, keep_in_scan, of_rig, of_scan
+from polysight.host.calibration.active import (
+    Calibration,
+    calibration_of_rig,
+    calibration_of_scan,
+    checked_calibration,
+    copy_into_scan,
+)
 from polysight.host.calibration.direct_signal import (
     FULL_SCALE,
     DirectSignal,
@@ -14,11 +22,19 @@ from polysight.host.calibration.direct_signal import (
     jitter_hz,
     unwrapped,
 )
-from polysight.host.calibration.files import CalibrationFile, FilterFile, MetalFile, StartFile, head, read, write
+from polysight.host.calibration.files import (
+    CalibrationFile,
+    FilterFile,
+    MetalFile,
+    StartFile,
+    header,
+    read_calibration,
+    write_calibration,
+    write_metal,
+)
 from polysight.host.calibration.filters import fit_filter
-from polysight.host.calibration.metal import write_metal
-from polysight.host.calibration.places import Prior, fit_places, look, places_file, read_target
-from polysight.host.calibration.rows import facts_of, open_raw
+from polysight.host.calibration.places import Prior, fit_places, load_echoes, places_file, read_target
+from polysight.host.calibration.scans import open_raw, source_scan
 
 __all__ = [
     "FULL_SCALE",
@@ -30,23 +46,23 @@ __all__ = [
     "Prior",
     "StartFile",
     "band_hz",
-    "checked",
-    "facts_of",
+    "calibration_of_rig",
+    "calibration_of_scan",
+    "checked_calibration",
+    "copy_into_scan",
     "find_direct",
     "fit_filter",
     "fit_places",
     "fit_start",
-    "head",
+    "header",
     "jitter_hz",
-    "keep_in_scan",
-    "look",
-    "of_rig",
-    "of_scan",
+    "load_echoes",
     "open_raw",
     "places_file",
-    "read",
+    "read_calibration",
     "read_target",
+    "source_scan",
     "unwrapped",
-    "write",
+    "write_calibration",
     "write_metal",
 ]

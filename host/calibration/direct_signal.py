@@ -1,12 +1,12 @@
-"""The direct path in a short capture: its IF chirp by chirp, and what it says of start frequency, trigger, crystal.
+"""The direct path in a short capture: its IF in each chirp, from which start offset, delay and crystal error follow.
 
-IF of the direct path, with tau its delay, dt how much later the board started than the transmitter, and p what its
-crystal is faster by:
+IF of the direct path with delay tau, start delay dt of the board relative to the transmitter, and relative frequency
+error p of the board's crystal:
 
     f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
 
-A crystal shows by itself: it makes the IF drift by 2 p K within the chirp. What remains beside the geometry is dt.
-`fit_start` takes a scan's direct path and finds the start offset that puts it in the middle of the band.
+A crystal error makes the IF drift by 2 p K within a chirp, which separates it from dt.
+`fit_start` estimates the start offset that puts the direct path in the middle of the IF band.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.calibration.files import BoardStart
-from polysight.host.calibration.rows import board_rows
+from polysight.host.calibration.scans import board_rows
 from polysight.host.radar import direct_if_hz
 from polysight.host.store import RawSource
 from polysight.host.sync import FOLD, AlignedRow, BoardSetup, align_row, cis, noise_power, reference, whole_blocks
 from polysight.shared.config import Board, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 FULL_SCALE = 32767
 PASSBAND = 0.9  # of the sample rate
-ROWS = 4  # of a scan that are looked at
-FOUND = 0.25  # part of the chirps in which a direct path must be found to be believed
+ROWS = 4  # rows of a scan used by `fit_start`
+MIN_FOUND = 0.25  # smallest share of chirps with a direct path
 
 
 @dataclass(frozen=True)
@@ -38,16 +39,16 @@ class DirectSignal:
     Attributes
     ----------
     if_hz
-        float64 [chirp]: its IF, of the chirps in which it was found; in the receiver's band, so it may be aliased.
+        float64 [chirp]: IF in the chirps with a direct path; within the receiver's band, so it may be aliased.
     power, noise_power
-        float64 [chirp]: square of its amplitude as recorded, before any filter is undone, and of the noise in that
-        estimate; ADC counts squared. The first holds the second.
+        float64 [chirp]: squared amplitude as recorded (high-pass filter not compensated, noise included), and the
+        noise power in it; ADC counts squared.
     expected_hz
-        IF by the rig file: geometry and start offsets.
+        IF expected from geometry and start offsets in the rig file.
     drift_hz_per_s
         Change of the IF within a chirp.
     chirps
-        Chirps that were received whole.
+        Number of chirps received whole.
     """
 
     if_hz: NDArray[np.float64]
@@ -59,30 +60,30 @@ class DirectSignal:
 
     @property
     def found(self) -> bool:
-        """Whether there is a direct path at all: in most chirps."""
+        """True if most chirps have a direct path."""
         return 2 * self.if_hz.size > self.chirps > 0
 
     def crystal_ppm(self, rig: Instrument) -> float:
-        """How much faster the board's crystal is than the transmitter's, parts per million, by the drift."""
+        """Return the frequency error of the board's crystal relative to the transmitter's, ppm, from the drift."""
         return self.drift_hz_per_s / (2e-6 * rig.chirp.slope_hz_per_s)
 
-    def later_s(self, rig: Instrument) -> tuple[float, float]:
-        """How much later the board starts its chirps than the transmitter, and the mean's standard error; seconds."""
+    def start_delay_s(self, rig: Instrument) -> tuple[float, float]:
+        """Return the mean start delay of the board relative to the transmitter, and its standard error; seconds."""
         chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
         middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (a + b - 1) / 2
         expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
-        later = (expected - unwrapped(self.if_hz, rig)) / chirp.slope_hz_per_s
-        return float(later.mean()), float(later.std(ddof=1) / np.sqrt(later.size)) if later.size > 1 else np.inf
+        delay = (expected - unwrapped(self.if_hz, rig)) / chirp.slope_hz_per_s
+        return float(delay.mean()), float(delay.std(ddof=1) / np.sqrt(delay.size)) if delay.size > 1 else np.inf
 
 
 def band_hz(rig: Instrument) -> tuple[float, float]:
-    """IF that the receiver keeps: 0..0.9 sample rates (complex 1x) or +-0.45 (complex 2x)."""
+    """Return the IF band of the receiver, Hz: 0 to 0.9 sample rates (complex 1x) or +-0.45 (complex 2x)."""
     width = PASSBAND * rig.chirp.sample_rate_hz
     return (0.0, width) if rig.chirp.if_mode == "complex1x" else (-width / 2, width / 2)
 
 
 def unwrapped(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64]:
-    """IFs [chirp] of one direct path about their circular mean: unbroken where jitter crosses the band's edge."""
+    """Unwrap the IFs [chirp] of one direct path around their circular mean, where jitter crosses the band edge."""
     rate = rig.chirp.sample_rate_hz
     middle = np.angle(np.exp(2j * np.pi * if_hz / rate).sum()) * rate / (2 * np.pi)
     middle += rate * round((if_hz.mean() - middle) / rate)
@@ -90,14 +91,14 @@ def unwrapped(if_hz: NDArray[np.float64], rig: Instrument) -> NDArray[np.float64
 
 
 def jitter_hz(rig: Instrument) -> float:
-    """IF that 5 ns of trigger uncertainty make."""
+    """Return the IF change due to 5 ns of trigger uncertainty, Hz."""
     return rig.chirp.slope_hz_per_s * 5e-9
 
 
 def find_direct(
     rig: Instrument, board: Board, words: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup | None = None
 ) -> DirectSignal:
-    """Look for the direct path in bursts.
+    """Find the direct path in bursts.
 
     Parameters
     ----------
@@ -106,16 +107,16 @@ def find_direct(
     words
         int16 [frame, sample, 2, rx], whole bursts.
     valid
-        bool [frame].
+        bool [frame]: frames received whole.
     setup
-        The board's, where it is there already.
+        Setup of the board, if it exists already.
     """
     setup, chirp = setup or BoardSetup.of(rig, board), rig.chirp
     shape = (len(words) // setup.pulses, setup.pulses)
     aligned = align_row(
         words.reshape(*shape, *words.shape[1:]), valid.reshape(shape), chirp.linear_samples, setup.equaliser, FULL_SCALE
     )
-    # The estimate of the drift is linear in it: what two ppm make is found to a tenth, and what that leaves, exactly.
+    # The drift estimate is linearised: the first pass finds 2 ppm within a tenth, the second the rest.
     drift, time = reference(aligned, setup.path, chirp).drift, np.arange(aligned.halves.shape[-1]) * float(FOLD)
     time -= time.mean()
     flat = aligned._replace(halves=aligned.halves * cis(-0.5 * drift * time**2))
@@ -137,7 +138,7 @@ def find_direct(
 
 
 def _recorded_noise(aligned: AlignedRow) -> float:
-    """Noise power of a recorded sample; compensation has raised it by its gain. The same in all positions."""
+    """Return the noise power of a recorded sample: the estimate divided by the gain of the filter compensation."""
     raised = (aligned.gain**2 * aligned.good).sum(axis=1) / np.maximum(aligned.good.sum(axis=1), 1)
     recorded = noise_power(aligned) / np.maximum(raised, 1e-12)
     return float(np.nanmedian(recorded)) if np.isfinite(recorded).any() else 0.0
@@ -146,7 +147,7 @@ def _recorded_noise(aligned: AlignedRow) -> float:
 def _power(
     words: NDArray[np.int16], cycles: NDArray[np.float64], setup: BoardSetup, drift: float
 ) -> NDArray[np.float64]:
-    """Power of the direct path in each chirp [chirp], by the estimator that does not hear the object."""
+    """Return the power of the direct path in each chirp [chirp], by the estimator that suppresses the object."""
     if not len(words):
         return np.zeros(0)
     a, b = whole_blocks(setup.chirp.linear_samples)
@@ -159,24 +160,25 @@ def _power(
 
 
 def fit_start(source: RawSource, board_name: str) -> BoardStart:
-    """The start offset of a board, from where its direct path was.
+    """Estimate the start offset of a board from the IF of its direct path.
 
     Raises
     ------
     DataError
-        when it was hardly ever found; the error names the offset by geometry alone.
+        if too few chirps have a direct path; the error gives the offset from geometry alone.
     """
     rig = source.instrument
     board = rig.by_name(board_name)
     setup = BoardSetup.of(rig, board)
-    heard = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
-    if_hz, chirps = np.concatenate([s.if_hz for s in heard]), sum(s.chirps for s in heard)
+    found = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
+    if_hz, chirps = np.concatenate([s.if_hz for s in found]), sum(s.chirps for s in found)
     expected = direct_if_hz(rig, board)
-    if if_hz.size < max(2, FOUND * chirps):
+    if if_hz.size < max(2, MIN_FOUND * chirps):
         raise DataError(
-            f"{source.scan_id}: a direct path of {board_name} in {if_hz.size} of {chirps} chirps only",
-            "it lies outside the band and is filtered away, or something stands in it",
+            f"{source.scan_id}: only {if_hz.size} of {chirps} chirps show the direct path of {board_name}",
+            "it lies outside the IF band and is filtered out, or something blocks it",
             f"by geometry alone start_offset_hz = {by_geometry(rig, board):.0f} for {board_name}; scan again with it",
+            code=ErrorCode.NO_DATA,
         )
     if_hz = unwrapped(if_hz, rig)
     return start_of(rig, board, expected, float(if_hz.mean()), float(if_hz.std() / np.sqrt(if_hz.size)), if_hz.size)
@@ -185,7 +187,7 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
 def start_of(
     rig: Instrument, board: Board, expected_hz: float, seen_hz: float, error_hz: float, chirps: int
 ) -> BoardStart:
-    """The offset that moves a direct path seen at `seen_hz`, whatever sample rates away it really is, to the middle."""
+    """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band."""
     rate, middle = rig.chirp.sample_rate_hz, sum(band_hz(rig)) / 2
     alias = round((expected_hz - seen_hz) / rate)
     offset = board.start_offset_hz + middle - (seen_hz + alias * rate)
@@ -195,5 +197,5 @@ def start_of(
 
 
 def by_geometry(rig: Instrument, board: Board) -> float:
-    """The offset by the rig file alone, hertz."""
+    """Return the start offset from the rig file's geometry alone, Hz."""
     return board.start_offset_hz + sum(band_hz(rig)) / 2 - direct_if_hz(rig, board)

@@ -1,16 +1,16 @@
-"""Where the receivers and the object plane are, from a scan of points at known places on the plane.
+"""Estimate the positions of the receivers and the object plane from a scan of points at known positions.
 
-Samples are referenced to the direct path, so an echo of a point at v, seen from stage offset u, has the phase
+Samples are referenced to the direct path, so the echo of a point at v, at stage offset u, has the phase
 2 pi f d / c with the excess path
 
     d = |v - u - tx| + |v - u - rx| - |tx - rx|
 
-The transmitter is taken to be where the rig file says, which fixes the frame; unknown are the shift of each receiving
-board (3), the plane's distance (1), where the target was laid (2) and how it was turned (1). Each point's amplitude is
-a complex number a board, so phases count only as they change over the aperture and with frequency; amplitudes drop out
-by projection (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973). Least squares over positions, RX and frequencies,
-noise made white. A ruler's accuracy is a prior for each unknown: what the scan cannot tell stays near the rig file, and
-its standard error says so.
+The position of the transmitter in the rig file defines the frame. Unknowns are the shift of each receiving board (3),
+the distance of the plane (1), and position (2) and rotation (1) of the target. The amplitude of each point is a free
+complex number per board, eliminated by variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10, 1973), so that
+only phase differences over aperture and frequency count. Least squares over positions, RX and frequencies, with
+whitened noise. Each unknown has a prior (the accuracy of a ruler): an unknown that the scan does not determine stays
+near the rig file, with the prior as its standard error.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, head, places_crc32
-from polysight.host.calibration.rows import board_rows
+from polysight.host.calibration.files import BoardPlace, PlacesFile, SourceScan, Vector, header, places_crc32
+from polysight.host.calibration.scans import board_rows
 from polysight.host.imaging import Antennas, image_grid, reduction, row_offsets_m, scene_gate_m
 from polysight.host.store import RawSource
 from polysight.host.sync import BoardSetup, HighPass, synchronise_row
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import specular_midpoint_m
 from polysight.shared.raster import plan_raster
@@ -37,12 +38,12 @@ from polysight.shared.tables import decode, read_toml
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Real = NDArray[np.float64]
-DEPTH_M = 0.02  # how far the plane may lie from where the rig file has it
-POSITIONS = 400  # that are looked at; more would only take longer
-_SEARCHED = 100  # positions that the search for the target looks at
-_REACH_MM, _STEP_MM = 12.0, 1.5  # where the target may lie, and the search's step: under half a resolution cell
-_KEPT = 1e-3  # directions of the reduced samples with less noise than this part of the most hold nothing
-_EXPLAINED = 0.3  # part of the power that the points must explain
+DEPTH_M = 0.02  # largest deviation of the plane from the rig file
+POSITIONS = 400  # positions used by the fit; more take longer and add little
+_SEARCH_POSITIONS = 100  # positions used by the search for the target
+_REACH_MM, _STEP_MM = 12.0, 1.5  # range of the search and its step, less than half a resolution cell
+_MIN_NOISE = 1e-3  # noise power of a component of the reduced samples, relative to the largest, below which it is empty
+_MIN_EXPLAINED = 0.3  # part of the power that the points must explain
 
 
 class TargetPoint(msgspec.Struct, frozen=True):
@@ -53,14 +54,14 @@ class TargetPoint(msgspec.Struct, frozen=True):
 
 
 class Target(msgspec.Struct, frozen=True):
-    """A target file: `[[points]]`. Other keys are let be, so that a scene file is one too."""
+    """A target file: `[[points]]`. Other keys are ignored, so that a scene file can be used too."""
 
     points: tuple[TargetPoint, ...] = ()
 
 
 @dataclass(frozen=True)
 class Prior:
-    """How well the unknowns are known beforehand: one standard deviation."""
+    """Prior standard deviations of the unknowns."""
 
     board_mm: float = 5.0
     plane_mm: float = 5.0
@@ -68,15 +69,26 @@ class Prior:
     turn_deg: float = 2.0
 
     def scale(self, boards: int) -> Real:
-        """One for each unknown."""
+        """Return the standard deviation of each unknown."""
         return np.array([self.board_mm] * 3 * boards + [self.plane_mm, *2 * [self.target_mm], self.turn_deg])
 
 
 @dataclass
-class Seen:
-    """What one board saw: whitened samples [rx, position, k], how an echo comes out, and where it was seen from.
+class BoardEchoes:
+    """Whitened samples of one board, from :func:`load_echoes`.
 
-    Made by :func:`look`.
+    Attributes
+    ----------
+    antennas
+        Antennas by the rig file.
+    samples
+        complex128 [rx, position, k]: whitened samples, k their components.
+    echo
+        complex128 [k, frequency]: maps a spectrum to the components.
+    offsets_m
+        float64 [position, 3]: stage offsets.
+    frequencies_hz
+        float64 [frequency], evenly spaced.
     """
 
     antennas: Antennas
@@ -88,7 +100,7 @@ class Seen:
 
 @dataclass
 class PlacesFit:
-    """The unknowns (millimetres, degrees), their covariance, and the part of the power that is explained."""
+    """Estimated unknowns (millimetres, degrees), their covariance, and the explained share of the power."""
 
     values: Real
     covariance: Real
@@ -97,50 +109,53 @@ class PlacesFit:
 
     @property
     def errors(self) -> Real:
-        """Standard errors."""
+        """Standard errors of the unknowns."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def read_target(path: Path) -> list[TargetPoint]:
-    """Points of a target file. Raises ConfigError, and DataError for fewer than three."""
+    """Read the points of a target file. Raises ConfigError, and DataError for fewer than three."""
     points = list(decode(read_toml(path), Target, str(path)).points)
     if len(points) < 3:
         raise DataError(
             f"{path}: {len(points)} points",
-            "two points do not tell a turn from a shift",
+            "two points do not separate rotation from shift",
             "give three or more [[points]] with position_mm = [x, y]",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     return points
 
 
-def look(source: RawSource, rig: Instrument, filters: dict[str, HighPass | None] | None = None) -> dict[str, Seen]:
-    """What each receiving board saw in a scan, by name; `filters` are measured ones. Raises DataError."""
-    return {b.name: _look(source, rig, b.name, (filters or {}).get(b.name)) for b in rig.receivers}
+def load_echoes(
+    source: RawSource, rig: Instrument, filters: dict[str, HighPass | None] | None = None
+) -> dict[str, BoardEchoes]:
+    """Load the whitened samples of a scan by receiving board; `filters` are measured ones. Raises DataError."""
+    return {b.name: _load_board(source, rig, b.name, (filters or {}).get(b.name)) for b in rig.receivers}
 
 
-def fit_places(seen: dict[str, Seen], rig: Instrument, points: list[TargetPoint], prior: Prior = Prior()) -> PlacesFit:
-    """Fit boards, plane and target to what was seen.
+def fit_places(
+    echoes: dict[str, BoardEchoes], rig: Instrument, points: list[TargetPoint], prior: Prior = Prior()
+) -> PlacesFit:
+    """Estimate the positions of boards, plane and target.
 
     Parameters
     ----------
-    seen
-        From :func:`look`.
+    echoes
+        From :func:`load_echoes`.
     rig
-        Where everything is thought to be.
+        Positions by the rig file, the starting point.
     points
-        The target's points.
+        Points of the target.
     prior
-        How well that is known.
+        Standard deviations of the rig file's positions.
     """
     mm = np.array([p.position_mm for p in points])
     centre = np.array(specular_midpoint_m(rig, rig.receivers[0]))
-    scale = prior.scale(len(seen))
-    boards = list(seen.values())
+    scale = prior.scale(len(echoes))
+    boards = list(echoes.values())
 
     def misfit(unknown: Real, sigma: float) -> Real:
-        parts = [
-            _left_over(b, unknown[3 * i : 3 * i + 3], _places_m(centre, mm, unknown)) for i, b in enumerate(boards)
-        ]
+        parts = [_residual(b, unknown[3 * i : 3 * i + 3], _places_m(centre, mm, unknown)) for i, b in enumerate(boards)]
         flat = np.concatenate([p.ravel() for p in parts]) / sigma
         return np.concatenate([flat.real, flat.imag, unknown / scale])
 
@@ -149,7 +164,7 @@ def fit_places(seen: dict[str, Seen], rig: Instrument, points: list[TargetPoint]
     size = sum(b.samples.size for b in boards)
     sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
     found: Any = None
-    for tolerance in (1e-3, 1e-6, 1e-8):  # the noise is known once it fits
+    for tolerance in (1e-3, 1e-6, 1e-8):  # each fit improves the estimate of the noise
         found = scipy.optimize.least_squares(
             misfit, start, args=(sigma,), method="lm", x_scale=scale / 10, ftol=tolerance, xtol=tolerance
         )
@@ -158,11 +173,11 @@ def fit_places(seen: dict[str, Seen], rig: Instrument, points: list[TargetPoint]
     power = sum(float((np.abs(b.samples) ** 2).sum()) for b in boards)
     explained = 1 - 2 * size * sigma**2 / power
     covariance = np.linalg.inv(found.jac.T @ found.jac)
-    return PlacesFit(found.x, covariance, explained, list(seen))
+    return PlacesFit(found.x, covariance, explained, list(echoes))
 
 
-def _look(source: RawSource, rig: Instrument, name: str, model: HighPass | None) -> Seen:
-    """A board's scan, synchronised, reduced to the gate, its RX alike, its noise white."""
+def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass | None) -> BoardEchoes:
+    """Synchronise a board's scan, reduce it to the range gate, equalise its RX and whiten its noise."""
     board, plan = rig.by_name(name), plan_raster(rig.grid)
     setup = BoardSetup.of(rig, board, model=model)
     every = tuple(Antennas.of(rig, b) for b in rig.receivers)
@@ -180,27 +195,32 @@ def _look(source: RawSource, rig: Instrument, name: str, model: HighPass | None)
         offsets.append(row_offsets_m(rig, plan.row(row))[keep])
     samples, gains = np.concatenate(reduced, axis=1), np.concatenate(direct, axis=1).mean(axis=1)
     if not samples.size or np.any(gains == 0):
-        raise DataError(f"{source.scan_id}: no direct path of {name}", "see `polysight sync-report`", "scan again")
-    # Noise is white in the raw samples, so its covariance in the reduced ones is that of their map.
+        raise DataError(
+            f"{source.scan_id}: no direct path of {name}",
+            "see `polysight sync-report`",
+            "scan again",
+            code=ErrorCode.NO_DATA,
+        )
+    # Noise is white in the raw samples, so its covariance in the reduced samples is that of the reduction.
     power, directions = scipy.linalg.eigh(maps.matrix @ maps.matrix.conj().T)
-    kept = power > _KEPT * power[-1]
+    kept = power > _MIN_NOISE * power[-1]
     white = directions[:, kept].conj().T / np.sqrt(power[kept])[:, None]
     samples = (samples / gains[:, None, None]) @ white.T
     flat = np.concatenate(offsets)
     places = np.column_stack([flat, np.zeros(len(flat))])
-    return Seen(Antennas.of(rig, board), samples, white @ maps.model, places, maps.frequencies_hz)
+    return BoardEchoes(Antennas.of(rig, board), samples, white @ maps.model, places, maps.frequencies_hz)
 
 
 def _places_m(centre: Real, mm: Real, unknown: Real) -> Real:
-    """Where the target's points are, metres [point, 3], rig frame."""
+    """Return the positions of the target's points, metres [point, 3], rig frame."""
     depth, x, y, turn = unknown[-4:]
     c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
     flat = mm @ np.array([[c, s], [-s, c]]) + [x, y]
     return centre + np.column_stack([flat, np.full(len(mm), depth)]) / 1e3
 
 
-def _design(board: Seen, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
-    """What each point of amplitude one answers, complex [rx * position * k, point]."""
+def _design(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+    """Return the echo of each point with amplitude one, complex [rx * position * k, point]."""
     tx, rx = board.antennas.tx_m, board.antennas.rx_m + np.asarray(shift_mm) / 1e3
     away = places_m[None] - board.offsets_m[:, None]  # [position, point, 3]
     out = np.linalg.norm(away - tx, axis=-1)
@@ -217,20 +237,21 @@ def _design(board: Seen, shift_mm: Real, places_m: Real) -> NDArray[np.complex12
 
 
 def _turns(cycles: Real) -> NDArray[np.complex128]:
+    """Return exp(2j pi cycles), accurate for many cycles."""
     return np.exp(2j * np.pi * (cycles - np.round(cycles)))
 
 
-def _left_over(board: Seen, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
-    """The samples less the best sum of the points' answers."""
+def _residual(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
+    """Return the samples minus the best-fitting sum of the points' echoes."""
     design, samples = _design(board, shift_mm, places_m), board.samples.reshape(-1)
     amplitude = np.linalg.lstsq(design.conj().T @ design, design.conj().T @ samples, rcond=1e-9)[0]
     return samples - design @ amplitude
 
 
-def _find_target(boards: list[Seen], centre: Real, mm: Real) -> tuple[float, float]:
-    """Where the target lies, millimetres, on a coarse grid: the most power at all points together."""
+def _find_target(boards: list[BoardEchoes], centre: Real, mm: Real) -> tuple[float, float]:
+    """Return the position of the target on a coarse grid, millimetres: maximum of the power at all points."""
     best, found = -1.0, (0.0, 0.0)
-    few = [_fewer(b) for b in boards]
+    few = [_subset(b) for b in boards]
     steps = np.arange(-_REACH_MM, _REACH_MM + _STEP_MM / 2, _STEP_MM)
     for x in steps:
         for y in steps:
@@ -245,20 +266,21 @@ def _find_target(boards: list[Seen], centre: Real, mm: Real) -> tuple[float, flo
     return found
 
 
-def _fewer(b: Seen) -> Seen:
-    """One RX at some of the positions."""
-    at = slice(None, None, -(-len(b.offsets_m) // _SEARCHED))
+def _subset(b: BoardEchoes) -> BoardEchoes:
+    """Return the samples of one RX at some positions."""
+    at = slice(None, None, -(-len(b.offsets_m) // _SEARCH_POSITIONS))
     antennas = Antennas(b.antennas.tx_m, b.antennas.rx_m[:1])
-    return Seen(antennas, b.samples[:1, at], b.echo, b.offsets_m[at], b.frequencies_hz)
+    return BoardEchoes(antennas, b.samples[:1, at], b.echo, b.offsets_m[at], b.frequencies_hz)
 
 
 def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[SourceScan]) -> PlacesFile:
-    """What a fit found, as a file. Raises DataError when the points explain too little of the data."""
-    if fit.explained < _EXPLAINED:
+    """Return a fit as a calibration file. Raises DataError if the points explain too little of the data."""
+    if fit.explained < _MIN_EXPLAINED:
         raise DataError(
             f"the points explain {100 * fit.explained:.0f} % of the echoes",
-            "the target was another one, lay more than a centimetre from the middle, or other things reflect too",
-            "check the target file; cover what reflects beside it",
+            "another target was scanned, it lay more than a centimetre off the middle, or other objects reflect too",
+            "check the target file; cover other reflecting objects",
+            code=ErrorCode.MISMATCH,
         )
     errors, boards = fit.errors, {}
     for i, name in enumerate(fit.boards):
@@ -276,7 +298,7 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[Sour
         )
     depth, x, y, turn = (float(v) for v in fit.values[-4:])
     return PlacesFile(
-        **head("direct_path", sources),
+        **header("direct_path", sources),
         rig_crc32=places_crc32(rig),
         boards=boards,
         object_distance_mm=rig.geometry.object_distance_mm + depth,

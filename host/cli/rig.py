@@ -88,14 +88,14 @@ def _add_card(add_command: Add) -> None:
 
 
 def _doctor(args: argparse.Namespace) -> int:
-    from polysight.host.doctor import Wanted, doctor
+    from polysight.host.doctor import DoctorOptions, run_doctor
 
     if args.move and not args.pulse:
         raise ConfigError(
             "--move and --no-pulse", "each point of the row is a burst of SYNC_IN pulses", "leave one of them out"
         )
-    wanted = Wanted(args.config, args.out, args.move, args.pulse, args.bursts)
-    return doctor(wanted, args.json, bundle=args.bundle)
+    options = DoctorOptions(args.config, args.out, args.move, args.pulse, args.bursts)
+    return run_doctor(options, args.json, bundle=args.bundle)
 
 
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)

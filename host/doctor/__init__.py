@@ -1,14 +1,15 @@
-"""`polysight doctor`: the rig hop by hop, from the rig file to the direct path.
+"""`polysight doctor`: check the rig hop by hop, from the rig file to the direct path.
 
-`doctor` walks the checks in their order (`walk.CHECKS`); a hop behind one that failed is not tried. A check is a
-function of a `Bench`, which holds what checks share, and returns a `Finding`: what was seen, why, what to do. The
-checks lie in `check_host`, `check_pi` and `check_capture`.
+`run_doctor` runs the checks of `checks.CHECKS` in order and prints a finding for each: the verdict, the observation,
+its likely cause and the remedy. A check whose prerequisite failed is skipped. A check is a function of a
+`CheckContext` (options, rig file, connection to the Pi, captured frames); the functions are in `check_host`, `check_pi`
+and `check_capture`. `write_bundle` (`bundle.py`) collects findings, versions and logs for somebody who helps from afar.
 """
 
-from polysight.host.doctor.bench import Wanted
-from polysight.host.doctor.walk import doctor
+from polysight.host.doctor.checks import run_doctor
+from polysight.host.doctor.context import DoctorOptions
 
 __all__ = [
-    "Wanted",
-    "doctor",
+    "DoctorOptions",
+    "run_doctor",
 ]

@@ -1,7 +1,6 @@
-"""`polysight doctor --bundle FILE.zip`: what somebody elsewhere needs to find a fault. No raw data, no keys.
+"""`polysight doctor --bundle FILE.zip`: findings, versions, logs and manifests for remote help; no raw data, no keys.
 
-What is in it is listed in docs/how-to/doctor.md and in the archive's own README.txt. Every file is text and goes
-through :class:`Redactor` first.
+docs/how-to/doctor.md and the archive's README.txt list its files. Each is text and passes a `Redactor` first.
 """
 
 from __future__ import annotations
@@ -18,26 +17,27 @@ from dataclasses import asdict
 from importlib.metadata import distributions
 from pathlib import Path
 
-from polysight.host.doctor.bench import Finding, Wanted, nic
+from polysight.host.doctor.context import DoctorOptions, Finding
+from polysight.host.doctor.kernel import read_interface
 from polysight.host.store import MANIFEST, utc_now, versions
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError, DeviceError
 from polysight.shared.files import open_to_write, read_bounded
 
-README = """What `polysight doctor --bundle` found on {utc}.
+README = """Findings of `polysight doctor --bundle`, {utc}.
 
-findings.txt, findings.json  what the doctor said of each hop
+findings.txt, findings.json  the finding for each hop
 rig.toml                     the rig file
 versions.json                releases of this program, Python and every installed package; the system
 kernel.txt                   kernel, limits of this login, receive buffers
-network.json                 interfaces, routes and neighbours, as the kernel tells them
+network.json                 interfaces, routes and neighbours, from the kernel
 scans/                       the last {lines} lines of the manifest of the newest {scans} scans under --out
 logs/                        the last {kilobytes} kB of the logs beside the rig file and under --out
 traces/                      the newest {traces} traces of radars (radar.trace_dir)
 
-Not in it: raw data, images, labels, keys. Words that are in a file of pi.key_dir, and whatever follows a name like
-`token` or `secret`, are replaced by {hidden}. Read it before you send it: paths, addresses and names of this
-computer are in it.
+Not included: raw data, images, labels, keys. Words from files in pi.key_dir, and values of names like `token` or
+`secret`, are replaced by {hidden}. Read the files before you send them: they contain paths, addresses and names of
+this computer.
 """
 HIDDEN = "[removed]"
 _LINES, _SCANS, _LOGS, _TRACES = 60, 3, 20, 6
@@ -54,7 +54,7 @@ _PEM = re.compile(r"-----BEGIN [^-]*KEY-----.*?(?:-----END [^-]*KEY-----|\Z)", r
 
 
 class Redactor:
-    """Takes keys out of text: those in the key folders by their content, all others by what they are called."""
+    """Remove keys from text: those of the key folders by their content, others by name or form."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         words: set[str] = set()
@@ -67,7 +67,7 @@ class Redactor:
         self._words = sorted(words, key=len, reverse=True)
 
     def __call__(self, text: str) -> str:
-        """The text without them."""
+        """Return the text with keys replaced by `HIDDEN`."""
         for word in self._words:
             text = text.replace(word, HIDDEN)
         text = _PEM.sub(HIDDEN, text)
@@ -77,35 +77,25 @@ class Redactor:
 
 
 def write_bundle(
-    path: Path, wanted: Wanted, rig: Instrument | None, findings: Sequence[Finding], text: str, root: Path = Path("/")
+    path: Path,
+    options: DoctorOptions,
+    rig: Instrument | None,
+    findings: Sequence[Finding],
+    text: str,
+    root: Path = Path("/"),
 ) -> None:
-    """Write the archive; a file of that name is replaced.
+    """Write the archive `path`; an existing file is overwritten.
 
-    Parameters
-    ----------
-    path
-        Of the archive.
-    wanted
-        The rig file, and the folder of scans.
-    rig
-        The rig file as read; None where it could not be.
-    findings, text
-        What the doctor found, and how it was printed.
-    root
-        Of the file system, for what the kernel tells.
-
-    Raises
-    ------
-    DeviceError
-        when it cannot be written.
+    `rig` is None if the rig file could not be read; `text` is the printed form of `findings`; `root` is the root of
+    the file system. Raises DeviceError if the file cannot be written.
     """
-    keys = [wanted.config.resolve().parent / "keys"]
+    keys = [options.config.resolve().parent / "keys"]
     if rig is not None and rig.pi.key_dir:
         keys.append(Path(rig.pi.key_dir))
     redacted = Redactor(keys)
     try:
         with open_to_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in _contents(wanted, rig, findings, text, root):
+            for name, content in _contents(options, rig, findings, text, root):
                 archive.writestr(name, redacted(content))
     except OSError as e:
         raise DeviceError(
@@ -114,9 +104,9 @@ def write_bundle(
 
 
 def _contents(
-    wanted: Wanted, rig: Instrument | None, findings: Sequence[Finding], text: str, root: Path
+    options: DoctorOptions, rig: Instrument | None, findings: Sequence[Finding], text: str, root: Path
 ) -> Iterator[tuple[str, str]]:
-    """Name and text of every file."""
+    """Yield name and text of every file."""
     about = {"utc": utc_now(), "lines": _LINES, "scans": _SCANS, "kilobytes": _TAIL_BYTES >> 10, "traces": _TRACES}
     yield "README.txt", README.format(hidden=HIDDEN, **about)
     yield "findings.txt", text
@@ -124,13 +114,13 @@ def _contents(
     yield "versions.json", json.dumps(_versions(), indent=1)
     yield "kernel.txt", _kernel(root)
     yield "network.json", json.dumps(_network(root), indent=1)
-    if (config := _tail(wanted.config, _TAIL_BYTES)) is not None:
+    if (config := _tail(options.config, _TAIL_BYTES)) is not None:
         yield "rig.toml", config
-    for folder in _newest_scans(wanted.out):
+    for folder in _newest_scans(options.out):
         with suppress(OSError, DataError):
             lines = read_bounded(folder / MANIFEST, _MANIFEST_BYTES).decode("utf-8", "replace").splitlines()
             yield f"scans/{folder.resolve().name}.jsonl", "\n".join(lines[-_LINES:]) + "\n"
-    places = [wanted.config.parent, wanted.config.parent / "logs", wanted.out, wanted.out / "logs"]
+    places = [options.config.parent, options.config.parent / "logs", options.out, options.out / "logs"]
     yield from _files("logs", _newest(places, "*.log", _LOGS), _TAIL_BYTES)
     if rig is not None and rig.radar.trace_dir:
         yield from _files("traces", _newest([Path(rig.radar.trace_dir)], "*", _TRACES), _TRACE_BYTES)
@@ -143,7 +133,7 @@ def _files(folder: str, paths: Sequence[Path], most: int) -> Iterator[tuple[str,
 
 
 def _tail(path: Path, most: int) -> str | None:
-    """The last bytes of a file as text; None where it cannot be read."""
+    """Return at most the last `most` bytes of a file as text; None if it cannot be read."""
     try:
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
@@ -174,7 +164,7 @@ def _kernel(root: Path) -> str:
     parts = [f"{platform.uname()}", *(f"{name} {resource.getrlimit(getattr(resource, name))}" for name in limits)]
     for name in _KERNEL:
         text = _tail(root / name, _TAIL_BYTES)
-        parts.append(f"== /{name}\n{'not told' if text is None else text.rstrip()}")
+        parts.append(f"== /{name}\n{'not available' if text is None else text.rstrip()}")
     return "\n".join(parts) + "\n"
 
 
@@ -184,4 +174,4 @@ def _network(root: Path) -> dict[str, object]:
     except OSError:
         names = []
     kept = {name: _tail(root / "proc/net" / name, _TAIL_BYTES) for name in ("route", "arp", "dev")}
-    return {"interfaces": [asdict(nic(name, root)) for name in names], **kept}
+    return {"interfaces": [asdict(read_interface(name, root)) for name in names], **kept}

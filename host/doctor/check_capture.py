@@ -1,174 +1,50 @@
-"""Checks of the capture side: network, cards, SYNC_IN pulses, radars, and the signal itself.
+"""Checks of the capture side: capture cards, network, SYNC_IN pulses, radars, level, direct path, trigger skew.
 
-First each card's link, the card and its receive buffer. Then a few pulses at rest and the frames that must follow, and
-from these frames level, direct path and the receivers' skew. Nothing moves. Radars that are armed transmit for as long
-as the pulses last, some tens of milliseconds.
+The checks from `check_pulses` on use a few bursts captured at rest. Armed radars transmit during these pulses, for some
+tens of milliseconds.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from polysight.host.acquisition import RefusedError
 from polysight.host.calibration import FULL_SCALE, DirectSignal, band_hz, find_direct, jitter_hz, unwrapped
-from polysight.host.capture import HopFinding, route_interface, silent_radar
-from polysight.host.doctor.bench import Bench, Finding, error, nic, not_checked, ok, warning
+from polysight.host.capture import HopFinding, RowCapture, route_interface, silent_radar
+from polysight.host.doctor.context import (
+    CheckContext,
+    Finding,
+    capture_frames,
+    error,
+    not_checked,
+    ok,
+    warning,
+    with_boards,
+)
+from polysight.host.doctor.kernel import NetworkInterface, read_interface
 from polysight.host.radar import RadarState
 from polysight.shared.config import Board, Instrument
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import MOST_PULSES, MOST_PULSES_S
 
-# Network card: what it must carry.
-MTU = 1500
-SPEED_MBIT = 1000
-RING = 512
-_BEFORE_DATA = ("host", "route", "link", "card")  # hops of the survey
-
-# Direct path.
-HEARD = 0.9  # part of the chirps in which it must be found
-APART_S = 10e-9  # 5 ns of trigger, and some ppm of crystals
-
-# Level.
-CLIPPED = 0.01  # part of the chirps that may be clipped
-WEAK = 4.0  # counts
-
-# Skew of two receivers.
-MUCH_S = 10e-9
-TOO_MUCH_S = 20e-9
-JITTER_S = 4e-9  # two clocks of 5 ns each make 2 ns
+_CARD_HOPS = ("host", "route", "link", "card")  # of the network survey
+_MIN_MTU, _MIN_SPEED_MBIT, _MIN_RING = 1500, 1000, 512
+_MAX_CLIPPED = 0.01  # of the chirps
+_MIN_RMS = 4.0  # counts
+_MIN_DETECTED = 0.9  # of the chirps, for the direct path
+_MAX_DELAY_S = 10e-9  # 5 ns trigger clock and some ppm of the crystals
+_SKEW_WARNING_S, _SKEW_ERROR_S = 10e-9, 20e-9
+_MAX_JITTER_S = 4e-9  # two trigger clocks of 5 ns give a standard deviation of 2 ns
 
 
-def check_pulses(bench: Bench) -> Finding:
-    """Capture a few bursts; the Pi sends every pulse, none of them too long."""
-    if not bench.wanted.pulse:
-        return not_checked("--no-pulse: no SYNC_IN pulse is sent", "leave it out; nothing moves")
-    if not bench.sound:
-        return not_checked("no card can be used")
-    from polysight.host.doctor.bench import capture, only
-
-    rig, burst = only(bench.rig, bench.sound), bench.rig.burst
-    period_s = burst.period_us * 1e-6
-    try:
-        bursts = min(bench.wanted.bursts, MOST_PULSES // burst.pulses, int(MOST_PULSES_S / (burst.pulses * period_s)))
-        if not bursts:
-            return not_checked(
-                f"a burst of {burst.pulses} pulses every {burst.period_us:g} us is longer than the Pi sends at rest",
-                f"`polysight scan` can use it; here at most {MOST_PULSES} pulses or {MOST_PULSES_S:g} s",
-            )
-        bench.captured, sent = capture(rig, bench.pi, bursts)
-    except RefusedError as e:
-        if e.number != PiFault.BAD_REQUEST:
-            raise
-        return error(e.what, "the Pi's release does not know this command", "install the same release on both")
-    told = (
-        f"{sent.pulses} sent at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
-        f" at most {sent.jitter_ns / 1e3:.2f} us late"
-    )
-    facts = {k: getattr(sent, k) for k in ("pulses", "width_max_ns", "jitter_ns", "fault")}
-    if sent.fault:
-        e = explain(sent.fault)
-        return error(f"{told}: {e.what}", e.why, e.remedy, **facts)
-    return ok(told, **facts)
-
-
-def check_radar(bench: Bench, board: Board) -> Finding:
-    """Every pulse made a frame, and every frame came."""
-    got = bench.captured.get(board.name)
-    if got is None:
-        return not_checked("nothing was captured")
-    row, frames, whole = got.row, len(got.valid), int(got.valid.sum())
-    facts = {"frames_expected": frames, "frames": whole, "bytes": row.bytes, "packets": row.packets}
-    if got.radar is not None and got.radar.state is RadarState.FAULT:
-        return error(
-            f"the radar stopped by itself: {got.radar.detail}",
-            "see there",
-            "`polysight radar check BOARD`",
-            **facts,
-        )
-    if row.packets == 0:
-        e = silent_radar(board, row)
-        return error(e.what, e.why, e.remedy, **facts)
-    told = f"{whole} of {frames} frames, {row.packets} packets"
-    if row.slipped or (row.bytes < row.expected and not row.gap_bytes):
-        return error(
-            f"{told}: {row.reason or 'the record ended early'}",
-            "the radar missed pulses: the level or the width of SYNC_IN, or it was armed for fewer frames",
-            "look at SYNC_IN with an oscilloscope at the board (0..3.3 V, 25 ns..4 us)",
-            **facts,
-        )
-    if row.lost_before_packets:
-        return error(
-            f"{told}; the card reports {row.lost_before_packets.name}",
-            "the card dropped data before it was numbered: it sends more slowly than the radar measures",
-            "shorten card.packet_delay_us",
-            **facts,
-        )
-    if row.missing:
-        return warning(
-            f"{told}; {row.missing_bytes} bytes are missing, {row.kernel_drops} packets dropped by this machine",
-            "packets are lost on the way",
-            "check cable, switch and the receive buffer above; a scan takes such rows again",
-            **facts,
-        )
-    if row.strangers:
-        return warning(
-            f"{told}; {row.strangers} packets from other addresses",
-            "two cards have the same data port",
-            "`polysight card program` gives each its own",
-            **facts,
-        )
-    return ok(told, **facts)
-
-
-def check_network(bench: Bench, board: Board) -> Finding:
-    """A gigabit link that carries whole packets. What the kernel does not tell is left out."""
-    if board.card_address.startswith("127."):
-        return ok("loopback: no network card is involved")
-    name = route_interface(board.card_address, bench.system.root)
-    if not name:
-        return warning(
-            f"no interface is in the subnet of {board.card_address}",
-            "it has no address there, or this system does not tell",
-            f"`ip address add {board.host_address}/24 dev <interface>`",
-        )
-    found = nic(name, bench.system.root)
-    told = [f"{name}: MTU {found.mtu or 'unknown'}", f"{found.speed_mbit or 'unknown'} Mbit/s"]
-    told += [f"ring {found.ring} of {found.ring_max}"] if found.ring is not None else []
-    facts, text = vars(found), ", ".join(told)
-    if found.mtu is not None and found.mtu < MTU:
-        return warning(
-            text, f"packets of a card fill frames of {MTU} bytes", f"`ip link set {name} mtu {MTU}`", **facts
-        )
-    if found.speed_mbit is not None and found.speed_mbit < SPEED_MBIT:
-        return warning(
-            text,
-            "a DCA1000 sends at gigabit speed: a slower link drops packets of each burst",
-            "a cable of category 5e or better, and a gigabit port; no 100 Mbit switch between",
-            **facts,
-        )
-    if found.ring is not None and found.ring < min(RING, found.ring_max or RING):
-        return warning(
-            text,
-            "few receive descriptors: a pause of this machine loses packets before the socket's buffer",
-            f"`ethtool -G {name} rx {found.ring_max}`",
-            **facts,
-        )
-    if found.lost:
-        return warning(
-            f"{text}; {found.lost} packets lost since it came up",
-            "the interface or the kernel dropped them before any program could take them",
-            f"`ethtool -S {name}`; does the number grow during a scan?",
-            **facts,
-        )
-    return ok(text, **facts)
-
-
-def check_card(bench: Bench, board: Board) -> Finding:
-    """The card answers at its address; what does not, is the first hop that is silent."""
-    survey = bench.surveys[board.name]
-    wrong = next((h for h in survey.hops if h.hop in _BEFORE_DATA and h.verdict == "error"), None)
-    if wrong is not None:
-        return _as(wrong)
+def check_card(context: CheckContext, board: Board) -> Finding:
+    """Check that the card replies; otherwise report the first hop that does not."""
+    survey = context.surveys[board.name]
+    for hop in survey.hops:
+        if hop.hop in _CARD_HOPS and hop.verdict == "error":
+            return _finding(hop)
     return ok(
         f"{board.card_address}:{board.command_port} answers, FPGA {survey.version}; data to"
         f" {board.host_address}:{board.data_port}",
@@ -176,163 +52,277 @@ def check_card(bench: Bench, board: Board) -> Finding:
     )
 
 
-def check_buffer(bench: Bench, board: Board) -> Finding:
-    """The receiving process starts as in a scan, and the kernel grants it the buffer that was asked for."""
-    hops = {h.hop: h for h in bench.surveys[board.name].hops}
+def check_network(context: CheckContext, board: Board) -> Finding:
+    """Check the network interface to the card: MTU, speed, receive ring, dropped packets. Unknown values pass."""
+    if board.card_address.startswith("127."):
+        return ok("loopback: no network interface is used")
+    name = route_interface(board.card_address, context.system.root)
+    if not name:
+        return warning(
+            f"no interface is in the subnet of {board.card_address}",
+            "no interface has an address there, or this system does not list its routes",
+            f"`ip address add {board.host_address}/24 dev <interface>`",
+        )
+    interface = read_interface(name, context.system.root)
+    return replace(_judge_interface(interface), facts=vars(interface))
+
+
+def _judge_interface(interface: NetworkInterface) -> Finding:
+    name, ring = interface.name, interface.ring
+    found = f"{name}: MTU {interface.mtu or 'unknown'}, {interface.speed_mbit or 'unknown'} Mbit/s"
+    found += f", ring {ring} of {interface.ring_max}" if ring is not None else ""
+    if interface.mtu is not None and interface.mtu < _MIN_MTU:
+        return warning(found, f"a card sends frames of {_MIN_MTU} bytes", f"`ip link set {name} mtu {_MIN_MTU}`")
+    if interface.speed_mbit is not None and interface.speed_mbit < _MIN_SPEED_MBIT:
+        return warning(
+            found,
+            "a DCA1000 sends at gigabit speed; a slower link drops packets of every burst",
+            "use a cable of category 5e or better and a gigabit port, without a 100 Mbit switch",
+        )
+    if ring is not None and ring < min(_MIN_RING, interface.ring_max or _MIN_RING):
+        return warning(
+            found,
+            "few receive descriptors: packets are lost while this machine is busy",
+            f"`ethtool -G {name} rx {interface.ring_max}`",
+        )
+    if interface.lost:
+        return warning(
+            f"{found}; {interface.lost} packets dropped since it came up",
+            "the interface or the kernel dropped packets before a program received them",
+            f"`ethtool -S {name}`: check if the number increases during a scan",
+        )
+    return ok(found)
+
+
+def check_buffer(context: CheckContext, board: Board) -> Finding:
+    """Check that the receiving process starts and that the kernel grants its receive buffer."""
+    hops = {h.hop: h for h in context.surveys[board.name].hops}
     receiver, buffer = hops["receiver"], hops["buffer"]
     for verdict in ("error", "warning"):
         for hop in (buffer, receiver):
             if hop.verdict == verdict:
-                return _as(hop)
-    bench.sound.add(board.name)
+                return _finding(hop)
+    context.usable_cards.add(board.name)
     return ok(f"{buffer.found}; {receiver.found}")
 
 
-def _as(hop: HopFinding) -> Finding:
+def _finding(hop: HopFinding) -> Finding:
     return Finding(hop.verdict, hop.found, hop.why, hop.remedy)
 
 
-def check_direct_path(bench: Bench, board: Board) -> Finding:
-    """Found in most chirps, within the band, and where geometry and start frequencies say."""
-    got = bench.captured.get(board.name)
-    if board.role == "transmit":
-        return not_checked("the transmitter hears only itself")
-    if got is None or not got.valid.any():
-        return not_checked("no whole frame was captured")
-    signal = find_direct(bench.rig, board, got.words, got.valid)
-    finding = judge(bench.rig, board, signal)
-    if signal.found:
-        bench.signals[board.name] = signal
-    return finding
-
-
-def better_offset_hz(rig: Instrument, board: Board, if_hz: float) -> float:
-    """The `start_offset_hz` that moves a direct path at this true IF to the middle of the band."""
-    return board.start_offset_hz + sum(band_hz(rig)) / 2 - if_hz
-
-
-def judge(rig: Instrument, board: Board, signal: DirectSignal) -> Finding:
-    """What is to be said of a board's direct path."""
-    low, high = band_hz(rig)
-    expected, spread = signal.expected_hz, jitter_hz(rig)
-    predicted = f"{expected / 1e3:.0f} kHz by the rig file"
-    facts = {"expected_hz": expected, "band_hz": [low, high], "chirps": signal.chirps, "heard": signal.if_hz.size}
-    remedy = f"start_offset_hz = {better_offset_hz(rig, board, expected):.0f} for {board.name}"
-    outside = not low <= expected <= high
-    if not signal.found:
-        return error(
-            f"no direct path in {signal.chirps - signal.if_hz.size} of {signal.chirps} chirps; expected at {predicted}",
-            "its IF lies outside the receiver's band, so it is filtered away or aliased"
-            if outside
-            else "the transmitter is off or not armed, something stands between the boards, or the start frequencies"
-            " differ by more than the rig file says",
-            remedy
-            if outside
-            else "free the line of sight from TX to RX, check that the transmitting board is armed too, and the start"
-            " frequencies of both",
-            **facts,
+def check_pulses(context: CheckContext) -> Finding:
+    """Capture a few bursts; check that the Pi sent every pulse and that none was too long."""
+    if not context.options.pulse:
+        return not_checked("--no-pulse: no SYNC_IN pulse is sent", "omit --no-pulse; nothing moves")
+    if not context.usable_cards:
+        return not_checked("no capture card is usable")
+    rig, burst = with_boards(context.rig, context.usable_cards), context.rig.burst
+    burst_s = burst.pulses * burst.period_us * 1e-6
+    bursts = min(context.options.bursts, MOST_PULSES // burst.pulses, int(MOST_PULSES_S / burst_s))
+    if not bursts:
+        return not_checked(
+            f"a burst of {burst.pulses} pulses every {burst.period_us:g} us is longer than the Pi sends at rest",
+            f"`polysight scan` can use it; the limit here is {MOST_PULSES} pulses or {MOST_PULSES_S:g} s",
         )
-    if_hz = unwrapped(signal.if_hz, rig)
-    middle, std = float(np.median(if_hz)), float(if_hz.std())
-    told = f"at {middle / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
-    facts |= {"if_hz": middle, "std_hz": std, "amplitude": float(np.sqrt(np.median(signal.power)))}
-    if outside:
+    try:
+        context.captured, sent = capture_frames(rig, context.pi, bursts)
+    except RefusedError as e:
+        if e.number != PiFault.BAD_REQUEST:
+            raise
+        return error(e.what, "the Pi's release does not know this command", "install the same release on both")
+    found = (
+        f"{sent.pulses} sent at rest, at most {sent.width_max_ns / 1e3:.2f} us long,"
+        f" at most {sent.jitter_ns / 1e3:.2f} us late"
+    )
+    facts = {k: getattr(sent, k) for k in ("pulses", "width_max_ns", "jitter_ns", "fault")}
+    if sent.fault:
+        e = explain(sent.fault)
+        return error(f"{found}: {e.what}", e.why, e.remedy, **facts)
+    return ok(found, **facts)
+
+
+def check_radar(context: CheckContext, board: Board) -> Finding:
+    """Check that every pulse gave a frame and that every frame was received complete."""
+    captured = context.captured.get(board.name)
+    if captured is None:
+        return not_checked("nothing was captured")
+    frames, complete = len(captured.valid), int(captured.valid.sum())
+    facts = {"frames_expected": frames, "frames": complete, "bytes": captured.row.bytes}
+    facts["packets"] = captured.row.packets
+    if captured.radar is not None and captured.radar.state is RadarState.FAULT:
+        found = f"the radar stopped: {captured.radar.detail}"
+        return error(found, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
+    text = f"{complete} of {frames} frames, {captured.row.packets} packets"
+    return replace(_judge_frames(board, captured.row, text), facts=facts)
+
+
+def _judge_frames(board: Board, row: RowCapture, found: str) -> Finding:
+    if row.packets == 0:
+        e = silent_radar(board, row)
+        return error(e.what, e.why, e.remedy)
+    if row.slipped or (row.bytes < row.expected and not row.gap_bytes):
         return error(
-            f"{told}; {predicted} is outside {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
-            "what is seen is an alias: the anti-aliasing filter weakens it, and the high-pass filter is undone wrongly",
-            remedy,
-            **facts,
+            f"{found}: {row.reason or 'the record ended early'}",
+            "the radar missed pulses: wrong level or width of SYNC_IN, or it was armed for fewer frames",
+            "check SYNC_IN at the board with an oscilloscope (0..3.3 V, 25 ns..4 us)",
         )
-    offset = better_offset_hz(rig, board, middle)
-    if middle - spread < low or middle + spread > high or signal.if_hz.size < HEARD * signal.chirps:
+    if row.lost_before_packets:
         return error(
-            f"{told}: too near the edge of {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
-            f"the start frequencies put it there; 5 ns of trigger are {spread / 1e3:.0f} kHz, so some chirps are lost",
-            f"start_offset_hz = {offset:.0f} for {board.name}",
-            **facts,
+            f"{found}; the card reports {row.lost_before_packets.name}",
+            "the card dropped data before it was numbered: it sends more slowly than the radar measures",
+            "shorten card.packet_delay_us",
         )
-    apart = -signal.later_s(rig)[0]  # what the crystals explain is taken off
-    if abs(apart) > APART_S:
+    if row.missing:
         return warning(
-            f"{told}; {predicted}, {apart * 1e9:+.1f} ns away",
-            "start_offset_hz in the rig file is not what the board was programmed with, the geometry is wrong, or the"
-            " board is triggered at another time than the transmitter",
-            "if the board was programmed so: start_offset_hz ="
-            f" {board.start_offset_hz + apart * rig.chirp.slope_hz_per_s:.0f} for {board.name}",
-            **facts,
+            f"{found}; {row.missing_bytes} bytes are missing, {row.kernel_drops} packets dropped by this machine",
+            "packets were lost between card and program",
+            "check cable, switch and the receive buffer above; a scan retakes such rows",
         )
-    return ok(f"{told}; {predicted}", **facts)
+    if row.strangers:
+        return warning(
+            f"{found}; {row.strangers} packets from other addresses",
+            "two cards have the same data port",
+            "give each card its own port with `polysight card program`",
+        )
+    return ok(found)
 
 
-def check_level(bench: Bench, board: Board) -> Finding:
-    """Chirps with a sample at full scale are useless to synchronisation; a level of a few counts drowns in steps."""
-    got = bench.captured.get(board.name)
-    if got is None or not got.valid.any():
-        return not_checked("no whole frame was captured")
-    words = got.words[got.valid]
-    high = (words >= FULL_SCALE) | (words <= -FULL_SCALE)
-    clipped = int(high.any(axis=(1, 2, 3)).sum())
-    rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)  # I and Q together, of each RX
+def check_level(context: CheckContext, board: Board) -> Finding:
+    """Check for clipped chirps, which cannot be synchronised, and for an RX without a signal."""
+    captured = context.captured.get(board.name)
+    if captured is None or not captured.valid.any():
+        return not_checked("no complete frame was captured")
+    words = captured.words[captured.valid]
+    clipped = int(((words >= FULL_SCALE) | (words <= -FULL_SCALE)).any(axis=(1, 2, 3)).sum())
+    rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)  # of I and Q together, for each RX
     peak = int(np.abs(words.astype(np.int32)).max())
-    told = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
+    found = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
     facts = {"clipped_chirps": clipped, "chirps": len(words), "rms": [round(float(r), 1) for r in rms], "peak": peak}
     if clipped:
-        told += f"; {clipped} of {len(words)} chirps are clipped"
-        found = error if clipped > CLIPPED * len(words) else warning
-        return found(
-            told,
-            "something reflects straight into the receiver, or its gain is too high",
+        fault = error if clipped > _MAX_CLIPPED * len(words) else warning
+        return fault(
+            f"{found}; {clipped} of {len(words)} chirps are clipped",
+            "a strong reflection reaches the receiver, or its gain is too high",
             "lower the RX gain (radar.rx_gain_db, or the profile in mmWave Studio), or move the reflector away",
             **facts,
         )
-    if rms.min() < WEAK:
+    if rms.min() < _MIN_RMS:
+        remedy = "check the RX mask of the profile; `polysight card reset --radar`, and arm it again"
+        return error(found, "an RX is off, or the radar sends zeros", remedy, **facts)
+    return ok(found, **facts)
+
+
+def check_direct_path(context: CheckContext, board: Board) -> Finding:
+    """Check that the direct path is detected, lies within the band, and at the IF that the rig file predicts."""
+    captured = context.captured.get(board.name)
+    if board.role == "transmit":
+        return not_checked("the transmitter has no direct path to itself")
+    if captured is None or not captured.valid.any():
+        return not_checked("no complete frame was captured")
+    signal = find_direct(context.rig, board, captured.words, captured.valid)
+    if signal.found:
+        context.signals[board.name] = signal
+    return judge_direct_path(context.rig, board, signal)
+
+
+def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Finding:
+    """Judge a board's direct path."""
+    low, high = band_hz(rig)
+    expected = signal.expected_hz
+    outside = not low <= expected <= high
+    predicted = f"{expected / 1e3:.0f} kHz expected from the rig file"
+    facts = {"expected_hz": expected, "band_hz": [low, high], "chirps": signal.chirps, "heard": signal.if_hz.size}
+    if not signal.found:
+        missed = signal.chirps - signal.if_hz.size
+        found = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
+        if outside:
+            why = "its IF is outside the receiver's band, so it is filtered out or aliased"
+            return error(found, why, _better_start(rig, board, expected), **facts)
         return error(
-            told,
-            "an RX is off, or the radar sends zeros",
-            "check the RX mask of the profile; `polysight card reset --radar`, and arm it again",
+            found,
+            "the transmitter is off or not armed, something stands between the boards, or the start frequencies"
+            " differ by more than in the rig file",
+            "clear the line of sight from TX to RX; check that the transmitting board is armed, and the start"
+            " frequencies of both boards",
             **facts,
         )
-    return ok(told, **facts)
+    if_hz, spread = unwrapped(signal.if_hz, rig), jitter_hz(rig)
+    median, std = float(np.median(if_hz)), float(if_hz.std())
+    found = f"at {median / 1e3:.0f} kHz, std {std / 1e3:.0f} kHz, {signal.if_hz.size} of {signal.chirps} chirps"
+    facts |= {"if_hz": median, "std_hz": std, "amplitude": float(np.sqrt(np.median(signal.power)))}
+    if outside:
+        return error(
+            f"{found}; {predicted}, outside {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
+            "this is an alias: the anti-aliasing filter attenuates it, and the high-pass filter is inverted at the"
+            " wrong frequency",
+            _better_start(rig, board, expected),
+            **facts,
+        )
+    if median - spread < low or median + spread > high or signal.if_hz.size < _MIN_DETECTED * signal.chirps:
+        return error(
+            f"{found}: too near the edge of {low / 1e3:.0f}..{high / 1e3:.0f} kHz",
+            f"5 ns of trigger jitter move it by {spread / 1e3:.0f} kHz, so that some chirps are lost",
+            _better_start(rig, board, median),
+            **facts,
+        )
+    delay_s = -signal.start_delay_s(rig)[0]  # without the crystals' share
+    if abs(delay_s) > _MAX_DELAY_S:
+        start = board.start_offset_hz + delay_s * rig.chirp.slope_hz_per_s
+        return warning(
+            f"{found}; {predicted}, {delay_s * 1e9:+.1f} ns away",
+            "start_offset_hz in the rig file is not the programmed one, the geometry is wrong, or the board is"
+            " triggered at another time than the transmitter",
+            f"if the board was programmed so: start_offset_hz = {start:.0f} for {board.name}",
+            **facts,
+        )
+    return ok(f"{found}; {predicted}", **facts)
 
 
-def check_skew(bench: Bench) -> Finding:
-    """Both receivers start together; the transmitter's start is known as well as the start frequencies are."""
-    if any(b.name not in bench.signals for b in bench.rig.receivers):
-        return not_checked("the direct path of both receivers is needed")
-    return judge_skew(bench.rig, bench.signals)
+def _better_start(rig: Instrument, board: Board, if_hz: float) -> str:
+    """Remedy: the start offset that moves a direct path with this true IF to the middle of the band."""
+    return f"start_offset_hz = {board.start_offset_hz + sum(band_hz(rig)) / 2 - if_hz:.0f} for {board.name}"
+
+
+def check_skew(context: CheckContext) -> Finding:
+    """Check that both receivers start their chirps at the same time."""
+    if any(b.name not in context.signals for b in context.rig.receivers):
+        return not_checked("the direct path of a receiver is missing")
+    return judge_skew(context.rig, context.signals)
 
 
 def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
-    """What is to be said of two receivers' direct paths."""
+    """Judge the receivers' start times. Relative to the transmitter they are as exact as the start frequencies."""
     h, v = rig.receivers
-    later = {b.name: signals[b.name].later_s(rig) for b in (h, v)}
-    skew = later[v.name][0] - later[h.name][0]
-    unsure = float(np.hypot(later[h.name][1], later[v.name][1]))
+    delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}  # mean and standard error, s
+    skew = delay[v.name][0] - delay[h.name][0]
+    uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
     jitter = max(float(unwrapped(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
     ppm = {b.name: signals[b.name].crystal_ppm(rig) for b in (h, v)}
-    told = f"{v.name} starts {skew * 1e9:+.2f} +- {unsure * 1e9:.2f} ns after {h.name}; " + ", ".join(
+    found = f"{v.name} starts {skew * 1e9:+.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(
         f"{name} {mean * 1e9:+.1f} ns after the transmitter, crystal {ppm[name]:+.2f} ppm"
-        for name, (mean, _) in later.items()
+        for name, (mean, _) in delay.items()
     )
     facts = {
         "skew_ns": skew * 1e9,
-        "standard_error_ns": unsure * 1e9,
+        "standard_error_ns": uncertainty * 1e9,
         "jitter_ns": jitter * 1e9,
-        "later_ns": {name: mean * 1e9 for name, (mean, _) in later.items()},
+        "later_ns": {name: mean * 1e9 for name, (mean, _) in delay.items()},
         "crystal_ppm": ppm,
     }
-    lines = "several GPIO lines, written one after another" if len(rig.pi.sync_out) > 1 else "cables of unequal length"
-    why = f"{lines}, a slow edge, or start_offset_hz that one board does not have"
-    remedy = "one line and a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
-    if abs(skew) > TOO_MUCH_S:
-        return error(told, why, remedy, **facts)
-    if abs(skew) > MUCH_S:
-        return warning(told, why, remedy, **facts)
-    if jitter > JITTER_S:
+    wiring = (
+        "several GPIO lines, switched one after another" if len(rig.pi.sync_out) > 1 else "cables of unequal length"
+    )
+    why = f"{wiring}, a slow edge, or a start_offset_hz that differs from the programmed one"
+    remedy = (
+        "use one line and a clock buffer (docs/how-to/wiring.md); compare SYNC_IN at the boards with an oscilloscope"
+    )
+    if abs(skew) > _SKEW_WARNING_S:
+        return (error if abs(skew) > _SKEW_ERROR_S else warning)(found, why, remedy, **facts)
+    if jitter > _MAX_JITTER_S:
         return warning(
-            f"{told}; {jitter * 1e9:.1f} ns from chirp to chirp",
-            "more than two clocks of 5 ns explain: noise or slow edges on SYNC_IN",
+            f"{found}; {jitter * 1e9:.1f} ns from chirp to chirp",
+            "more jitter than two clocks of 5 ns cause: noise or slow edges on SYNC_IN",
             remedy,
             **facts,
         )
-    return ok(told, **facts)
+    return ok(found, **facts)

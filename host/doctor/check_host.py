@@ -1,4 +1,4 @@
-"""Checks of the host: rig file, calibration and library; the disk, the scan's duration, the clocks."""
+"""Checks of the host: rig file, clocks, calibration, library, receivers, disk, duration of a scan."""
 
 from __future__ import annotations
 
@@ -6,61 +6,128 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-from polysight.host.calibration import checked
+from polysight.host.calibration import checked_calibration
 from polysight.host.capture import PRIORITY_REMEDY
-from polysight.host.doctor.bench import Bench, Finding, error, not_checked, ok, warning
-from polysight.host.doctor.receiver_load import SEND_US, rates
+from polysight.host.doctor.context import CheckContext, Finding, error, not_checked, ok, warning
+from polysight.host.doctor.receiver_load import PACKET_TIME_US, card_rates
 from polysight.host.materials import SIMULATED_LIBRARY, Library
 from polysight.host.plan import scan_time
 from polysight.host.process import Options
 from polysight.host.radar import require
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import incidence_deg
 from polysight.shared.messages import is_simulated
 from polysight.shared.raster import check_burst_fits
 
-SPARE = 2.0  # the disk should take so many times what comes
-APART_S = 1.0  # the clocks of host and Pi, at most
-LOST_S = 60.0  # a clock that is earlier than this file by more has lost its time
-_NTP = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery behind its clock"
+_SPEED_MARGIN = 2.0  # disk speed relative to the data rate
+_MAX_CLOCK_OFFSET_S = 1.0  # between host and Pi
+_CLOCK_LOST_S = 60.0
+_SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
 
 
-def row_s(rig: Instrument) -> float:
-    """How long a row takes, from one row's first point to the next one's, as `polysight plan` has it: seconds."""
-    return scan_time(rig).total_s / rig.grid.rows
+def check_config(context: CheckContext) -> Finding:
+    """Load the rig file; check that a burst fits between two points, and the settings of natively controlled radars."""
+    options = context.options
+    rig = load_instrument(options.config)
+    check_burst_fits(rig.grid, rig.burst, rig.stage)
+    if rig.radar.control == "native":
+        require(rig, rig.grid.columns * rig.burst.pulses)
+    context.loaded_rig = rig
+    boards = ", ".join(b.name for b in rig.recorded)
+    return ok(
+        f"{options.config}: {rig.name}, {rig.grid.columns} x {rig.grid.rows} positions, records {boards},"
+        f" radar control {rig.radar.control!r}"
+    )
 
 
-def check_disk(bench: Bench) -> Finding:
-    """Room for a whole scan and the reserve, and twice the speed at which data comes."""
-    rig, folder = bench.rig, _existing(bench.wanted.out)
+def check_host_clock(context: CheckContext) -> Finding:
+    """Check that the clock is later than this program's files, and synchronised."""
+    now_s = context.system.wall_ns() * 1e-9
+    found = f"{datetime.fromtimestamp(now_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    if now_s < Path(__file__).stat().st_mtime - _CLOCK_LOST_S:
+        return error(f"{found}: earlier than this program's installation", "the clock lost its time", _SET_CLOCK)
+    if context.system.clock_is_synchronised() is False:
+        return warning(f"{found}, not synchronised", "no time server is reachable", _SET_CLOCK)
+    return ok(found)
+
+
+def check_pi_clock(context: CheckContext) -> Finding:
+    """Compare the clocks of Pi and host; the uncertainty is half the duration of the request."""
+    if context.hello is None or context.hello.t_unix_ns == 0:
+        return not_checked("the Pi does not report its time", "install the same release on both")
+    offset_s = (context.hello.t_unix_ns - context.hello_at_ns) * 1e-9
+    uncertainty_s = context.hello_took_ns * 0.5e-9
+    found = f"the Pi's clock minus this machine's: {offset_s:+.3f} s (+- {uncertainty_s:.3f} s)"
+    facts = {"offset_s": offset_s, "uncertainty_s": uncertainty_s}
+    if abs(offset_s) - uncertainty_s > _CLOCK_LOST_S:
+        return error(found, "one clock is wrong: times in logs and scans cannot be compared", _SET_CLOCK, **facts)
+    if abs(offset_s) - uncertainty_s > _MAX_CLOCK_OFFSET_S:
+        return warning(found, "one of the two clocks is not synchronised", _SET_CLOCK, **facts)
+    return ok(found, **facts)
+
+
+def check_calibration(context: CheckContext) -> Finding:
+    """Check the calibration files that a scan would copy into its folder."""
+    simulated = context.hello is not None and is_simulated(context.hello.backend)
+    facts = checked_calibration(context.rig, simulated).facts()
+    if not facts:
+        return ok("no calibration file is configured: geometry, filters and metal as in the rig file and the scene")
+    return ok("; ".join(f"{kind} of {fact['made_utc'][:10]}" for kind, fact in facts.items()), **facts)
+
+
+def check_library(context: CheckContext) -> Finding:
+    """Compare the rig's incidence angle with those of the default library; without a match no material is named."""
+    angle, angles = incidence_deg(context.rig, context.rig.receivers[0]), Library.load(SIMULATED_LIBRARY).angles_deg
+    known = " and ".join(f"{a:g}" for a in angles)
+    facts = {"incidence_deg": angle, "library_deg": list(angles)}
+    found = f"incidence angle of the rig {angle:.1f} degrees, of {SIMULATED_LIBRARY.name} {known} degrees"
+    if not Options().unnamed(context.rig):
+        return ok(found, **facts)
+    return warning(
+        found,
+        "|P| changes by about 10 % per degree, so no material of this rig's scans will be named",
+        "train a library at this angle (docs/how-to/add-a-material.md) and scan with --library; or --model none",
+        **facts,
+    )
+
+
+def check_receivers(context: CheckContext) -> Finding:
+    """Measure the receivers' packet loss under load; loss at a rate that this rig's cards reach is a warning."""
+    rates = card_rates(context.rig)
+    results, scheduling = context.system.measure_receivers(context.rig, rates)
+    losses = "; ".join(
+        f"{r.mbit_s:.0f} Mbit/s a card: {'no loss' if not r.lost else f'{100 * r.lost / r.sent:.1f} % lost'}"
+        for r in results
+    )
+    found = f"receivers ({scheduling}) with all cores busy: {losses}"
+    facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
+    needed = results[: rates.index(1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)) + 1]
+    if any(r.lost for r in needed):
+        remedy = "use a faster machine" if "real-time" in scheduling else PRIORITY_REMEDY
+        return warning(found, "other programs take processor time from the receivers", remedy, **facts)
+    return ok(found, **facts)
+
+
+def check_disk(context: CheckContext) -> Finding:
+    """Check free space for a scan and the reserve, and for twice the scan's data rate."""
+    rig, folder = context.rig, _nearest_existing(context.options.out)
     need, reserve, free = rig.scan_bytes, rig.limits.free_disk_bytes, shutil.disk_usage(folder).free
-    told = f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
+    found = f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
+    facts: dict[str, float] = {"free_bytes": free, "need_bytes": need}
     if free < need + reserve:
-        return error(
-            told,
-            "the disk is too full for a whole scan",
-            "free space, or another --out",
-            free_bytes=free,
-            need_bytes=need,
-        )
-    speed, wanted = bench.system.write_speed(folder), need / (rig.grid.rows * row_s(rig))
-    told += f"; it writes {speed / 1e6:.0f} MB/s durably, a scan brings {wanted / 1e6:.2f} MB/s"
-    facts = {"free_bytes": free, "need_bytes": need, "write_bytes_s": speed, "scan_bytes_s": wanted}
-    if speed < wanted:
-        return error(
-            told,
-            "the disk is slower than the data comes: a network share, or a worn card",
-            "scan to a local disk",
-            **facts,
-        )
-    if speed < SPARE * wanted:
-        return warning(told, "the disk has little to spare", "scan to a faster disk", **facts)
-    return ok(told, **facts)
+        return error(found, "the disk is too full for a scan", "free space, or give another --out", **facts)
+    speed, rate = context.system.write_speed(folder), need / scan_time(rig).total_s
+    found += f"; durable write speed {speed / 1e6:.0f} MB/s, data rate of a scan {rate / 1e6:.2f} MB/s"
+    facts |= {"write_bytes_s": speed, "scan_bytes_s": rate}
+    if speed < rate:
+        return error(found, "the disk is too slow: a network share or a worn card", "scan to a local disk", **facts)
+    if speed < _SPEED_MARGIN * rate:
+        return warning(found, "the disk is hardly fast enough", "scan to a faster disk", **facts)
+    return ok(found, **facts)
 
 
-def _existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that exists."""
+def _nearest_existing(folder: Path) -> Path:
     found = folder.resolve()
     while not found.exists():
         found = found.parent
@@ -69,97 +136,14 @@ def _existing(folder: Path) -> Path:
     return found
 
 
-def check_time(bench: Bench) -> Finding:
-    """How long a scan of the configured grid takes, from the plan."""
-    rig = bench.rig
-    seconds = rig.grid.rows * row_s(rig)
+def check_time(context: CheckContext) -> Finding:
+    """Estimate the duration of a scan of the configured grid."""
+    rig, seconds = context.rig, scan_time(context.rig).total_s
     hours, minutes = divmod(round(seconds / 60), 60)
-    told = f"{hours} h {minutes:02d} min" if hours else f"{seconds / 60:.1f} min"
+    duration = f"{hours} h {minutes:02d} min" if hours else f"{seconds / 60:.1f} min"
     return ok(
-        f"a scan of {rig.grid.rows} rows takes about {told}: {row_s(rig):.1f} s a row, {rig.scan_bytes / 1e9:.2f} GB",
+        f"a scan of {rig.grid.rows} rows takes about {duration}: {seconds / rig.grid.rows:.1f} s a row,"
+        f" {rig.scan_bytes / 1e9:.2f} GB",
         seconds=seconds,
         bytes=rig.scan_bytes,
     )
-
-
-def check_config(bench: Bench) -> Finding:
-    """Read it; a burst must end before the next point, and radars under native control must take their settings."""
-    rig = load_instrument(bench.wanted.config)
-    check_burst_fits(rig.grid, rig.burst, rig.stage)
-    if rig.radar.control == "native":
-        require(rig, rig.grid.columns * rig.burst.pulses)
-    bench.given = rig
-    boards = ", ".join(b.name for b in rig.recorded)
-    return ok(
-        f"{bench.wanted.config}: {rig.name}, {rig.grid.columns} x {rig.grid.rows} positions, records {boards},"
-        f" radars under control {rig.radar.control!r}"
-    )
-
-
-def check_calibration(bench: Bench) -> Finding:
-    """What a scan would copy into its folder."""
-    simulated = bench.hello is not None and is_simulated(bench.hello.backend)
-    facts = checked(bench.rig, simulated).facts()
-    if not facts:
-        return ok("none named: geometry, filters and metal as the rig file and the scene have them")
-    return ok("; ".join(f"{kind} of {fact['made_utc'][:10]}" for kind, fact in facts.items()), **facts)
-
-
-def check_library(bench: Bench) -> Finding:
-    """A scan can be made without it, but nothing of it would be named."""
-    angle, known = incidence_deg(bench.rig, bench.rig.receivers[0]), Library.load(SIMULATED_LIBRARY).angles_deg
-    held = " and ".join(f"{a:g}" for a in known)
-    facts = {"incidence_deg": angle, "library_deg": list(known)}
-    if not Options().unnamed(bench.rig):
-        return ok(f"{SIMULATED_LIBRARY.name} holds {held} degrees of incidence, the rig looks at {angle:.1f}", **facts)
-    return warning(
-        f"the rig looks at {angle:.1f} degrees of incidence, {SIMULATED_LIBRARY.name} holds {held} degrees only",
-        "|P| changes by a tenth in a degree, so that nothing of its scans will be named",
-        "train a library at this angle (docs/how-to/add-a-material.md) and scan with --library; or --model none",
-        **facts,
-    )
-
-
-def check_host_clock(bench: Bench) -> Finding:
-    """The clock is later than this program's own files, and the kernel calls it synchronised."""
-    now_s = bench.system.wall_ns() * 1e-9
-    told = f"{datetime.fromtimestamp(now_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    if now_s < Path(__file__).stat().st_mtime - LOST_S:
-        return error(f"{told}: earlier than this program was installed", "the clock was lost", _NTP)
-    if bench.system.clock_is_synchronised() is False:
-        return warning(f"{told}, not synchronised", "no time server is reached", _NTP)
-    return ok(told)
-
-
-def check_pi_clock(bench: Bench) -> Finding:
-    """How far the Pi's clock is from this one's: to half the time that its answer took."""
-    if bench.hello is None or bench.hello.t_unix_ns == 0:
-        return not_checked("the Pi does not tell its time", "install the same release on both")
-    offset_s = (bench.hello.t_unix_ns - bench.hello_at_ns) * 1e-9
-    unsure_s = bench.hello_took_ns * 0.5e-9
-    told = f"the Pi's clock is {offset_s:+.3f} s off this one's (to {unsure_s:.3f} s)"
-    facts = {"offset_s": offset_s, "uncertainty_s": unsure_s}
-    if abs(offset_s) - unsure_s > LOST_S:
-        return error(
-            told, "one of the two does not know the time: logs and scans cannot be laid side by side", _NTP, **facts
-        )
-    if abs(offset_s) - unsure_s > APART_S:
-        return warning(told, "one of the two is not synchronised", _NTP, **facts)
-    return ok(told, **facts)
-
-
-def check_receivers(bench: Bench) -> Finding:
-    """What the receivers hold under load, and whether a scan needs more."""
-    some = rates(bench.rig)
-    held, scheduling = bench.system.held(bench.rig, some)
-    told = "; ".join(
-        f"{h.mbit_s:.0f} Mbit/s a card: {'nothing lost' if not h.lost else f'{100 * h.lost / h.sent:.1f} % lost'}"
-        for h in held
-    )
-    told = f"receivers ({scheduling}) beside a busy machine: {told}"
-    facts = {"held": [vars(h) for h in held], "scheduling": scheduling}
-    needed = held[: some.index(1e6 / (bench.rig.card.packet_delay_us + SEND_US)) + 1]
-    if any(h.lost for h in needed):
-        why = "other programs take the processor from the receivers"
-        return warning(told, why, PRIORITY_REMEDY if "real-time" not in scheduling else "a faster machine", **facts)
-    return ok(told, **facts)

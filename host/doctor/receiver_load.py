@@ -1,9 +1,15 @@
-"""How many packets this machine's receivers hold while it computes: measured over loopback with the scan's own."""
+"""Measure packet loss of the scan's receivers over loopback while every core is busy.
+
+`python -m polysight.host.doctor.receiver_load CARD HOST PORT PACKETS RATE` sends full packets as a card does, at RATE
+packets/s, and prints the seconds it took.
+"""
 
 from __future__ import annotations
 
 import os
 import random
+import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -14,20 +20,20 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.host.capture import MAX_PAYLOAD_BYTES, ReceiverProcess, receiver_cores
+from polysight.host.capture import CARD_SOURCE_PORT, MAX_PAYLOAD_BYTES, ReceiverProcess, receiver_cores
 from polysight.shared.config import Instrument
 
-SECONDS = 1.5  # of each rate
-SEND_US = (
-    11.0  # a card takes so long for a packet beside its delay: 5, 10, 25, 50 us are 706, 545, 325, 193 Mbit/s (TI)
-)
+# Time of a packet beyond its configured delay: delays of 5, 10, 25, 50 us give 706, 545, 325, 193 Mbit/s (TI).
+PACKET_TIME_US = 11.0
+_RATE_S = 1.5  # duration of each rate
 _DRAIN_S = 5.0
-_BUSY = "while True: sum(range(100_000))"
+_MAX_LAG_S = 0.005  # a card catches up no more than its own buffer
+_BUSY_LOOP = "while True: sum(range(100_000))"
 
 
 @dataclass(frozen=True)
-class Held:
-    """One rate, tried: packets/s asked for and reached, packets sent and lost, all of one card at the mean."""
+class LoadResult:
+    """Result at one rate: packets/s of a card requested (`wanted`) and reached; packets sent and lost by all cards."""
 
     wanted: float
     reached: float
@@ -36,20 +42,20 @@ class Held:
 
     @property
     def mbit_s(self) -> float:
-        """Payload of one card, Mbit/s."""
+        """Payload rate of one card, Mbit/s."""
         return self.reached * MAX_PAYLOAD_BYTES * 8e-6
 
 
-def rates(rig: Instrument) -> list[float]:
-    """Packets/s of one card: in a burst, when it sends what it has stored, and at its fastest."""
+def card_rates(rig: Instrument) -> list[float]:
+    """Packet rates of a card, packets/s, ascending: during bursts, while emptying its memory, and its maximum."""
     burst = rig.frame_bytes / MAX_PAYLOAD_BYTES / (rig.burst.period_us * 1e-6)
-    return sorted({burst, *(1e6 / (delay_us + SEND_US) for delay_us in (rig.card.packet_delay_us, 5.0))})
+    return sorted({burst, *(1e6 / (delay_us + PACKET_TIME_US) for delay_us in (rig.card.packet_delay_us, 5.0))})
 
 
-def measure(rig: Instrument, some: list[float], seconds: float = SECONDS) -> tuple[list[Held], str]:
-    """Send at these rates to receivers of every recorded board at once, beside a busy process a core.
+def measure_receivers(rig: Instrument, rates: list[float], seconds: float = _RATE_S) -> tuple[list[LoadResult], str]:
+    """Send packets at each rate (packets/s) to the receivers of all recorded boards, with a busy process on each core.
 
-    Returns what was held, and how the receivers run. Raises DeviceError as ReceiverProcess does.
+    Returns the result for each rate and the receivers' scheduling. Raises DeviceError if a receiver does not start.
     """
     subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
     boards = [
@@ -58,43 +64,56 @@ def measure(rig: Instrument, some: list[float], seconds: float = SECONDS) -> tup
     ]
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="polysight-receivers-")))
-        cores = receiver_cores(len(boards))
         receivers = [
             stack.enter_context(ReceiverProcess(b, rig.card.receive_buffer_bytes, core))
-            for b, core in zip(boards, cores, strict=True)
+            for b, core in zip(boards, receiver_cores(len(boards)), strict=True)
         ]
         for _ in range(os.cpu_count() or 1):
-            stack.callback(_end, subprocess.Popen([sys.executable, "-c", _BUSY], start_new_session=True))
-        return [_try(rate, seconds, receivers, folder) for rate in some], receivers[0].scheduling
+            busy = stack.enter_context(subprocess.Popen([sys.executable, "-c", _BUSY_LOOP], start_new_session=True))
+            stack.callback(busy.kill)
+        return [_measure_rate(rate, seconds, receivers, folder) for rate in rates], receivers[0].scheduling
 
 
-def _try(rate: float, seconds: float, receivers: list[ReceiverProcess], folder: Path) -> Held:
+def _measure_rate(rate: float, seconds: float, receivers: list[ReceiverProcess], folder: Path) -> LoadResult:
     packets = max(2, round(rate * seconds))
     for r in receivers:
         r.begin_row(0, 1, packets * MAX_PAYLOAD_BYTES, 1, folder / f"{r.board.name}.part")
+    module = [sys.executable, "-m", "polysight.host.doctor.receiver_load"]
     senders = [
         subprocess.Popen(
-            [
-                *(sys.executable, "-m", "polysight.host.doctor.send_packets", r.board.card_address),
-                *(r.board.host_address, str(r.board.data_port), str(packets), str(rate)),
-            ],
+            [*module, r.board.card_address, r.board.host_address, str(r.board.data_port), str(packets), str(rate)],
             stdout=subprocess.PIPE,
             text=True,
         )
         for r in receivers
     ]
-    took = [float(sender.communicate()[0] or "inf") for sender in senders]
+    took_s = [float(sender.communicate()[0] or "inf") for sender in senders]
     deadline = time.monotonic() + _DRAIN_S
     while not all(r.poll().complete for r in receivers) and time.monotonic() < deadline:
         before = [r.report().received for r in receivers]
         time.sleep(0.2)
         if [r.report().received for r in receivers] == before:
             break
-    captures = [r.end_row() for r in receivers]
-    lost = sum(packets - c.packets for c in captures)
-    return Held(rate, packets / max(took), packets * len(receivers), lost)
+    lost = sum(packets - r.end_row().packets for r in receivers)
+    return LoadResult(rate, packets / max(took_s), packets * len(receivers), lost)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()
-    process.wait()
+def send_packets(card: str, host: str, port: int, packets: int, rate: float) -> float:
+    """Send full packets with consecutive counters from `card` to `host`, at `rate` packets/s; return the seconds."""
+    period_s = 1 / rate
+    payload = (bytes(range(256)) * 6)[:MAX_PAYLOAD_BYTES]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((card, CARD_SOURCE_PORT))
+        began = due = time.perf_counter()
+        for k in range(packets):
+            count = k * MAX_PAYLOAD_BYTES
+            sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + payload, (host, port))
+            due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
+            if (ahead := due - time.perf_counter()) > 0.0005:
+                time.sleep(ahead)
+        return time.perf_counter() - began
+
+
+if __name__ == "__main__":
+    _, card, host, port, packets, rate = sys.argv
+    sys.stdout.write(f"{send_packets(card, host, int(port), int(packets), float(rate))}\n")

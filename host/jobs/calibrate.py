@@ -15,8 +15,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polysight.host.calibration import CalibrationFile, FilterFile, StartFile, facts_of, head, open_raw, write
+from polysight.host.calibration import (
+    CalibrationFile,
+    FilterFile,
+    StartFile,
+    header,
+    open_raw,
+    source_scan,
+    write_calibration,
+)
 from polysight.host.jobs.process import imaged, load_reference, plane_of
+from polysight.host.jobs.progress import say, steps
 from polysight.host.polarimetry import (
     Image,
     Leakage,
@@ -62,17 +71,18 @@ def _key(kind: str, path: Path) -> list[str]:
 
 def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, out: Path, as_json: bool) -> int:
     """Places of boards and plane from a scan of known points. Raises PolysightError."""
-    from polysight.host.calibration import Prior, fit_places, look, of_scan, places_file, read_target
+    from polysight.host.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
 
     points = read_target(target)
     given = None if config is None else load_instrument(config)
     source = open_raw(scan, given)
     rig = source.instrument if given is None else with_places_of(source.instrument, given)
-    in_force = of_scan(source)
+    in_force = calibration_of_scan(source)
     filters = {b.name: in_force.high_pass(b.name) for b in rig.receivers}
-    fit = fit_places(look(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
-    file = places_file(rig, fit, len(points), [facts_of(source, scan)])
-    path = write(file, out)
+    say("places of boards and plane")
+    fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
+    file = places_file(rig, fit, len(points), [source_scan(source, scan)])
+    path = write_calibration(file, out)
     lines = []
     for name, b in file.boards.items():
         shift = ", ".join(f"{v:+.2f} +- {e:.2f}" for v, e in zip(b.shift_mm, b.standard_error_mm, strict=True))
@@ -107,10 +117,10 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
             f"the scans have different filters: {sorted(chirps)} kHz", "they are of several sweeps", "give one"
         )
     names = [b.name for b in sources[0].instrument.receivers]
-    boards = {name: fit_filter(sources, name) for name in names}
-    found = [facts_of(source, folder) for source, folder in zip(sources, scans, strict=True)]
-    file = FilterFile(**head("hpf", found), boards=boards)
-    path = write(file, out)
+    boards = {name: fit_filter(sources, name) for name in steps(names, [f"filters of {name}" for name in names])}
+    found = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
+    file = FilterFile(**header("hpf", found), boards=boards)
+    path = write_calibration(file, out)
     lines = [
         f"{name}: corners "
         + ", ".join(
@@ -125,13 +135,13 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
 
 def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool) -> int:
     """Gains at every pixel from a scan of a metal plate over the plane, in sub-bands too. Raises PolysightError."""
-    from polysight.host.calibration import MetalFile, read, write_metal
+    from polysight.host.calibration import MetalFile, read_calibration, write_metal
     from polysight.host.imaging import sub_bands
 
     source = open_raw(scan, None if config is None else load_instrument(config))
     parts = sub_bands(source.instrument.chirp, bands) if bands > 1 else ()
-    path = write_metal(load_reference(scan, config, bands=bands), [facts_of(source, scan)], out, parts)
-    file = read(path, MetalFile, "metal")
+    path = write_metal(load_reference(scan, config, bands=bands), [source_scan(source, scan)], out, parts)
+    file = read_calibration(path, MetalFile, "metal")
     lines = [
         f"metal on {100 * file.share_of_plane:.0f} % of the image; elsewhere pixels are masked",
         f"gains vary over it by {file.h_variation_db:.2f} dB (H), {file.v_variation_db:.2f} dB (V),"
@@ -152,9 +162,10 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     from polysight.host.calibration import fit_start
 
     source = open_raw(scan, None if config is None else load_instrument(config))
-    boards = {b.name: fit_start(source, b.name) for b in source.instrument.receivers}
-    file = StartFile(**head("start_frequency", [facts_of(source, scan)]), boards=boards)
-    path = write(file, out)
+    names = [b.name for b in source.instrument.receivers]
+    boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}
+    file = StartFile(**header("start_frequency", [source_scan(source, scan)]), boards=boards)
+    path = write_calibration(file, out)
     lines, what_to_set = [], []
     rate_khz = source.instrument.chirp.sample_rate_hz / 1e3
     for name, b in boards.items():

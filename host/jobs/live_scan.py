@@ -17,17 +17,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from polysight.host.acquisition import (
-    ControlDesk,
+    ControlFolder,
     OnProgress,
     OnRow,
     ScanProgress,
     ScanResult,
     StopRequest,
-    hangups_pass,
+    ignore_hangup,
     resume_scan,
     run_scan,
 )
-from polysight.host.calibration import Calibration, of_rig, of_scan
+from polysight.host.calibration import Calibration, calibration_of_rig, calibration_of_scan
 from polysight.host.imaging import image_grid
 from polysight.host.jobs.process import check_options, load_options, make_products, publish_images, truth_of
 from polysight.host.materials import TRUTH, read_truth
@@ -124,11 +124,11 @@ class _Live:
             publish_images(self.pipeline, self._folder / PRODUCTS)
 
 
-@hangups_pass()
+@ignore_hangup()
 def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
     live = _Live(folder)
     stop = StopRequest()
-    with ScanBar() as bar, ControlDesk(folder, stop) as desk:
+    with ScanBar() as bar, ControlFolder(folder, stop) as desk:
 
         def told(progress: ScanProgress) -> None:
             if progress.phase != "connect":
@@ -205,7 +205,7 @@ def scan(config: Path, request: ProcessRequest, truth: Path | None, keep_incompl
     if truth is not None and not truth.is_file():
         raise ConfigError(f"{truth}: no such file", "--truth names it", "give truth.json, or leave --truth out")
     if process:
-        _check_options(options, rig, of_rig(rig))
+        _check_options(options, rig, calibration_of_rig(rig))
         if truth is not None:
             read_truth(truth)
 
@@ -236,7 +236,7 @@ def resume(request: ProcessRequest, keep_incomplete: bool, process: bool, config
     if rig_now is not None:
         check_same_scan(source.instrument, rig_now, str(config))
     if process:
-        _check_options(options, source.instrument, of_scan(source))
+        _check_options(options, source.instrument, calibration_of_scan(source))
         check_products_folder(folder / PRODUCTS, source.scan_id)
 
     def take(on_row: OnRow | None, tell: OnProgress, stop: StopRequest) -> ScanResult:

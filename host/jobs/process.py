@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
-from polysight.host.calibration import of_scan
+from polysight.host.calibration import calibration_of_scan
 from polysight.host.imaging import (
     AS_IN_RIG_FILE,
     PLANE_REACH_M,
@@ -23,6 +20,7 @@ from polysight.host.imaging import (
     View,
     focus_sweep,
 )
+from polysight.host.jobs.progress import counted, current_step, say
 from polysight.host.materials import (
     TruthPlate,
     read_labels,
@@ -34,12 +32,10 @@ from polysight.host.process import (
     Options,
     ProcessRequest,
     Products,
-    Tell,
     coverage_lines,
-    each_row,
+    map_rows,
     quality_content,
     save_images,
-    untold,
 )
 from polysight.host.products import (
     IMAGE,
@@ -85,9 +81,7 @@ def all_rows(
         )
     if isinstance(source, ScanFolder) and not pipeline.samples.holds(rows):
         require_raw(source)
-    console = Console(stderr=True)
-    done = each_row(pipeline.add_row, rows, threads)
-    for _ in track(done, "rows", total=len(rows), console=console, disable=not console.is_terminal):
+    for _ in counted(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
         pass
     return pipeline
 
@@ -155,33 +149,22 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
 
 
 def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
-    """All products, which take the place of those in `out`; what is being made is shown on a terminal.
+    """All products, which take the place of those in `out`; the current step is shown on stderr.
 
     When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
     are. Raises PolysightError.
     """
-    with making_products(out, pipeline.source.scan_id) as new, _telling() as tell:
+    with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
         try:
-            return replace(pipeline.finish(new, options, plates, tell), folder=out)
+            return replace(pipeline.finish(new, options, plates, progress), folder=out)
         except DataError as e:
             if not (new / IMAGE).exists():
                 raise
             if (out / REPORT).exists():
                 where = f"{out} holds the earlier products; `polysight image` with another --out writes the images"
-                raise DataError(e.what, e.why, advice(e.remedy, where)) from None
-            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"))
+                raise DataError(e.what, e.why, advice(e.remedy, where), code=e.code) from None
+            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
-
-
-@contextmanager
-def _telling() -> Iterator[Tell]:
-    """Shows the step that is being done, on a terminal."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield untold
-        return
-    with console.status("image") as status:
-        yield status.update
 
 
 def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
@@ -279,11 +262,11 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     out.mkdir(parents=True, exist_ok=True)
     pipeline = all_rows(source, data, max(depth_mm / 1e3, PLANE_REACH_M))
     builder = pipeline.images
-    _say("images, and the plane of the plates")
+    say("images, and the plane of the plates")
     images = pipeline.form_images()
     pipeline.place_plane(images, move=False)
     plates = pipeline.plane
-    _say("the plane at which the image is sharpest")
+    say("the plane at which the image is sharpest")
     found = focus_sweep(builder, depth_m=depth_mm / 1e3)
     depth_m = plates.offset_m if plates.known else found.depth_mm / 1e3
     grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
@@ -298,12 +281,6 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     sys.stdout.write("".join(f"{line}\n" for line in _focus_lines(head, at, found, plates)))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
-
-
-def _say(step: str) -> None:
-    """What is being done for the next seconds."""
-    sys.stderr.write(f"{step} ...\n")
-    sys.stderr.flush()
 
 
 def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstimate) -> list[str]:
@@ -341,13 +318,13 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     from polysight.host.sync import BoardSetup, synchronise_row
 
     source = raw_source(open_source(data, config), data)
-    calibration = of_scan(source)
+    calibration = calibration_of_scan(source)
     rig = calibration.rig(source.instrument)
     chirp, reports = rig.chirp, {}
     for board in rig.receivers:
         setup = BoardSetup.of(rig, board, model=calibration.high_pass(board.name))
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
-        _say(f"rows of {board.name}")
+        say(f"rows of {board.name}")
         for row in source.rows():
             recorded = source.read_row(board.name, row)
             words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples)

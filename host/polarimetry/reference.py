@@ -1,9 +1,9 @@
-"""A metal plate over the whole plane, scanned on its own, as the reference of other scans (Eq. 8 and 9 by position).
+"""Metal reference from a separate scan of a metal plate that covers the plane (Eq. 8 and 9 for each pixel).
 
-One metal patch in the scene gives one number for each channel. A plate over the plane gives one for each pixel: what
-differs from place to place, antenna patterns and illumination of H against V, is divided out with the gains. Samples
-are referenced to the direct path, so the gains of another power cycle do not matter; the geometry and the boards must
-be the same: :meth:`PlaneReference.check_rig`.
+A metal patch in the scene gives one number per channel. A plate over the plane gives one per pixel, which also removes
+differences between H and V that vary over the plane (antenna patterns, illumination). Samples are referenced to the
+direct path, so the reference stays valid after a power cycle; geometry and boards must be the same, see
+:meth:`PlaneReference.check_rig`.
 """
 
 from __future__ import annotations
@@ -17,34 +17,35 @@ import scipy
 
 from polysight.host.imaging import ImagedWith
 from polysight.host.polarimetry.calibrate import Calibrated, Image, Mask, calibrate_by_reference, ratio, smooth
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 SMOOTH_MM = 8.0
 FLOOR_DB = -10.0
-LEAST_PIXELS = 100
+MIN_PIXELS = 100
 
 
 @dataclass(frozen=True)
 class PlaneReference:
-    """What both channels are divided by.
+    """Metal reference of both channels at every pixel.
 
     Attributes
     ----------
     h, v
-        complex [ny, nx]: metal's amplitudes, with the phase of H / V in h and v real; not a number where not valid.
+        complex [ny, nx]: amplitudes of metal, with the phase of H / V in h, and v real; NaN where not valid.
     valid
-        bool [ny, nx]: where metal was seen strongly enough.
+        bool [ny, nx]: pixels where metal is strong enough in both channels.
     x_m, y_m
         Pixel centres, rig frame, metres.
     spread
-        How far pixels of the plate lie from it, one standard deviation of each part of V / H: noise and speckle, and
-        for :meth:`mean` the variation over the plane.
+        Standard deviation of the real and the imaginary part of V / H over the plate: noise and speckle; for
+        :meth:`mean` also the variation over the plane.
     how
         One sentence for the report.
     bands
-        The same plate in sub-bands of the sweep, where those were imaged.
+        References of the imaged sub-bands.
     made_with
-        The rig that it was imaged with; None where that is not known.
+        Settings that the gains depend on; None if unknown.
     """
 
     h: Image
@@ -58,7 +59,7 @@ class PlaneReference:
     made_with: ImagedWith | None = None
 
     def mean(self) -> PlaneReference:
-        """The same plate as one number a channel (Eq. 9), usable at every pixel."""
+        """Return the reference averaged to one number per channel (Eq. 9), valid at every pixel."""
         at = self.valid
         cross = complex(np.mean(self.h[at] * np.conj(self.v[at])))
         metal_v = float(np.sqrt(np.mean(np.abs(self.v[at]) ** 2)))
@@ -75,57 +76,61 @@ class PlaneReference:
         )
 
     def apply(self, h: Image, v: Image) -> Calibrated:
-        """Divide both channels of another scan; not a number where this reference is not valid."""
+        """Divide both channels of another scan by the reference; NaN where it is not valid."""
         return calibrate_by_reference(h, v, self.h, self.v)
 
     def check_axes(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> None:
-        """Refuse a scan with other pixels. Raises DataError."""
+        """Raise DataError if a scan has other pixels."""
         same = all(
             np.shape(own) == np.shape(other) and np.allclose(own, other, rtol=0, atol=1e-5)
             for own, other in ((self.x_m, x_m), (self.y_m, y_m))
         )
         if not same:
             raise DataError(
-                "the metal reference's image and this scan's have different pixels",
+                "the images of the metal reference and of this scan have different pixels",
                 "the reference was scanned with another [image], another geometry or another chirp",
                 "scan the metal plate with the same rig file; only [grid] may differ",
+                code=ErrorCode.MISMATCH,
             )
 
     def valid_on(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Where the reference is strong enough, on a scan's pixels, bool [ny, nx]. Raises DataError."""
+        """Return `valid` for a scan with these pixels. Raises DataError if its pixels differ."""
         self.check_axes(x_m, y_m)
         return self.valid
 
     def check_rig(self, now: ImagedWith, name: str = "the metal reference") -> None:
-        """Refuse images of another rig: the gains would not be theirs. `name` is for the message. Raises DataError."""
+        """Raise DataError if the gains do not apply to images made with `now`; `name` is for the message."""
         if self.made_with is None:
             raise DataError(
-                f"{name} does not say which rig it was scanned with",
-                "an older release wrote it, which could not tell when a board was moved afterwards",
+                f"{name} does not contain the rig that it was scanned with",
+                "an older release wrote it, so later changes of the rig cannot be detected",
                 "make it again from the same scan: `polysight calibrate metal SCAN`; one scan can be processed with"
                 " --reference SCAN instead",
+                code=ErrorCode.KEY_MISSING,
             )
         if found := self.made_with.differences(now):
             raise DataError(
                 f"{name} is of another rig: {'; '.join(found)}",
-                "the rig or its file was changed after the metal plate was scanned, and the gains with it",
-                "empty calibration.metal, scan the metal plate again with the rig as it is, and calibrate with it; or"
-                " put the rig file back",
+                "the rig or its file was changed after the scan of the metal plate, which changes the gains",
+                "empty calibration.metal, scan the metal plate again with the present rig, and calibrate with it; or"
+                " restore the rig file",
+                code=ErrorCode.MISMATCH,
             )
 
     def check_bands(self, count: int, name: str = "the metal reference") -> None:
-        """Refuse to divide so many sub-bands by a reference that has others, or none. Raises DataError."""
+        """Raise DataError if the reference does not have `count` sub-bands; one band is always there."""
         if count > 1 and len(self.bands) != count:
             held = f"{len(self.bands)} sub-bands" if self.bands else "no sub-bands"
             instead = f"--bands {len(self.bands)} uses those it has" if self.bands else "leave --bands out"
             raise DataError(
                 f"{name} holds {held}, not {count}",
-                "a sub-band is divided by metal in the same part of the sweep",
-                f"`polysight calibrate metal SCAN --bands {count}` keeps so many; or {instead}; or --reference SCAN",
+                "each sub-band needs a metal reference in the same part of the sweep",
+                f"`polysight calibrate metal SCAN --bands {count}` adds them; or {instead}; or --reference SCAN",
+                code=ErrorCode.MISMATCH,
             )
 
     def facts(self) -> dict[str, Any]:
-        """How much the gains vary over the plane, for quality.json; plain numbers."""
+        """Return the variation of the gains over the plane, for quality.json."""
         at = self.valid
         h, v = self.h[at], self.v[at]
         out: dict[str, Any] = {"how": self.how, "share_of_plane": round(float(at.mean()), 4)}
@@ -150,29 +155,28 @@ def plane_reference(
     floor_db: float = FLOOR_DB,
     name: str = "",
 ) -> PlaneReference:
-    """The reference from the images of a metal plate over the plane.
+    """Make a reference from the images of a metal plate over the plane.
 
-    Amplitudes and H conj(V) are averaged over a Gaussian window: a phase common to both channels, the plate's distance
-    and tilt, has no influence. Pixels count where both channels lie above `floor_db`, and not within two widths of the
-    window of ones that do not.
+    Amplitudes and H conj(V) are averaged over a Gaussian window, so a common phase of both channels (distance and tilt
+    of the plate) has no influence. A pixel is valid if both channels exceed `floor_db` within two widths of the window.
 
     Parameters
     ----------
     h, v
         complex [ny, nx], flattened by the footprint.
     x_m, y_m, valid
-        Pixel centres, metres; bool [ny, nx], pixels to look at.
+        Pixel centres, metres; bool [ny, nx], pixels to use.
     smooth_mm
-        Width (standard deviation) of the window, millimetres: gains vary slowly, speckle does not.
+        Width (standard deviation) of the window, millimetres; the gains vary slowly, speckle does not.
     floor_db
-        Weakest level relative to the plate's own 90th percentile, in each channel.
+        Lowest level relative to the plate's 90th percentile, in each channel.
     name
-        Of the scan, for the report.
+        Name of the scan, for the report.
 
     Raises
     ------
     DataError
-        when no metal is seen.
+        if the image shows no metal.
     """
     smooth_px = smooth_mm / 1e3 / abs(float(x_m[1] - x_m[0]))
     usable = np.isfinite(h) & np.isfinite(v) & (True if valid is None else valid)
@@ -181,13 +185,14 @@ def plane_reference(
     for power in (power_h, power_v):
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
         strong &= power >= max(top * 10 ** (floor_db / 10), np.finfo(np.float32).tiny)
-    # The image's own border is no edge of the plate.
+    # The border of the image does not count as an edge of the plate.
     inside = np.asarray(scipy.ndimage.binary_erosion(strong, _disk(round(2 * smooth_px)), border_value=1), bool)
-    if int(inside.sum()) < LEAST_PIXELS:
+    if int(inside.sum()) < MIN_PIXELS:
         raise DataError(
             "the reference scan shows no metal plate",
-            "nowhere are both channels strong over an area wider than the smoothing",
+            "no area wider than the smoothing window is bright in both channels",
             "scan a flat metal plate that covers the plane, larger than the grid on every side",
+            code=ErrorCode.NO_DATA,
         )
     cut_h, cut_v = (np.where(strong, z, complex(np.nan, np.nan)) for z in (h, v))
     level_h, level_v = (np.sqrt(np.abs(smooth(np.abs(z) ** 2, smooth_px))) for z in (cut_h, cut_v))
@@ -201,7 +206,7 @@ def plane_reference(
 
 
 def _spread(h: Image, v: Image) -> float:
-    """Standard deviation of the real and of the imaginary part of V / H, from the median absolute deviation."""
+    """Return the standard deviation of the real and the imaginary part of V / H (median absolute deviation)."""
     q = ratio(v, h)
     q = q[np.isfinite(q)]
     parts = np.concatenate([q.real - np.median(q.real), q.imag - np.median(q.imag)])

@@ -1,24 +1,26 @@
-"""What one scan goes through between its rows and its products.
+"""Processing of one scan: its request and options, kept samples, quality figures, verdict and products.
 
-`ProcessRequest` is what was asked, as plain data; `Options` the same with its files read. `Quality` collects figures
-while rows are processed, `KeptSamples` their reduced samples; `save_images` and `save_materials` write the products.
+A `ProcessRequest` is the command line as plain data; `Options` are the same settings with their files loaded.
+`map_rows` processes rows on several threads. For each row, `Quality` collects quality figures and `KeptSamples` stores
+the reduced samples in the scan folder, so that images can be formed again without raw data. `judge` gives the verdict
+on the result; `save_images` and `save_materials` write the products. `host/pipeline.py` calls them in this order.
 """
 
 from polysight.host.process.judge import error_budget, judge, recording_verdict
-from polysight.host.process.quality import Quality
+from polysight.host.process.parallel import cores, map_boards, map_rows
+from polysight.host.process.quality import Quality, masked_runs
 from polysight.host.process.request import DrawnBoxes, Options, ProcessRequest
-from polysight.host.process.rows import cores, each_row, of_each
 from polysight.host.process.samples import Choices, KeptSamples
 from polysight.host.process.save import (
     Findings,
     Products,
-    Tell,
+    Progress,
     coverage_lines,
     materials_content,
+    no_progress,
     quality_content,
     save_images,
     save_materials,
-    untold,
 )
 
 __all__ = [
@@ -29,18 +31,19 @@ __all__ = [
     "Options",
     "ProcessRequest",
     "Products",
+    "Progress",
     "Quality",
-    "Tell",
     "cores",
     "coverage_lines",
-    "each_row",
     "error_budget",
     "judge",
+    "map_boards",
+    "map_rows",
+    "masked_runs",
     "materials_content",
-    "of_each",
+    "no_progress",
     "quality_content",
     "recording_verdict",
     "save_images",
     "save_materials",
-    "untold",
 ]

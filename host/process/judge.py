@@ -1,4 +1,4 @@
-"""The verdict on a processed scan: which evidence of the scan, the rig and the scene speaks for and against it."""
+"""Verdict on a processed scan, from the evidence of recording, rig and scene; error budget of its results."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from polysight.host.verdict import (
 
 
 def recording_verdict(quality: Quality) -> list[Reason]:
-    """Reasons from how the scan was recorded and synchronised: rows, frames, manifest, direct path of each board."""
+    """Return reasons from recording and synchronisation: rows, frames, manifest, and the direct path of each board."""
     coverage = Coverage.of(quality.coverage())
     positions = sum(b.positions for b in quality.boards.values())
     masked = sum(b.positions_masked for b in quality.boards.values())
     missing: list[Reason] = []
     for name, board in quality.boards.items():
         share = 1 - board.positions_masked / board.positions if board.positions else 0.0
-        # Positions without a whole frame have no direct path either: that is the recording's fault, not the path's.
+        # Positions without a whole frame have no direct path either; do not count that loss twice.
         received = board.frames_share
         missing += direct_path_reasons(
             name, board.direct_snr_db, board.residual("averaged"), share / received if received else 1.0
@@ -48,18 +48,18 @@ def recording_verdict(quality: Quality) -> list[Reason]:
 def judge(
     quality: Quality, found: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None
 ) -> Verdict:
-    """The verdict, from everything that is known of a scan.
+    """Return the verdict on a processed scan.
 
     Parameters
     ----------
     quality
-        Of all rows.
+        Figures of all rows.
     found
-        Patches, metal reference, joint inversion.
+        Patches, metal reference and joint inversion.
     plane
-        Where the plates lie; None where it was not looked for.
+        Plane of the plates; None if it was not estimated.
     classifier
-        What named them, if anything did.
+        The classifier that named the patches; None without naming.
     """
     reasons = recording_verdict(quality)
     refused = {r.patch.label: r.refused.what for r in found.patches if r.refused is not None}
@@ -78,7 +78,7 @@ def judge(
     if found.prior.channels_known:
         levels = {"H": found.calibrated.metal_h, "V": found.calibrated.metal_v}
         reasons += level_reasons({k: float(np.median(np.abs(v))) for k, v in levels.items()})
-    reasons += leakage_reasons(found.prior.leakage_measured, found.inversion.leakage_determined, _by_leakage(found))
+    reasons += leakage_reasons(found.prior.leakage_measured, found.inversion.leakage_determined, _leakage_error(found))
     if plane is not None:
         std = float(np.degrees(found.prior.theta_std_rad))
         tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
@@ -92,8 +92,8 @@ def judge(
     return verdict_of(reasons)
 
 
-def _by_leakage(found: MaterialsResult) -> float:
-    """Median relative error that leakage leaves in the permittivities; 0 without any."""
+def _leakage_error(found: MaterialsResult) -> float:
+    """Return the median relative error of the permittivities due to leakage; 0 without permittivities."""
     parts = []
     for r in found.patches:
         e = r.permittivity
@@ -104,7 +104,7 @@ def _by_leakage(found: MaterialsResult) -> float:
 
 
 def error_budget(found: MaterialsResult, plane: PlaneEstimate | None) -> dict[str, Any]:
-    """What the joint inversion found, for materials.json: leakage, angle, plane, evidence for metal."""
+    """Return `error_budget` of materials.json: leakage, incidence angle, plane and evidence for metal."""
     i, prior = found.inversion, found.prior
     source = "measured" if prior.leakage_measured else "scene" if i.leakage_determined else "prior and scene"
     evidence = found.metal.evidence

@@ -1,4 +1,4 @@
-"""How good a scan is: what was received and masked, how well the boards were synchronised, where the time went."""
+"""Quality figures of a scan (quality.json): frames received, positions masked, synchronisation residuals, run time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from polysight.shared.raster import plan_raster
 
 @dataclass
 class BoardQuality:
-    """Sums over the rows of one board; a row that is added again replaces its earlier figures."""
+    """Quality figures of one board, by row; adding a row again replaces its earlier figures."""
 
     rig: Instrument
     board: Board
@@ -34,7 +34,7 @@ class BoardQuality:
         self._filter = object_filter(self.rig, self.board)
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
-        """Take in one row."""
+        """Compute and store the figures of a synchronised row."""
         figures = {
             "frames_expected": recorded.frames_expected,
             "frames_received": frames_valid,
@@ -50,45 +50,45 @@ class BoardQuality:
         self.put(row, figures, echo_of_row(synced, self._filter))
 
     def put(self, row: int, figures: dict[str, Any], echo: NDArray[np.complex64]) -> None:
-        """Take in what :meth:`add` made of a row before."""
+        """Store figures of a row that :meth:`add` computed earlier."""
         self.rows[row], self.echoes[row] = figures, echo
 
     @property
     def positions(self) -> int:
-        """Positions of the rows that were recorded."""
+        """Number of positions in the recorded rows."""
         return sum(r["positions"] for r in self.rows.values())
 
     @property
     def positions_masked(self) -> int:
-        """Those of them without usable data."""
+        """Number of recorded positions without usable data."""
         return sum(r["positions_masked"] for r in self.rows.values())
 
     @property
     def frames_share(self) -> float:
-        """Share of the recorded rows' frames that were received whole."""
+        """Share of the frames of recorded rows that were received whole, 0 to 1."""
         expected = sum(r["frames_expected"] for r in self.rows.values())
         return sum(r["frames_received"] for r in self.rows.values()) / expected if expected else 0.0
 
     @property
     def direct_snr_db(self) -> float | None:
-        """Power of the direct path over that of noise in one sample of one chirp and channel, dB.
+        """Median SNR of the direct path in one sample of one chirp and channel, dB.
 
-        None where it is not known (cubes that were synchronised elsewhere).
+        None if unknown (cubes that another program synchronised).
         """
         values = _known([r["direct_snr"] for r in self.rows.values()])
         return float(10 * np.log10(np.median(values))) if values.size else None
 
     def residual(self, stage: str) -> float | None:
-        """Standard deviation of the phase after a stage of synchronisation, radians; None where it is not known."""
+        """Return the standard deviation of the phase after a synchronisation stage, radians; None if unknown."""
         found = [r["stages"][stage][1] for r in self.rows.values() if stage in r["stages"]]
         return float(np.median(found)) if found else None
 
     def summary(self, backlash: bool = True) -> dict[str, Any]:
-        """Plain numbers for quality.json. Residuals are root mean squares over rows, weighted by valid positions.
+        """Return the board's entry of quality.json. Residuals are RMS over rows, weighted by valid positions.
 
-        Without `backlash` it is not estimated: that takes 2 ms a row.
+        `backlash=False` skips the estimate of the stage's backlash, which takes 2 ms per row.
         """
-        ordered = dict(sorted(self.rows.items()))  # they come from several threads, in any order
+        ordered = dict(sorted(self.rows.items()))  # threads add rows in any order
         rows = list(ordered.values())
         total: dict[str, Any] = {
             key: sum(r[key] for r in rows)
@@ -117,15 +117,15 @@ class BoardQuality:
         return {**total, "synchronisation": stages}
 
     def _backlash(self) -> dict[str, float] | None:
-        """How far odd rows lie towards +x of where the plan puts them, from the echoes; None where they do not tell."""
+        """Return the shift of odd rows towards +x relative to the plan, estimated from echoes; None if undetermined."""
         found = estimate_backlash(self.echoes, self.rig)
         return None if found is None else {"shift": round(found.shift_mm, 4), "std": round(found.std_mm, 4)}
 
 
 def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
-    """Power of the direct path over that of noise in one sample of one chirp and channel, float64 [position].
+    """Return the SNR of the direct path in one sample of one chirp and channel, power ratio, float64 [position].
 
-    Not a number where a position is not valid, or the noise is not known.
+    NaN at invalid positions and where the noise is unknown.
     """
     out = np.full(row.valid.size, np.nan)
     if row.noise is not None:
@@ -135,19 +135,19 @@ def _direct_snr(row: SyncedRow) -> NDArray[np.float64]:
 
 
 def _known(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The numbers among the values of all rows."""
+    """Return the finite values of all rows in one array."""
     values = np.concatenate(rows) if rows else np.zeros(0)
     return values[np.isfinite(values)]
 
 
 def masked_runs(masked: NDArray[np.bool_]) -> list[list[int]]:
-    """Half-open ranges [start, stop) of what is masked, ascending."""
+    """Return the half-open ranges [start, stop) of True values, ascending."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(np.int8), [0]])))
     return edges.reshape(-1, 2).tolist()
 
 
 class Quality:
-    """Collects the figures of a scan while it is processed; `rig` is the calibrated one of the source."""
+    """Collects the quality figures of a scan during processing; `rig` is the source's rig, calibrated."""
 
     def __init__(self, rig: Instrument, source: Source) -> None:
         self.source = source
@@ -157,7 +157,7 @@ class Quality:
         self._lock = threading.Lock()  # rows are processed in several threads
 
     def coverage(self) -> dict[str, Any]:
-        """Rows, positions and frames compared with the plan; rows that were never recorded count as not received."""
+        """Compare rows, positions and frames with the plan; missing rows count as not received."""
         plan, boards = self.source.plan, list(self.boards.values())
         absent = [row for row in range(plan.rows) if any(row not in board.rows for board in boards)]
         frames_at = 1 if self.source.synchronised else self.source.instrument.burst.chirps_a_position
@@ -173,29 +173,25 @@ class Quality:
         }
 
     def note(self, **entries: Any) -> None:
-        """Keep entries for quality.json."""
+        """Add entries to quality.json."""
         self.notes |= entries
 
     def note_imaging(self, builder: ImageBuilder, images: ChannelImages) -> None:
-        """Keep what the aperture makes of a point."""
+        """Add the point response of the aperture to quality.json."""
         with self.timed("point response"):
             self.note(imaging=imaging_facts(builder, images))
 
     def note_materials(
-        self,
-        found: MaterialsResult,
-        angles: IncidenceChoice,
-        valid: NDArray[np.bool_],
-        plane: PlaneReference | None,
+        self, found: MaterialsResult, angles: IncidenceChoice, valid: NDArray[np.bool_], plane: PlaneReference | None
     ) -> None:
-        """Keep what the choice of the incidence angle changes, and how the metal plate was used."""
+        """Add the effect of the incidence angle and the use of the metal plate to quality.json."""
         self.note(incidence={**angles.facts(valid), **permittivity_change(found, angles)})
         if plane is not None:
             self.note(metal_reference=plane.facts())
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the wall time of a block to a stage's seconds, those of rows at the same time each."""
+        """Add the wall time of a block to a stage; parallel rows add up."""
         began = time.perf_counter()
         try:
             yield
@@ -204,7 +200,7 @@ class Quality:
                 self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
 
     def to_dict(self, backlash: bool = True, **more: Any) -> dict[str, Any]:
-        """Content of quality.json; `more` are further entries."""
+        """Return the content of quality.json, with the entries `more`."""
         return {
             "boards": {name: board.summary(backlash) for name, board in self.boards.items()},
             "coverage": self.coverage(),

@@ -1,4 +1,4 @@
-"""What a scan is to be processed with: the request as plain data, and the options with their files read."""
+"""Settings of processing: the request as plain data, and the options with their files loaded."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from polysight.shared.geometry import incidence_deg
 
 
 class ProcessRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One scan to process, as plain data: what the command line parses, and what batch and Dask send to their workers.
+    """Request to process one scan, as plain data: parsed from the command line, sent to workers by batch and Dask.
 
     Attributes
     ----------
     data, out
-        The recorded scan, and the folder for its products.
+        Recorded scan, and the folder for its products.
     config
-        Rig file, for data that brings none; None: the data's own.
+        Rig file, for data without one; None: the rig file of the data.
     library, model
-        Reference library (None: the simulated one) and classifier (None: the library's own, "none": name nothing).
+        Reference library (None: the simulated one) and classifier (None: the library's default, "none": no naming).
     metal_box_mm
-        Where the metal reference is: x0, y0, x1, y1 in millimetres from the image centre; None: found.
+        Box of the metal reference: x0, y0, x1, y1 in millimetres from the image centre; None: find it.
     labels
-        File of boxes drawn by hand, which take the place of patches that are found.
+        File of boxes drawn by hand, used instead of detected patches.
     reference, reference_by
-        Scan of a metal plate, the reference instead of metal in the scene: by position, or one number a channel.
+        Scan of a metal plate, used as reference instead of metal in the scene: per pixel, or one number per channel.
     incidence
-        One angle for the image, or each pixel's own.
+        One incidence angle for the image, or one per pixel.
     bands
-        Above 1: image so many sub-bands of the sweep too.
+        Number of sub-bands of the sweep to image as well; 1: none.
     """
 
     data: str
@@ -62,16 +62,16 @@ class ProcessRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     bands: int = 1
 
     def paths(self) -> dict[str, Path]:
-        """The files and folders that shape the products, by field; those that are not given are left out."""
+        """Return the files and folders that affect the products, by field, without those that are None."""
         given = {name: getattr(self, name) for name in ("config", "library", "labels", "reference")}
         return {name: Path(value) for name, value in given.items() if value is not None}
 
     def choices(self) -> dict[str, Any]:
-        """The other choices that shape the products, by field."""
+        """Return the other settings that affect the products, by field."""
         return {name: getattr(self, name) for name in ("model", "metal_box_mm", "reference_by", "incidence", "bands")}
 
     def absolute(self) -> ProcessRequest:
-        """The same with absolute paths, for a worker in another folder."""
+        """Return the request with absolute paths, for a worker in another folder."""
         paths = {name: str(path.absolute()) for name, path in self.paths().items()}
         return msgspec.structs.replace(
             self, data=str(Path(self.data).absolute()), out=str(Path(self.out).absolute()), **paths
@@ -79,7 +79,7 @@ class ProcessRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
 
 class DrawnBoxes(NamedTuple):
-    """Boxes drawn by hand as patches, their names by patch number, and which of them is the metal reference."""
+    """Boxes drawn by hand as patches, their names by patch number, and the number of the metal reference."""
 
     segmentation: Segmentation | None = None
     names: Mapping[int, str] = MappingProxyType({})
@@ -88,11 +88,9 @@ class DrawnBoxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Options:
-    """Where the metal is (else it is found), the classifier's library and its model, and how far to look.
+    """Settings of a :class:`ProcessRequest` with their files loaded; the fields have the same meaning.
 
-    `model` None is the one chosen for the library, "none" no naming at all. `reference` is metal scanned on its own,
-    instead of metal in the scene; `bands` above 1 images so many sub-bands, for thin layers; `incidence` is one angle
-    for the image or each pixel's own. `labels` are boxes drawn by hand, instead of patches that are found.
+    `reference` is the processed scan of a metal plate, `labels` the content of the label file.
     """
 
     metal_box_mm: Box | None = None
@@ -104,10 +102,9 @@ class Options:
     labels: Labels | None = None
 
     def drawn(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> DrawnBoxes:
-        """The boxes drawn by hand on an image; empty without them.
+        """Return the boxes drawn by hand as patches of an image with axes `x_m`, `y_m`; empty without labels.
 
-        `x_m`, `y_m` are the image's axes. Raises DataError when a box holds no pixel, or nothing could be learnt of
-        boxes that a person drew.
+        Raises DataError if a box holds no pixel, or too few to be used.
         """
         if self.labels is None:
             return DrawnBoxes()
@@ -117,12 +114,15 @@ class Options:
         return DrawnBoxes(patches, names, metal if self.reference is None and self.metal_box_mm is None else None)
 
     def unnamed(self, rig: Instrument) -> str:
-        """Why nothing of a rig's scans will be named, in a sentence; "" when it will. Raises DataError."""
+        """Return the reason why nothing will be named in scans of a rig, as a sentence; "" if names are given.
+
+        Raises DataError if the library cannot be loaded.
+        """
         if self.model == "none":
             return "Nothing was named: naming was left out (--model none)."
         path, angle = self.library or SIMULATED_LIBRARY, incidence_deg(rig, rig.receivers[0])
         known = Library.load(path).angles_deg
-        if not known or any(abs(a - angle) <= SAME_ANGLE_DEG for a in known):  # an empty one is an error of its own
+        if not known or any(abs(a - angle) <= SAME_ANGLE_DEG for a in known):  # Classifier refuses an empty library
             return ""
         return (
             f"Nothing was named: the scan looks at {angle:.1f} degrees of incidence, and {path.name} holds"
@@ -131,7 +131,7 @@ class Options:
         )
 
     def classifier(self, rig: Instrument) -> Classifier | None:
-        """For scans of a rig; None where nothing is to be named, see :meth:`unnamed`. Raises DataError."""
+        """Return the classifier for scans of a rig; None without naming, see :meth:`unnamed`. Raises DataError."""
         if self.unnamed(rig):
             return None
         angle = incidence_deg(rig, rig.receivers[0])

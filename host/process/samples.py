@@ -1,7 +1,8 @@
-"""The reduced samples of a scan on disk (docs/spec/samples.md): images are made again from them, without raw data.
+"""Kept samples: the reduced samples of a scan on disk, from which images are formed without raw data.
 
-`KeptSamples` belongs to one pipeline. It gives a row back where the row on disk was made from the same bytes in the
-same way, and writes it where it was not. Nothing depends on it: what is absent, torn or damaged is synchronised anew.
+`KeptSamples` belongs to one pipeline. It restores a row from disk if the row was made from the same raw bytes with the
+same settings; otherwise the pipeline synchronises the row and saves it. Missing, truncated or damaged records are
+synchronised again. File format: docs/spec/samples.md.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from polysight.shared.files import read_json
 FOLDER, HEAD, ROWS = "samples", "samples.json", "rows.jsonl"
 FORMAT = 1
 MAKING = 1
-"""Counts changes of how samples are made from raw data."""
+"""Version of the method that makes samples from raw data."""
 Use = Literal["none", "read", "keep"]
 Filters = Mapping[str, HighPass | None]
 Gate = tuple[float, float]
@@ -50,21 +51,20 @@ _log = logging.getLogger(__name__)
 
 
 class Choices(TypedDict, total=False):
-    """How a scan is imaged.
+    """Settings of imaging a scan.
 
     Attributes
     ----------
     live
-        The images so far can be looked at after every row.
+        Keep running sums, so that images can be formed after every row.
     depth_m
-        What lies so much nearer or farther than the rig file says is kept (default: 15 mm).
+        The range gate keeps echoes from planes up to this much nearer or farther than the rig file's (default 15 mm).
     bands
-        Sub-bands to image; 1 (the default): none.
+        Number of sub-bands to image; 1 (default): none.
     view
-        Another plane, other pixels.
+        Another plane or other pixels than the rig file's.
     samples
-        "none" (the default): nothing is read or written; "read": rows are read; "keep": those that are not there are
-        written too.
+        Kept samples: "none" (default) ignores them, "read" restores rows, "keep" also saves missing rows.
     """
 
     live: bool
@@ -75,7 +75,7 @@ class Choices(TypedDict, total=False):
 
 
 def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
-    """What reduced samples depend on beside raw data and gate: the calibrated rig and its filters, as plain numbers."""
+    """Return the settings that samples depend on besides raw data and gate: the calibrated rig and its filters."""
     imaged = msgspec.to_builtins(ImagedWith.of(rig, filters))
     imaged.pop("apodisation")
     parts = {name: msgspec.to_builtins(getattr(rig, name)) for name in ("chirp", "burst", "grid")}
@@ -83,24 +83,24 @@ def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
 
 
 class KeptSamples:
-    """Reduced rows of a scan folder; of another source none.
+    """Kept samples of a scan folder; nothing is kept for other sources.
 
     Parameters
     ----------
     source
         The scan.
     rig, filters
-        Its rig, calibrated, and its receivers' filters by name; None: as the chirp profile programs them.
+        Its calibrated rig, and its receivers' filters by board name; None: as the chirp profile programs them.
     quality
-        Where the rows' figures are put and taken from.
+        Quality figures: restored rows are added to it, saved rows are read from it.
     choices
         See :class:`Choices`.
 
     Attributes
     ----------
     images, sub_bands
-        What rows are put into and taken from. They reduce by the gate of the samples on disk, where it holds what they
-        need. Rows of a wider gate than usual are not written.
+        Image builders: restored rows are added to them, saved rows are read from them. They use the range gate of the
+        samples on disk if it covers what they need. Rows of a wider gate than usual are not saved.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class KeptSamples:
         self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
 
     def _gate_m(self, needed: Gate, usual: Gate) -> Gate:
-        """The gate on disk, else the usual one, where it holds what is needed."""
+        """Return the gate on disk (without samples: the usual one) if it covers the needed one, else the latter."""
         kept = tuple(self._head.get("gate_m", usual))
         if kept[0] <= needed[0] and needed[1] <= kept[1]:
             return kept
@@ -134,25 +134,25 @@ class KeptSamples:
         return needed
 
     def holds(self, rows: Sequence[int]) -> bool:
-        """Whether every one of these rows is there, made from the bytes that are committed."""
+        """True if all these rows can be restored from disk."""
         return all(self._line(row) is not None for row in rows)
 
     def restore(self, row: int) -> bool:
-        """Put a row into the images; False when it has to be synchronised."""
+        """Restore a row into the images; return False if it must be synchronised instead."""
         line = self._line(row)
         if line is None:
             return False
         arrays = {board: self._array(board) for board in line["boards"]}
         records = {board: array[row] for board, array in arrays.items() if array is not None}
-        for board, told in line["boards"].items():
-            if board not in records or _digest(records[board]) != told["crc32"]:
+        for board, entry in line["boards"].items():
+            if board not in records or _digest(records[board]) != entry["crc32"]:
                 return False
         for board, record in records.items():
             self._put(board, row, record, line["boards"][board]["figures"])
         return True
 
     def save(self, row: int) -> None:
-        """Write a row that was just put into the images. What cannot be written is left out."""
+        """Save a row that was just added to the images; log a warning if it cannot be written."""
         digests = self._digests(row)
         if digests is not None:
             with self._lock:
@@ -178,7 +178,7 @@ class KeptSamples:
             _log.warning("samples are not kept in %s: %s", self._folder, e)
 
     def _digests(self, row: int) -> dict[str, str] | None:
-        """What a committed row's bytes are, by receiver; None where nothing is kept of this source."""
+        """Return the digests of a committed row's raw data, by receiver; None if this source keeps no samples."""
         committed = self._scan.committed().get(row) if self._scan is not None else None
         if committed is None or any(name not in committed.boards for name in self._quality.boards):
             return None
@@ -186,20 +186,21 @@ class KeptSamples:
         return {name: f"{b.crc32} {b.index_crc32} {b.missing_bytes}" for name, b in boards.items()}
 
     def _line(self, row: int) -> dict[str, Any] | None:
-        """What rows.jsonl says of a row, if it was made from the bytes that are committed."""
+        """Return the line of rows.jsonl for a row, if it was made from the committed raw data."""
         digests = self._digests(row)
         if digests is None or not self._head:
             return None
         with self._lock:
-            if row not in self._lines or self._told(row) != digests:
+            if self._kept_digests(row) != digests:
                 self._read_lines()
-        return self._lines[row] if row in self._lines and self._told(row) == digests else None
+            return self._lines[row] if self._kept_digests(row) == digests else None
 
-    def _told(self, row: int) -> dict[str, str]:
-        return {name: board["raw"] for name, board in self._lines[row]["boards"].items()}
+    def _kept_digests(self, row: int) -> dict[str, str] | None:
+        """Return the digests of the raw data that a saved row was made from; None if it is not saved."""
+        return {name: b["raw"] for name, b in self._lines[row]["boards"].items()} if row in self._lines else None
 
     def _read_head(self) -> dict[str, Any]:
-        """samples.json, where these samples can be used; else empty."""
+        """Return samples.json if its samples can be used, otherwise an empty dict."""
         if self._scan is None:
             return {}
         try:
@@ -209,12 +210,12 @@ class KeptSamples:
         wanted = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
         if not isinstance(head, dict) or any(head.get(key) != value for key, value in wanted.items()):
             return {}
-        if self._bands not in (1, head.get("bands")) or not _is_whole(head):
+        if self._bands not in (1, head.get("bands")) or not _is_valid_head(head):
             return {}
         return head
 
     def _read_lines(self) -> None:
-        """Lines that have come since; a torn or damaged one is no line."""
+        """Read new lines of rows.jsonl; skip a truncated or damaged one."""
         try:
             raw = (self._folder / ROWS).read_bytes()
         except OSError:
@@ -227,7 +228,7 @@ class KeptSamples:
         self._read_bytes = end
 
     def _array(self, board: str) -> NDArray[Any] | None:
-        """A board's records, mapped; None where the file is not what the head says."""
+        """Return a board's records, memory-mapped; None if the file does not fit samples.json."""
         if board not in self._arrays:
             try:
                 found = np.load(self._folder / f"{board}.npy", mmap_mode="r", allow_pickle=False)
@@ -239,7 +240,7 @@ class KeptSamples:
         return self._arrays[board]
 
     def _type(self, board: str) -> np.dtype[Any]:
-        """One row of a board."""
+        """Return the structured type of one board's record of a row."""
         columns, rx = self._plan.columns, len(self._builders["samples"].boards[board].aperture.antennas.rx_m)
         parts: list[Any] = []
         for name, frequencies in self._head["frequencies_hz"].items():
@@ -248,7 +249,7 @@ class KeptSamples:
         return np.dtype([*parts, ("valid", "?", (columns,))])
 
     def _record(self, board: str, row: int) -> tuple[NDArray[Any], dict[str, Any]]:
-        """A row of the images as it is written, and its other figures."""
+        """Return the record of a row, and its quality figures for rows.jsonl."""
         out, forward = np.zeros((), self._type(board)), slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
             out[name], out[f"{name}_direct"], out["valid"] = builder.boards[board].reduced(row)
@@ -260,6 +261,7 @@ class KeptSamples:
         return out, {**figures, "stages": [[name, *spread] for name, spread in figures["stages"].items()]}
 
     def _put(self, board: str, row: int, record: Any, figures: dict[str, Any]) -> None:
+        """Add a record to the images and its figures to the quality; the inverse of `_record`."""
         forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
             builder.boards[board].put(row, ReducedRow(record[name], record[f"{name}_direct"], record["valid"]))
@@ -268,11 +270,11 @@ class KeptSamples:
         self._quality.boards[board].put(row, {**figures, **values}, np.array(record["echo"][:, forward]))
 
     def _open(self) -> int | None:
-        """The file of lines, locked; begun anew where those on disk are others. None: another program writes."""
+        """Open and lock rows.jsonl; start new files if those on disk do not fit. None if another program locked it."""
         self._folder.mkdir(exist_ok=True)
         if self._scan is not None:
             for name in (HEAD, ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
-                inside(self._scan.path, f"{FOLDER}/{name}", FOLDER)  # a link would have another file written over
+                inside(self._scan.path, f"{FOLDER}/{name}", FOLDER)  # a link could overwrite another file
         rows = os.open(self._folder / ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
         weakref.finalize(self, os.close, rows)
         try:
@@ -281,14 +283,14 @@ class KeptSamples:
             self._keep = False
             return None
         if not self._head or any(self._array(board) is None for board in self._quality.boards):
-            self._begin(rows)
+            self._create(rows)
         self._read_lines()
-        os.truncate(rows, self._read_bytes)  # a line that a kill has cut
+        os.truncate(rows, self._read_bytes)  # drop a line that was cut by a kill
         self._rows = rows
         return rows
 
-    def _begin(self, rows: int) -> None:
-        """The head, and empty files for all rows."""
+    def _create(self, rows: int) -> None:
+        """Create samples.json and empty records for all rows."""
         (self._folder / HEAD).unlink(missing_ok=True)
         os.truncate(rows, 0)
         self._lines, self._read_bytes, self._arrays = {}, 0, {}
@@ -303,7 +305,7 @@ class KeptSamples:
             "made_with": self._made,
         }
         for board in self._quality.boards:
-            (self._folder / f"{board}.npy").unlink(missing_ok=True)  # who has it mapped keeps it
+            (self._folder / f"{board}.npy").unlink(missing_ok=True)  # programs that have it mapped keep it
             np.lib.format.open_memmap(self._folder / f"{board}.npy", "w+", self._type(board), (self._plan.rows,))
         part = self._folder / f"{HEAD}.part"
         part.write_text(json.dumps(self._head, indent=1) + "\n", encoding="utf-8")
@@ -314,8 +316,8 @@ def _digest(record: Any) -> str:
     return f"{crc32(record.tobytes()):08x}"
 
 
-def _is_whole(head: Mapping[str, Any]) -> bool:
-    """Whether samples.json holds what is read from it: two finite numbers of the gate, and lists of frequencies."""
+def _is_valid_head(head: Mapping[str, Any]) -> bool:
+    """True if samples.json has a gate of two finite numbers, and lists of frequencies."""
     gate, frequencies = head.get("gate_m"), head.get("frequencies_hz")
     if not (isinstance(gate, list) and isinstance(frequencies, dict) and "samples" in frequencies):
         return False
@@ -329,9 +331,10 @@ def _is_finite(value: object) -> bool:
 
 
 def _is_row(line: Mapping[str, Any]) -> bool:
-    """Whether a line of rows.jsonl is of a row and its boards."""
+    """True if a line of rows.jsonl has a row number and the entries of its boards."""
     boards = line.get("boards")
-    told = isinstance(boards, dict) and all(
-        isinstance(b, dict) and {"crc32", "raw", "figures"} <= b.keys() for b in boards.values()
+    return (
+        isinstance(line.get("row"), int)
+        and isinstance(boards, dict)
+        and all(isinstance(b, dict) and {"crc32", "raw", "figures"} <= b.keys() for b in boards.values())
     )
-    return told and isinstance(line.get("row"), int)

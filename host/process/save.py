@@ -1,4 +1,4 @@
-"""What a processed scan leaves behind: image.npz, quality.json, materials.json, labels.json, report.html, figures/."""
+"""Write the products of a scan: image.npz, quality.json, materials.json, labels.json, report.html, figures/."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from polysight.host.materials import (
     Classifier,
     MaterialsResult,
     TruthPlate,
+    expected_pixel_accuracy,
     labels_of,
     pack_labels,
     pack_patches,
@@ -40,24 +41,23 @@ from polysight.host.store import Scan, versions
 from polysight.host.verdict import NoResult, Verdict, verdict_of
 from polysight.shared.config import Instrument
 from polysight.shared.geometry import incidence_deg
-from polysight.shared.raster import RasterPlan
 from polysight.shared.tables import to_builtins
 
-if TYPE_CHECKING:  # it draws, and is loaded where something is written: matplotlib takes a second
+if TYPE_CHECKING:  # imported where it is used: matplotlib takes a second to load
     from polysight.host.report import ReportContext
 
-Tell = Callable[[str], None]
-"""Called with what is done next, in a word or two."""
+Progress = Callable[[str], None]
+"""Progress callback: gets the name of the next step."""
 NOT_ON_HARDWARE = "Nothing of this instrument has run on hardware yet."
 
 
-def untold(_: str) -> None:
-    """Tell nobody."""
+def no_progress(_: str) -> None:
+    """Ignore progress."""
 
 
 @dataclass(frozen=True)
 class Products:
-    """Where the products are, and what they say in short."""
+    """Folder of the products, their summary lines and the verdict."""
 
     folder: Path
     lines: tuple[str, ...]
@@ -65,11 +65,11 @@ class Products:
 
     @property
     def exit_status(self) -> int:
-        """0; without a result that of `NoResult`."""
+        """Exit status of the command: 0, or that of `NoResult` if the verdict allows no result."""
         return 0 if self.verdict.usable else NoResult.exit_status
 
     def summary(self) -> str:
-        """Text for the terminal."""
+        """Return the text for the terminal."""
         return "".join(
             f"{line}\n"
             for line in (*self.lines, f"report:   {self.folder / 'report.html'}", f"products: {self.folder}/")
@@ -78,22 +78,22 @@ class Products:
 
 @dataclass(frozen=True)
 class Findings:
-    """What is saved of a processed scan.
+    """Results of processing a scan.
 
     Attributes
     ----------
     images
         Both channels, valid where they were analysed.
     found
-        Patches, and what they are; nothing is said of them without a result.
+        Patches and their materials; without names and permittivities if the verdict is "no result".
     verdict
-        How far all of it may be trusted.
+        How far the results can be trusted.
     plane
-        Where the plates lie.
+        Plane of the plates.
     classifier
-        What named them, if anything did.
+        The classifier that named the patches; None without naming.
     plates
-        The truth, where known.
+        True plates, if known.
     """
 
     images: ChannelImages
@@ -107,9 +107,9 @@ class Findings:
 def save_images(
     out: Path, scan: Scan, rig: Instrument, images: ChannelImages, quality: Quality, backlash: bool = True
 ) -> None:
-    """image.npz before any metal reference is known (p is h / v in arbitrary units), scan.json, quality.json.
+    """Write image.npz without metal reference (p is h / v in arbitrary units), scan.json and quality.json.
 
-    `rig` is the one the images were made with; without `backlash` quality.json says nothing of it yet.
+    `rig` is the rig that the images were formed with; `backlash=False` leaves the backlash out of quality.json.
     """
     p = ratio(images.h, images.v)
     write_image(out / IMAGE, images.h, images.v, p, images.x_m, images.y_m, images.valid)
@@ -118,16 +118,16 @@ def save_images(
 
 
 def quality_content(quality: Quality, backlash: bool = True) -> dict[str, Any]:
-    """Content of quality.json of images in which no material was looked for."""
+    """Return the content of quality.json for images without materials."""
     return quality.to_dict(backlash, verdict=verdict_of(recording_verdict(quality)).to_dict())
 
 
 def save_materials(
     out: Path, scan: Scan, rig: Instrument, findings: Findings, unnamed: str, quality: Quality
 ) -> Products:
-    """The metal-referenced image.npz, quality.json, materials.json, patches, labels, figures and report.
+    """Write all products: metal-referenced image.npz, quality.json, materials.json, patches, labels, figures, report.
 
-    `unnamed` says why nothing was named; empty where it was.
+    `unnamed` is the reason why nothing was named; "" if patches were named.
     """
     from polysight.host.report import write_report
 
@@ -142,17 +142,17 @@ def save_materials(
     write_atomically(out / PATCHES, pack_patches(found, images.x_m, images.y_m, scan.simulated))
     content = materials_content(scan, findings, unnamed)
     write_json(out / MATERIALS, content)
-    write_report(out, _report_context(scan, rig, findings, numbers, (content["library"], unnamed)))
+    write_report(out, _report_context(scan, rig, findings, numbers, content["library"], unnamed))
     lines = (
         *findings.verdict.lines(3),
-        *_lines(scan, found, content["segments"]),
+        *_result_lines(scan, found, content["segments"]),
         *coverage_lines(numbers["coverage"]),
     )
     return Products(out, (*lines, unnamed) if unnamed else lines, findings.verdict)
 
 
 def coverage_lines(coverage: dict[str, Any]) -> tuple[str, ...]:
-    """For the terminal: what was recorded of the plan, and what is wrong with the manifest."""
+    """Return lines for the terminal: the recorded share of the plan, and faults of the manifest."""
     from polysight.host.report import manifest_sentence, recorded_sentence
 
     damaged = manifest_sentence(coverage)
@@ -160,7 +160,7 @@ def coverage_lines(coverage: dict[str, Any]) -> tuple[str, ...]:
 
 
 def materials_content(scan: Scan, findings: Findings, unnamed: str = "") -> dict[str, Any]:
-    """Content of materials.json; `unnamed` says why there is no classifier."""
+    """Return the content of materials.json; `unnamed` is the reason why there is no classifier."""
     from polysight.host.report import classifier_sentence
 
     found, classifier = findings.found, findings.classifier
@@ -178,11 +178,11 @@ def materials_content(scan: Scan, findings: Findings, unnamed: str = "") -> dict
 
 
 def _report_context(
-    scan: Scan, rig: Instrument, findings: Findings, quality: dict[str, Any], naming: tuple[str, str]
+    scan: Scan, rig: Instrument, findings: Findings, quality: dict[str, Any], named_by: str, unnamed: str
 ) -> ReportContext:
     from polysight.host.report import context_of, manifest_sentence
 
-    images, (named_by, unnamed) = findings.images, naming
+    images = findings.images
     context = context_of(
         findings.found,
         images.x_m,
@@ -201,12 +201,7 @@ def _report_context(
         },
         notes=[note for note in (manifest_sentence(quality["coverage"]), NOT_ON_HARDWARE, unnamed) if note],
     )
-    return _with_scan(context, scan.plan, rig, images)
-
-
-def _with_scan(ctx: ReportContext, plan: RasterPlan, rig: Instrument, images: ChannelImages) -> ReportContext:
-    """A report's context with what it says of the scan itself: where its positions were, gains, the whole rig file."""
-    return replace(ctx, plan=plan, rx_gains=rx_gains(images), rig_file=tomli_w.dumps(to_builtins(rig)))
+    return replace(context, plan=scan.plan, rx_gains=rx_gains(images), rig_file=tomli_w.dumps(to_builtins(rig)))
 
 
 def _config_summary(rig: Instrument) -> dict[str, Any]:
@@ -224,16 +219,19 @@ def _config_summary(rig: Instrument) -> dict[str, Any]:
     }
 
 
-def _lines(scan: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
+def _result_lines(scan: Scan, found: MaterialsResult, rows: list[dict[str, Any]]) -> tuple[str, ...]:
+    """Return lines for the terminal: number of patches, metal reference, and names compared with the truth."""
     head = f"{'simulated ' if scan.simulated else ''}scan {scan.scan_id}: {len(rows)} patches; metal {found.metal.how}"
     known = [r for r in rows if r["truth"] is not None and r["name"] is not None and not r["metal_reference"]]
     if not known:
         return (head,)
-    strange = [r for r in known if r["name"] == UNKNOWN and not r["truth"]["in_library"]]  # neither right nor wrong
-    known = [r for r in known if r not in strange]
+    foreign = [r for r in known if r["name"] == UNKNOWN and not r["truth"]["in_library"]]  # neither right nor wrong
+    known = [r for r in known if r not in foreign]
     right = sum(r["name"] == r["truth"]["name"] for r in known)
-    accuracy = pixel_accuracy(found)
+    accuracy, expected = pixel_accuracy(found), expected_pixel_accuracy(found)
     share = "" if accuracy is None else f", {100 * accuracy:.1f} % of their pixels"
-    aside = f"{len(strange)} not in the library, and called unknown" if strange else ""
+    if share and expected is not None:
+        share += f" (their own confidence expects {100 * expected:.1f} %)"
+    aside = f"{len(foreign)} not in the library, and called unknown" if foreign else ""
     named = f"{right} of {len(known)} plates named right{share}" if known else ""
     return head, "; ".join(part for part in (named, aside) if part)

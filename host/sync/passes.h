@@ -170,7 +170,7 @@ static void newton(const double *restrict re, const double *restrict im, const d
         memset(s, 0, sizeof *s * 6 * count);
         for (int p = 0; p < parts; p++)
             for (int k = 0; k < count; k++) {
-                Complex turn = cis(-f[k] * t[p]);
+                Complex turn = step ? cis(-f[k] * t[p]) : (Complex){1, 0}; /* f is zero at first */
                 double a = re[p * count + k] * turn.re - im[p * count + k] * turn.im;
                 double b = re[p * count + k] * turn.im + im[p * count + k] * turn.re;
                 r0[k] += a;

@@ -22,6 +22,7 @@ from polysight.host.sync.chain import SyncedRow
 from polysight.host.sync.direct_path import DirectPath, excess_path_m, prepare, reference
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.shared.config import Board, Chirp, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
@@ -97,7 +98,9 @@ def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Boa
     """
     cube = np.concatenate([r[:, np.isfinite(r).all(axis=(0, 2)) & (r != 0).any(axis=(0, 2))] for r in rows], axis=1)
     if cube.shape[1] == 0:
-        raise DataError(f"the cube of board {board.name} holds no data", "it is all zero", "fetch it again")
+        raise DataError(
+            f"the cube of board {board.name} holds no data", "it is all zero", "fetch it again", code=ErrorCode.NO_DATA
+        )
     chirp = rig.chirp
     (a, b), sweep = chirp.linear_samples, chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))

@@ -121,6 +121,8 @@ HALF_OPEN = """
 import socket, subprocess
 from polysight.host.radar.backends import LineServers
 from polysight.shared.errors import DeviceError
+from polysight.shared.error_codes import ErrorCode
+from tests.support.refusals import refused
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 listener = socket.create_server(("127.0.0.1", 5000))
 radars = LineServers({"RH": "127.0.0.1:5000"}, 0.5)

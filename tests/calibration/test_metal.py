@@ -1,62 +1,214 @@
-"""The metal reference as a file: what it says of a scanned plate is what processing with that scan would use."""
+"""The metal reference: a scanned plate gives the gains of every pixel and sub-band, and applies to one rig only."""
 
-import json
+import shutil
 
+import msgspec
 import numpy as np
 import pytest
 
-from polysight.host.calibration.active import load_calibration
+from polysight.host.calibration.active import checked_calibration, load_calibration
+from polysight.host.calibration.files import write_calibration, write_metal
 from polysight.host.cli.main import main
+from polysight.host.imaging import ImagedWith
 from polysight.host.jobs.calibrate import load_reference
+from polysight.host.materials import MetalChoice
 from polysight.host.pipeline import Pipeline
-from polysight.host.process.request import Options
-from polysight.host.store.scan_folder import ScanFolder
+from polysight.host.process import Options
+from polysight.host.store import ScanFolder
+from polysight.shared.error_codes import ErrorCode
+from tests.support.calibration import SOURCES, filter_file, metal_reference
+from tests.support.refusals import refused
 
-TABLES = {
-    "grid": {"columns": 14, "rows": 10, "step_x_mm": 12.0, "step_y_mm": 12.0},
-    "image": {"columns": 40, "rows": 40, "pixel_mm": 3.0},
+
+def board(name, **more):
+    def change(table):
+        (found,) = (b for b in table["boards"] if b["name"] == name)
+        found.update(more)
+
+    return change
+
+
+def mount(name, first=(), last=()):
+    """Add steps before and after a board's mount."""
+
+    def change(table):
+        (found,) = (b for b in table["boards"] if b["name"] == name)
+        found["mount"] = [*first, *found["mount"], *last]
+
+    return change
+
+
+def antennas(table):
+    table["antennas"]["rx_mm"] = [[x, y, 0.05] for x, y, _ in table["antennas"]["rx_mm"]]
+
+
+def tables(**more):
+    return lambda table: [table[name].update(values) for name, values in more.items()]
+
+
+MATTERS = {
+    "V moved": (mount("RV", last=[{"shift_mm": [0.0, 0.05, 0.0]}]), ["RV"]),
+    "H turned about the line of its antennas": (mount("RH", first=[{"turn_deg": 1.0, "about": "x"}]), ["RH"]),
+    "transmitter moved": (mount("LS", last=[{"shift_mm": [0.0, 0.0, 0.1]}]), ["LS"]),
+    "another transmit antenna": (board("LS", tx_antenna=0), ["LS"]),
+    "antennas": (antennas, ["RV"]),
+    "object plane": (tables(geometry={"object_distance_mm": 499.4}), ["499.40 mm", "499.00"]),
+    "start frequency of the chirp": (tables(chirp={"start_hz": 76.02e9}), [192, 76.2917]),
+    "slope": (tables(chirp={"slope_hz_per_s": 38.8e12}), ["linear samples"]),
+    "linear samples": (tables(chirp={"linear_samples": [0, 180]}), [180]),
+    "window": (tables(image={"apodisation": "none"}), ["none", "kaiser"]),
+    "filters": (tables(chirp={"hpf1_khz": 235.0}), ["RH", "235 and 350 kHz", "175 and 350"]),
+}
+CANCELS = {
+    "raster": tables(grid={"columns": 20, "rows": 10, "step_x_mm": 4.0}),
+    "burst": tables(burst={"pulses": 2}),
+    "leakage and speckle filter": tables(polarimetry={"leakage_h": [0.1, 0.02], "smooth_px": 3.0}),
+    "start frequency of one receiver": board("RV", start_offset_hz=3e5),
+    "stage": tables(stage={"speed_mm_s": 10.0}),
+    "the same mount in other steps": mount("RV", last=[{"turn_deg": a, "about": "y"} for a in (30.0, -30.0)]),
+}
+
+
+@pytest.fixture
+def metal(make_rig, tmp_path):
+    """A metal reference of the rig before it is changed."""
+    return write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "c")
+
+
+@pytest.mark.parametrize(("change", "values"), MATTERS.values(), ids=MATTERS)
+def test_a_metal_reference_of_another_rig_is_refused_with_the_difference(metal, make_rig, change, values):
+    with refused(ErrorCode.MISMATCH, metal, *values):
+        checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True)
+
+
+@pytest.mark.parametrize("change", CANCELS.values(), ids=CANCELS)
+def test_settings_that_cancel_may_change(metal, make_rig, change):
+    assert checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True).metal is not None
+
+
+def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_rig):
+    def rig(corner_khz):
+        file = write_calibration(filter_file(corner_khz), metal.parent)
+        return make_rig(calibration={"metal": str(metal), "hpf": str(file)})
+
+    assert checked_calibration(rig(179.0), True)
+    with refused(ErrorCode.MISMATCH, "RV", 200):
+        checked_calibration(rig(200.0), True)
+
+
+def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
+    before, _, after = metal.read_text().partition("[imaged_with]")
+    assert after
+    metal.write_text(before)
+    with refused(ErrorCode.KEY_MISSING, metal):
+        checked_calibration(make_rig(calibration={"metal": str(metal)}), True)
+
+
+SMALL = {
+    "grid": {"columns": 10, "rows": 8, "step_x_mm": 14.0, "step_y_mm": 14.0},
+    "image": {"columns": 24, "rows": 24, "pixel_mm": 4.0},
 }
 PLATE = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [500.0, 400.0], "metal": True}
+BANDS = 2
 
 
-def test_a_scanned_plate_becomes_the_reference_of_every_pixel(tmp_path, make_rig, scan_of, capsys):
-    folder = scan_of(tmp_path / "plate", make_rig(**TABLES), plates=[PLATE])
-    assert main(["calibrate", "metal", str(folder), "--out", str(tmp_path / "c")]) == 0
-    told = capsys.readouterr().out
-    path = next((tmp_path / "c").glob("*.toml"))
-    expected, found = load_reference(folder), load_calibration({"metal": path}).reference()
-    np.testing.assert_array_equal(found.h, expected.h)
-    np.testing.assert_array_equal(found.valid, expected.valid)
-    assert f"{100 * expected.valid.mean():.0f} % of the image" in told
-    assert 'metal = "' in told
+@pytest.fixture(scope="module")
+def plate(make_rig, scan_of, tmp_path_factory):
+    return scan_of(tmp_path_factory.mktemp("metal") / "plate", make_rig(**SMALL), plates=[PLATE])
 
 
-def test_metal_referenced_to_metal_is_one_in_every_pixel(tmp_path, make_rig, scan_of, request):
-    """Across a power cycle: other gains, phases and noise."""
-    if not request.config.getoption("--long"):
-        pytest.skip("a whole processing; --long runs it")
-    folder = scan_of(tmp_path / "plate", make_rig(**TABLES), plates=[PLATE])
-    assert main(["calibrate", "metal", str(folder), "--out", str(tmp_path / "c")]) == 0
-    path = next((tmp_path / "c").glob("*.toml"))
-    rig = make_rig(**TABLES, calibration={"metal": str(path)})
-    pipeline = Pipeline(ScanFolder.load(scan_of(tmp_path / "other", rig, plates=[PLATE], seed=9)))
-    for row in pipeline.source.rows():
-        pipeline.add_row(row)
-    pipeline.finish(tmp_path / "products", Options(model="none"))
-    with np.load(tmp_path / "products" / "image.npz") as image:
-        p = image["p"][image["valid"]]
-    assert p.size > 400
-    assert np.median(np.abs(p - 1)) < 0.02
-    quality = json.loads((tmp_path / "products" / "quality.json").read_text())
-    assert quality["calibration"]["metal"]["file"] == str(path)
-    assert quality["metal_reference"]["how"].endswith("of the image")
+def calibrate(plate, out, *options):
+    """Calibrate with a plate; return the calibration file."""
+    assert main(["calibrate", "metal", str(plate), "--out", str(out), *options]) == 0
+    return next(out.glob("*.toml"))
 
 
-def test_a_scan_without_metal_is_refused(tmp_path, make_rig, scan_of, capsys):
+@pytest.fixture(scope="module")
+def whole(plate, tmp_path_factory):
+    """The plate's metal reference without sub-bands."""
+    return calibrate(plate, tmp_path_factory.mktemp("whole"))
+
+
+@pytest.fixture(scope="module")
+def banded(plate, tmp_path_factory):
+    """The plate's metal reference with sub-bands."""
+    return calibrate(plate, tmp_path_factory.mktemp("banded"), "--bands", str(BANDS))
+
+
+@pytest.fixture
+def taken_with(plate, make_rig, set_rig, tmp_path):
+    """`taken_with(metal, change)`: the plate's scan, recorded with a changed rig and this calibration file."""
+
+    def make(metal, change=lambda _table: None):
+        folder = shutil.copytree(plate, tmp_path / f"scan-{len(list(tmp_path.iterdir()))}")
+        inside = shutil.copytree(metal.parent, folder / "calibration") / metal.name  # where a scan keeps its files
+        set_rig(folder, make_rig(change, **SMALL, calibration={"metal": str(inside)}))
+        return ScanFolder.load(folder)
+
+    return make
+
+
+def test_a_scan_without_metal_is_refused(tmp_path, make_rig, scan_of):
     small = {"grid": {"columns": 4, "rows": 3}, "image": {"columns": 20, "rows": 20}}
-    folder = scan_of(
-        tmp_path / "air", make_rig(**small), points=[{"position_mm": [0.0, 0.0], "amplitude": [1e-3, 0.0]}]
-    )
+    point = {"position_mm": [0.0, 0.0], "amplitude": [1e-3, 0.0]}
+    folder = scan_of(tmp_path / "air", make_rig(**small), points=[point])
     assert main(["calibrate", "metal", str(folder), "--out", str(tmp_path / "c")]) == 3
     assert not (tmp_path / "c").exists()
-    assert "metal" in capsys.readouterr().err
+
+
+def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
+    """The rig file is the same, but the active positions are not."""
+    reference, rig = load_reference(plate), make_rig(**SMALL)
+    reference.check_rig(ImagedWith.of(rig, {}))
+    deeper = msgspec.structs.replace(rig.geometry, object_distance_mm=rig.geometry.object_distance_mm + 0.2)
+    with refused(ErrorCode.MISMATCH):
+        reference.check_rig(ImagedWith.of(msgspec.structs.replace(rig, geometry=deeper), {}))
+
+
+def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows(plate, make_rig, scan_of, tmp_path):
+    """V moved between the two scans: the axes are the same, the phases are not."""
+    other = scan_of(tmp_path / "other", make_rig(MATTERS["V moved"][0], **SMALL), plates=[PLATE])
+    out = tmp_path / "out"
+    assert main(["process", str(other), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 3
+    assert not (out / "image.npz").exists()
+
+
+def test_processing_refuses_the_calibration_of_another_rig(whole, taken_with):
+    assert Pipeline(taken_with(whole)).metal_plane(Options()) is not None
+    moved = Pipeline(taken_with(whole, MATTERS["V moved"][0]))
+    with refused(ErrorCode.MISMATCH, "RV"):
+        moved.metal_plane(Options())
+    assert moved.metal_plane(Options(metal_box_mm=(0, 0, 9, 9))) is None  # metal in the scene has the scene's rig
+    assert moved.metal_plane(Options(), in_scene=True) is None
+
+
+def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded, taken_with):
+    found, expected = load_calibration({"metal": banded}).reference(), load_reference(plate, bands=BANDS)
+    assert len(found.bands) == len(expected.bands) == BANDS
+    for read, made in zip((found, *found.bands), (expected, *expected.bands), strict=True):
+        for name in ("h", "v", "valid"):
+            np.testing.assert_array_equal(getattr(read, name), getattr(made, name))
+        assert (read.spread, read.how) == (made.spread, made.how)
+    pipeline = Pipeline(taken_with(banded))
+    assert len(pipeline.metal_plane(Options(bands=BANDS)).bands) == BANDS
+    assert pipeline.metal_plane(Options()) is not None
+    with refused(ErrorCode.MISMATCH, "2 sub-bands, not 3", "--bands 3", "--bands 2"):
+        pipeline.metal_plane(Options(bands=3))
+
+
+def test_missing_sub_bands_are_refused_before_rows_are_read(whole, taken_with, tmp_path):
+    scan = taken_with(whole)
+    assert main(["process", str(scan.path), "--bands", "2", "--out", str(tmp_path / "out"), "--model", "none"]) == 3
+    assert not (tmp_path / "out" / "image.npz").exists()
+
+
+def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded, taken_with):
+    pipeline = Pipeline(taken_with(banded), bands=BANDS)
+    for row in pipeline.source.rows():
+        pipeline.add_row(row)
+    reference = pipeline.metal_plane(Options(bands=BANDS))
+    (found,) = pipeline.find_materials(pipeline.form_images(), MetalChoice(plane=reference)).rows()
+    assert len(found["bands"]) == BANDS
+    for ratio in (found["ratio"], *(band["ratio"] for band in found["bands"])):
+        assert complex(*ratio.values()) == pytest.approx(1.0, abs=0.02)
+    assert pipeline.quality.notes["metal_reference"]["sub_bands"] == BANDS

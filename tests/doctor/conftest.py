@@ -1,10 +1,10 @@
-"""The simulated rig as processes, once for a module; fake Pis for what a real one cannot be."""
+"""The simulated rig as processes, once for a module, and a rig file without a rig."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,7 @@ import tomli_w
 
 from polysight.shared.tables import to_builtins
 from polysight.simulators.loopback import on_free_subnet
-from tests.support.doctor.live_rig import SCENE, LiveRig, answering, impatient_rig
+from tests.support.doctor.live_rig import SCENE, LiveRig, impatient_rig
 from tests.support.processes import LIMIT_S, wait_for
 
 
@@ -40,13 +40,8 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
 
 
 @pytest.fixture
-def lonely(tmp_path: Path) -> LiveRig:
-    """A rig file on a free subnet where nobody answers."""
+def unanswered(tmp_path: Path) -> LiveRig:
+    """A rig file on a free subnet without any device."""
     path = tmp_path / "instrument.toml"
     path.write_text(tomli_w.dumps(to_builtins(on_free_subnet(impatient_rig()))))
     return LiveRig(tmp_path, path)
-
-
-@pytest.fixture
-def fake_pi() -> Callable[..., object]:
-    return answering

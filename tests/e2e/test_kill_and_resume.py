@@ -8,9 +8,18 @@ from __future__ import annotations
 import hashlib
 import resource
 
+import pytest
+
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.messages import RowStarted
+
+
+@pytest.fixture
+def rig(tmp_path, running_rig):
+    """Slow enough to be met in the middle of a row on a busy machine."""
+    with running_rig(tmp_path, time_scale=15.0) as made:
+        yield made
 
 
 def digests(path):

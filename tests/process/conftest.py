@@ -1,4 +1,4 @@
-"""Small simulated scans, made once and shared by the laws that look at them."""
+"""Small simulated scans, shared by the tests of this folder."""
 
 from __future__ import annotations
 
@@ -10,22 +10,20 @@ import pytest
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials import TruthPlate, read_truth
-from polysight.host.pipeline import Pipeline
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.shared.config import Instrument
 from polysight.simulators.scene import Scene, decode_scene, load_scene, simulate
 from tests.support.paths import EXAMPLES
+from tests.support.pipelines import pipeline_of
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
 
 class Imaged:
-    """A simulated scan that went through the host's pipeline up to the images."""
+    """A simulated scan, processed up to its images."""
 
     def __init__(self, folder: Path) -> None:
-        self.pipeline = Pipeline(ScanFolder.load(folder))
-        for row in self.pipeline.source.rows():
-            self.pipeline.add_row(row)
+        self.pipeline = pipeline_of(ScanFolder.load(folder))
         self.images: ChannelImages = self.pipeline.form_images()
         self.rig: Instrument = self.pipeline.source.instrument
         self.plates: tuple[TruthPlate, ...] = read_truth(folder / "truth.json")
@@ -38,10 +36,10 @@ Make = Callable[..., Imaged]
 def imaged(tmp_path_factory: pytest.TempPathFactory) -> Make:
     """`imaged("nine-materials", seed=2, leakage_h=[0, 0])`: the example scene with changed disturbances, imaged.
 
-    Four pulses a position in place of sixteen: the laws are the same, and a scan takes a third of the time.
+    Four pulses per position instead of sixteen: a scan takes a third of the time.
     """
     rig = rig_with(burst={"pulses": 4})
-    fields = tmp_path_factory.mktemp("fields")  # of a scene, whatever its disturbances
+    fields = tmp_path_factory.mktemp("fields")  # shared by scans of a scene with different disturbances
     done: dict[str, Imaged] = {}
 
     def make(name: str, seed: int | None = None, **disturbances: Any) -> Imaged:

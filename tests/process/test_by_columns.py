@@ -1,4 +1,4 @@
-"""A scan taken column by column: sub-bands, and what is said of the rig, have x and y where the images have them."""
+"""A scan recorded column by column: sub-bands and the rig in scan.json have the same axes as the images."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import tomli_w
 
-from polysight.host.pipeline import Pipeline
-from polysight.host.process.request import Options
+from polysight.host.process import Options
 from polysight.host.store.sources.open import open_source
 from polysight.shared.tables import to_builtins
 from tests.support.commands import content, told_by
+from tests.support.pipelines import pipeline_of
 from tests.support.rigs import rig_with
 from tests.support.scenes import COPPER, PET, scene_of
 
@@ -25,11 +25,8 @@ def scan(scan_of, tmp_path_factory):
     return scan_of(tmp_path_factory.mktemp("columns"), scene, RIG, layout="authors", by_columns=True)
 
 
-def test_sub_bands_lie_as_the_whole_band_s_image_does(scan, tmp_path):
-    source = open_source(scan, RIG)
-    pipeline = Pipeline(source, bands=BANDS)
-    for row in source.rows():
-        pipeline.add_row(row)
+def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
+    pipeline = pipeline_of(open_source(scan, RIG), bands=BANDS)
     whole, parts = pipeline.form_images(), pipeline.sub_bands.finish(pipeline.source.mirrored)
     assert whole.h.shape == (IMAGE["rows"], IMAGE["columns"])
     assert len(parts) == BANDS
@@ -40,21 +37,21 @@ def test_sub_bands_lie_as_the_whole_band_s_image_does(scan, tmp_path):
         for name in ("h", "v"):
             a, b = (np.abs(getattr(image, name)[whole.valid & part.valid]) for image in (part, whole))
             assert np.corrcoef(a, b)[0, 1] > 0.8
-    # The rig that is told is the one the images are of: rows along x, as the rig file has them.
+    # scan.json contains the rig of the images: rows along x, as in the rig file.
     pipeline.finish(tmp_path, Options(model="none", metal_box_mm=(-55.0, -5.0, -25.0, 25.0)))
-    assert grid_told(tmp_path) == (COLUMNS, ROWS)
+    assert grid_written(tmp_path) == (COLUMNS, ROWS)
     bands = [s["bands"] for s in content(tmp_path / "materials.json")["segments"]]
     assert bands
     assert all(len(b) == BANDS for b in bands)
 
 
-def test_the_image_command_tells_the_same_rig(scan, tmp_path):
+def test_the_image_command_writes_the_same_rig(scan, tmp_path):
     (tmp_path / "rig.toml").write_bytes(tomli_w.dumps(to_builtins(RIG)).encode())
     told_by("image", scan, "--config", tmp_path / "rig.toml", "--out", tmp_path / "out")
-    assert grid_told(tmp_path / "out") == (COLUMNS, ROWS)
+    assert grid_written(tmp_path / "out") == (COLUMNS, ROWS)
 
 
-def grid_told(out) -> tuple[int, int]:
+def grid_written(out) -> tuple[int, int]:
     rig = content(out / "scan.json")["instrument"]
     assert (rig["image"]["columns"], rig["image"]["rows"]) == (IMAGE["columns"], IMAGE["rows"])
     return rig["grid"]["columns"], rig["grid"]["rows"]

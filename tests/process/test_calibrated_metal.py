@@ -1,4 +1,4 @@
-"""A scan calibrated with metal is divided by it, pixel by pixel, where metal was seen, and nowhere else."""
+"""A scan is divided by its metal calibration pixel by pixel, and masked where the calibration has no metal."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from polysight.host.calibration.files import SourceScan
-from polysight.host.calibration.metal import write_metal
+from polysight.host.calibration.files import SourceScan, write_metal
 from polysight.host.jobs.calibrate import load_reference
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST
@@ -20,7 +19,7 @@ SCENE = scene_of(EVERYWHERE, columns=10, rows=8) | {"image": {"columns": 24, "ro
 
 @pytest.fixture(scope="module")
 def products(scan_of, tmp_path_factory):
-    """Of a metal plate's scan, calibrated with gains that are known in the image's left half; which, and where."""
+    """Products of a scan whose metal calibration has known gains in the left half of the image only."""
     folder = tmp_path_factory.mktemp("metal")
     scan = scan_of(folder / "scan", SCENE)
     seen = load_reference(scan)

@@ -5,11 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from polysight.host.materials import Classifier, Library
-from polysight.host.materials.analyse import KnownScene, MetalChoice
+from polysight.host.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, MetalChoice
 from polysight.host.materials.labels import labels_of, pack_labels, read_labels
-from polysight.host.materials.library import SIMULATED_LIBRARY
-from polysight.host.process.request import Options
+from polysight.host.process import Options
 
 
 @pytest.fixture
@@ -27,7 +25,7 @@ def again(scan, path, plates=()):
     return scan.pipeline.find_materials(scan.images, MetalChoice(label=metal), known, classifier), names
 
 
-def test_labels_of_products_given_back_find_the_same_materials(imaged, found, tmp_path):
+def test_labels_of_products_give_the_same_materials_again(imaged, found, tmp_path):
     scan = imaged("nine-materials")
     (tmp_path / "labels.json").write_bytes(pack_labels(labels_of(found)))
     boxes = read_labels(tmp_path / "labels.json")
@@ -39,8 +37,8 @@ def test_labels_of_products_given_back_find_the_same_materials(imaged, found, tm
         assert p.patch.label == second.metal.label or p.verdict.name == p.truth.name
 
 
-def test_a_box_is_only_what_was_drawn(imaged, tmp_path):
-    """Two boxes, neither more nor less; the one named copper is the reference, with its pixels' ratio of 1."""
+def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(imaged, tmp_path):
+    """Two boxes give two patches; the one named copper is the metal reference, with a ratio of 1."""
     scan = imaged("nine-materials")
     copper = next(p for p in scan.plates if p.metal)
     other = next(p for p in scan.plates if not p.metal)

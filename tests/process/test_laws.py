@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials import Classifier, Library, pixel_accuracy
-from polysight.host.materials.analyse import KnownScene
-from polysight.host.materials.library import SIMULATED_LIBRARY
+from polysight.host.materials import SIMULATED_LIBRARY, Classifier, KnownScene, Library, pixel_accuracy
 from polysight.host.materials.segment import axis_mm, box_mask
 from polysight.host.polarimetry import axial_ratio_from_known, calibrate, correct_leakage, ratio_from_permittivity
 
@@ -15,6 +13,12 @@ def inside(scan, name, rim_mm=11.0):
     x0, y0, x1, y1 = next(p.box_mm for p in scan.plates if p.name == name)
     box = (x0 + rim_mm, y0 + rim_mm, x1 - rim_mm, y1 - rim_mm)
     return box_mask(box, scan.images.x_m, scan.images.y_m) & scan.images.valid
+
+
+def named_materials(scan):
+    return scan.pipeline.find_materials(
+        scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
+    )
 
 
 def correlation(a, b):
@@ -44,7 +48,7 @@ def test_synchronisation_undoes_every_disturbance(imaged):
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_each_stage_of_synchronisation_shrinks_the_offsets(imaged, board):
-    """From chirps as they came to the object referenced to the direct path, all of them measured."""
+    """From received chirps to the averaged burst; residuals are measured in each stage."""
     stages = imaged("nine-materials").pipeline.quality.to_dict()["boards"][board]["synchronisation"]
     assert stages["received"]["frequency_std_hz"] > 10e3
     assert stages["received"]["phase_std_rad"] > 1.0
@@ -100,9 +104,7 @@ def test_the_set_leakage_is_recovered_from_a_known_material(imaged, disturbances
 
 def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
     scan = imaged("nine-materials")
-    found = scan.pipeline.find_materials(
-        scan.images, known=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
-    )
+    found = named_materials(scan)
     assert len(found.patches) == 9
     named = [p for p in found.patches if p.verdict is not None]
     assert [p.truth.name for p in found.patches if p.verdict is None] == ["copper"]  # the reference
@@ -116,7 +118,21 @@ def test_the_demo_scene_is_named_right_and_its_permittivities_found(imaged):
             assert p.permittivity.value.real == pytest.approx(p.truth.permittivity.real, rel=0.1), p.truth.name
 
 
-def test_the_library_never_saw_the_demo_scene():
+def test_a_scan_of_an_ideal_rig_is_not_corrected_and_all_plates_are_named_right(imaged):
+    """The scene switches filters and leakage off; the recorded rig contains that, so neither is corrected."""
+    scan = imaged("nine-materials", ideal=True)
+    rig = scan.rig
+    assert (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz) == (0.0, 0.0)
+    assert rig.polarimetry.leakage_h == rig.polarimetry.leakage_v == (0.0, 0.0)
+    assert all(setup.equaliser is None for setup in scan.pipeline.synchroniser.setups.values())
+    found = named_materials(scan)
+    named = [p for p in found.patches if p.verdict is not None]
+    assert [p.verdict.name for p in named] == [p.truth.name for p in named]
+    assert len(named) == 8
+    assert found.metal.certain
+
+
+def test_the_library_was_not_trained_on_the_demo_scene():
     library = Library.load(SIMULATED_LIBRARY)
     assert library.simulated
     assert "nine-materials" not in library.scans

@@ -1,11 +1,12 @@
-"""`polysight sync-report`: of a scan of known disturbances it tells these, and what processing tells."""
+"""`polysight sync-report` recovers known disturbances, and agrees with the residuals in quality.json."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, head, write
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header, write_calibration
+from polysight.host.store import manifest
 from polysight.shared.geometry import rx_positions_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 from tests.support.commands import content, told_by
@@ -13,8 +14,8 @@ from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import EVERYWHERE, scene_of
 
 COLUMNS, ROWS, PULSES = 10, 3, 8
-SYNC_NS = 5.0  # each board samples SYNC_IN so late at most, evenly drawn
-TRUE_KHZ = [350.0, 1400.0]  # the receivers' filters, which the chirp profile does not know
+SYNC_NS = 5.0  # each board samples SYNC_IN up to this much late, uniformly distributed
+TRUE_KHZ = [350.0, 1400.0]  # the receivers' filters; the chirp profile has others
 NAMES = {"frequency_hz_std": "frequency_std_hz", "phase_rad_std": "phase_std_rad", "amplitude_std": "amplitude_std"}
 
 
@@ -23,8 +24,8 @@ def scan(scan_of, tmp_path_factory):
     """A scan whose filters were measured before it."""
     folder = tmp_path_factory.mktemp("sync")
     found = BoardFilter(TRUE_KHZ, [1.0, 1.0], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
-    made = head("hpf", [SourceScan("sweep", "sweep", True, 3)])
-    path = write(FilterFile(**made, boards={"RH": found, "RV": found}), folder / "calibration")
+    made = header("hpf", [SourceScan("sweep", "sweep", True, 3)])
+    path = write_calibration(FilterFile(**made, boards={"RH": found, "RV": found}), folder / "calibration")
     true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     more = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
     scan = scan_of(folder / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **more), true)
@@ -33,16 +34,14 @@ def scan(scan_of, tmp_path_factory):
 
 
 def _believe_programmed(scan):
-    """The scan's rig file says what the published one does of the filters."""
-    from polysight.host.store import manifest
-
+    """Set the filters in the scan's manifest to those of the published rig."""
     facts = manifest.read(scan / "manifest.jsonl").facts
     facts[0]["instrument"]["chirp"] |= {"hpf1_khz": 175.0, "hpf2_khz": 350.0}
     (scan / "manifest.jsonl").write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
 
 
-def test_residuals_are_the_known_ones_and_those_of_processing(scan, tmp_path):
-    told = told_by("sync-report", scan, "--out", tmp_path / "report")
+def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path):
+    shown = told_by("sync-report", scan, "--out", tmp_path / "report")
     told_by("image", scan, "--out", tmp_path / "image")
     report, quality = content(tmp_path / "report" / "sync.json"), content(tmp_path / "image" / "quality.json")
     assert report["simulated"] is True
@@ -50,7 +49,7 @@ def test_residuals_are_the_known_ones_and_those_of_processing(scan, tmp_path):
     for name in ("RH", "RV"):
         found, stages = report["boards"][name], report["boards"][name]["stages"]
         assert (found["positions"], found["chirps"]) == (COLUMNS * ROWS, COLUMNS * ROWS * PULSES)
-        assert f"{name}: {found['chirps']} chirps at {found['positions']} positions" in told
+        assert str(found["chirps"]) in shown
         # Two boards sample the trigger, each evenly within SYNC_NS; the direct path's phase then is any.
         two_boards_hz = slope * SYNC_NS * 1e-9 * np.sqrt(2 / 12)
         assert stages["received"]["frequency_hz_std"] == pytest.approx(two_boards_hz, rel=0.15)
@@ -64,7 +63,7 @@ def test_residuals_are_the_known_ones_and_those_of_processing(scan, tmp_path):
             assert values == pytest.approx(expected, rel=1e-9)
 
 
-def test_the_direct_path_is_where_its_length_and_the_start_frequencies_put_it(scan_of, tmp_path):
+def test_the_if_of_the_direct_path_follows_from_its_length_and_the_start_frequencies(scan_of, tmp_path):
     """In quality.json: smallest, median and largest IF over the positions."""
     offset_hz, rig = 500e3, published_rig()
     disturbances = {"ideal": True, "if_offset_hz": offset_hz, "sync_uncertainty_ns": SYNC_NS}

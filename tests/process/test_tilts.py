@@ -1,4 +1,4 @@
-"""Tilted plates: their images tell the tilt, and show what level plates show. Scenes from the independent simulator."""
+"""Tilted plates: the tilt is estimated from the phase, and corrected images agree with those of level plates."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import pytest
 from benchmarks.coverage import Cubes
 from polysight.host.imaging import Illumination, levelled
 from polysight.host.materials.segment import box_mask
-from polysight.host.pipeline import Pipeline
 from polysight.simulators.scene import decode_scene
+from tests.support.pipelines import pipeline_of
 
 PLACES = [(-60.0, 40.0), (0.0, 40.0), (60.0, 40.0), (-60.0, -40.0), (0.0, -40.0), (60.0, -40.0)]
 TILTS_DEG = [(0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-0.7, 0.7), (0.5, -1.0)]
@@ -26,10 +26,7 @@ def _images(rig, tilts):
     ]
     grid = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
     scene = {"name": "tilts", "object_distance_mm": 499.0, "grid": grid, "plates": plates}
-    pipeline = Pipeline(Cubes(rig, decode_scene(scene, "tilts")))
-    for row in pipeline.source.rows():
-        pipeline.add_row(row)
-    return pipeline.form_images()
+    return pipeline_of(Cubes(rig, decode_scene(scene, "tilts"))).form_images()
 
 
 def _insides(images):
@@ -40,13 +37,13 @@ def _ratios(h, v, masks):
     return np.array([np.median((v[m] / h[m]).real) + 1j * np.median((v[m] / h[m]).imag) for m in masks])
 
 
-def test_the_phase_of_a_patch_tells_its_tilt(tilted):
+def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted):
     images = tilted[0]
     found = [images.lit.rise(images.h, images.v, mask) for mask in _insides(images)]
     assert np.degrees(found) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
 
 
-def test_a_tilted_plate_shows_the_ratio_and_brightness_of_a_level_one(tilted):
+def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted):
     images, level = tilted
     masks = _insides(images)
     rises = [images.lit.rise(images.h, images.v, mask) for mask in masks]
@@ -60,7 +57,7 @@ def test_a_tilted_plate_shows_the_ratio_and_brightness_of_a_level_one(tilted):
     assert np.array(brightness)[across] == pytest.approx(1, abs=0.015)
 
 
-def test_tilts_turn_with_the_image(tilted):
+def test_tilts_follow_a_transposed_image(tilted):
     images = tilted[0]
     turned = images.transposed()
     assert (images.lit.across, turned.lit.across) == (1, 0)
@@ -71,20 +68,20 @@ def test_tilts_turn_with_the_image(tilted):
         assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
 
 
-def test_noise_and_phases_too_steep_for_a_plate_tell_no_tilt():
+def test_noise_and_too_steep_phases_give_no_tilt():
     rng = np.random.default_rng(1)
     flat = np.ones((2, 40, 40), np.complex64)
     lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
     mask = np.ones((40, 40), bool)
     noise = rng.standard_normal((40, 80)).view(np.complex128)
     assert lit.rise(noise, noise, mask) == (0.0, 0.0)
-    for slope, told in ((0.02, 0.02), (0.08, 0.0)):
+    for slope, expected in ((0.02, 0.02), (0.08, 0.0)):
         along = np.exp(-1j * slope * 1900 * 2e-3 * np.arange(40))
         image = np.tile(along, (40, 1)).astype(np.complex128)
-        assert lit.rise(image, image, mask) == pytest.approx((told, 0.0))
+        assert lit.rise(image, image, mask) == pytest.approx((expected, 0.0))
 
 
-def test_factors_stay_finite_at_the_edge_of_the_light():
+def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
     footprints = np.ones((2, 20, 20), np.complex64)
     footprints[:, :, 10:] = 0
     lit = Illumination(footprints, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))

@@ -1,4 +1,4 @@
-"""`polysight train`: scans with known plates, simulated here or by the command itself, become the same library."""
+"""`polysight train`: scans with known plates, and scenes that the command simulates, give the same library."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = ("PET", "copper", "rubber")
 
 
 def scene(name: str):
-    """The same power cycle under any name."""
+    """A scene with the same power cycle under another name."""
     return scene_of(COPPER, PET, MORE, columns=15, rows=21, pulses=1, seed=7) | {"name": name}
 
 
@@ -29,30 +29,29 @@ def rig_file(tmp_path):
     return path
 
 
-def test_scans_and_their_scenes_teach_the_same(scan_of, rig_file, tmp_path):
+def test_scans_and_their_scenes_give_the_same_library(scan_of, rig_file, tmp_path):
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "second.toml").write_bytes(tomli_w.dumps(scene("second")).encode())
     scan, out = scan_of(tmp_path / "first", scene("first")), tmp_path / "library.npz"
-    told = told_by("train", scan, "--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
-    assert "6 patches of 3 materials from 2 scans" in told
+    shown = told_by("train", scan, "--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
+    assert "6 patches of 3 materials from 2 scans" in shown
     library = Library.load(out)
     assert (library.names, library.scans) == (NAMES, ("first", "second"))
     assert library.fit
     first, second = (library.select([name]).entries for name in library.scans)
-    for mine, its in zip(first, second, strict=True):
-        assert mine.simulated
-        assert mine.h.size >= 10
+    for one, other in zip(first, second, strict=True):
+        assert one.simulated
+        assert one.h.size >= 10
         for key in ("h", "v", "p"):
-            np.testing.assert_array_equal(getattr(mine, key), getattr(its, key))
-        assert (mine.name, mine.permittivity) == (its.name, its.permittivity)
-    # Relative to the copper of its own scan: copper is 1, what reflects less is darker.
+            np.testing.assert_array_equal(getattr(one, key), getattr(other, key))
+        assert (one.name, one.permittivity) == (other.name, other.permittivity)
+    # Relative to the copper of the same scan.
     level = {name: np.median([np.median(e.h) for e in library.entries if e.name == name]) for name in NAMES}
     assert level["copper"] == pytest.approx(1.0, abs=0.1)
     assert 0.2 < level["PET"] < level["rubber"] < 0.9
 
 
-def test_a_scan_without_metal_is_no_teacher(scan_of, rig_file, tmp_path, capsys):
+def test_a_scan_without_metal_cannot_be_trained_on(scan_of, rig_file, tmp_path):
     scan = scan_of(tmp_path / "scan", scene_of(PET, columns=6, rows=4))
     assert main(["train", str(scan), "--config", str(rig_file), "--out", str(tmp_path / "l.npz")]) == 3
-    assert "no metal plate" in capsys.readouterr().err
     assert not (tmp_path / "l.npz").exists()

@@ -1,4 +1,4 @@
-"""A rig whose start frequencies are programmed, benches for single checks, and simulated frames of a board at rest."""
+"""A rig with programmed start frequencies, contexts for single checks, and simulated frames of a board at rest."""
 
 import functools
 from pathlib import Path
@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from polysight.host.calibration.direct_signal import find_direct
-from polysight.host.doctor.bench import Bench, System, Wanted
-from polysight.host.doctor.receiver_load import Held
+from polysight.host.doctor.context import CheckContext, DoctorOptions, System
+from polysight.host.doctor.receiver_load import LoadResult
 from polysight.host.sync import BoardSetup
 from polysight.simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import programmed_rig
 
 QUICK = System(
-    write_speed=lambda _folder: 200e6, held=lambda _rig, rates: ([Held(r, r, 9, 0) for r in rates], "any core")
+    write_speed=lambda _folder: 200e6,
+    measure_receivers=lambda _rig, rates: ([LoadResult(r, r, 9, 0) for r in rates], "any core"),
 )
 FRAMES = 32
 
@@ -33,10 +34,7 @@ def frames_of(board, rig=RIG, **disturbances):
     return radar.chirps(board, np.zeros(FRAMES), np.zeros(FRAMES)).reshape(FRAMES, -1, 2, 4)
 
 
-@functools.cache
-def setup_of(board):
-    """The board's setup, which no start frequency changes."""
-    return BoardSetup.of(RIG, RIG.by_name(board))
+setup_of = functools.cache(lambda board: BoardSetup.of(RIG, RIG.by_name(board)))  # no start frequency changes it
 
 
 def signal_of(board, rig=RIG, **disturbances):
@@ -44,5 +42,5 @@ def signal_of(board, rig=RIG, **disturbances):
     return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), setup_of(board))
 
 
-def bench_of(rig=RIG, out=Path(), system=QUICK, **more):
-    return Bench(Wanted(Path("rig.toml"), out), system, given=rig, **more)
+def context_of(rig=RIG, out=Path(), system=QUICK, **more):
+    return CheckContext(DoctorOptions(Path("rig.toml"), out), system, loaded_rig=rig, **more)

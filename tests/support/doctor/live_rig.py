@@ -1,4 +1,4 @@
-"""The simulated rig as processes for the doctor, and a Pi that only answers."""
+"""The simulated rig as processes for the doctor, and a fake Pi that only answers requests."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import tomli_w
 import zmq
 
 from polysight.host.acquisition.pi_client import PiClient
-from polysight.host.doctor.bench import Bench, Finding, System, Wanted
-from polysight.host.doctor.walk import walk
+from polysight.host.doctor.checks import run_checks
+from polysight.host.doctor.context import CheckContext, DoctorOptions, Finding, System
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument, load_instrument
 from polysight.shared.tables import to_builtins
@@ -42,13 +42,13 @@ if_offset_hz = 0.0
 
 
 def impatient_rig() -> Instrument:
-    """A rig with the direct path mid-band, and little patience."""
+    """A rig with the direct path mid-band and short timeouts."""
     return programmed_rig(limits={"command_timeout_s": 6.0, "end_of_record_s": 1.0, "free_disk_bytes": 1 << 20})
 
 
 @dataclass
 class LiveRig:
-    """A simulated rig that runs; `table` is its rig file as plain values."""
+    """A running simulated rig."""
 
     folder: Path
     config: Path
@@ -58,7 +58,7 @@ class LiveRig:
         return load_instrument(self.config)
 
     def variant(self, change: Callable[[dict], None]) -> Path:
-        """Another rig file for the same rig."""
+        """Write a changed rig file for the same rig."""
         table = to_builtins(self.instrument)
         change(table)
         path = self.folder / "variant.toml"
@@ -72,13 +72,13 @@ class LiveRig:
         move: bool = False,
         pulse: bool = False,
     ) -> dict[str, Finding]:
-        """Every finding by its check's name, in order."""
-        with Bench(Wanted(config or self.config, self.folder, move, pulse), system) as bench:
-            return {f.check: f for f in walk(bench)}
+        """Run the checks; return the findings by name, in order."""
+        with CheckContext(DoctorOptions(config or self.config, self.folder, move, pulse), system) as context:
+            return {f.check: f for f in run_checks(context)}
 
     @contextmanager
     def pi(self) -> Iterator[PiClient]:
-        """A host's link to the Pi."""
+        """Connect to the Pi."""
         context: zmq.Context = zmq.Context()
         try:
             with PiClient(context, self.instrument) as client:
@@ -88,7 +88,7 @@ class LiveRig:
 
     @contextmanager
     def stopped(self, word: str) -> Iterator[None]:
-        """The rig's process with this word in its command line stands still, as a program that hangs."""
+        """Stop (SIGSTOP) the rig's process with this word in its command line, as if it hung."""
         pid = self._pid(word)
         os.kill(pid, signal.SIGSTOP)
         try:
@@ -98,7 +98,7 @@ class LiveRig:
 
     @contextmanager
     def cut(self, line: int) -> Iterator[None]:
-        """A GPIO wire is cut."""
+        """Cut a GPIO wire."""
         with socket.socket(socket.AF_UNIX) as wires:
             wires.connect(str(self.folder / "rig" / "wires.sock"))
             wires.settimeout(LIMIT_S)
@@ -111,7 +111,7 @@ class LiveRig:
                 assert wires.recv(8) == b"K\n"
 
     def home(self) -> None:
-        """Home the stage, out of whatever fault it is in."""
+        """Home the stage, which clears a fault."""
         with self.pi() as pi:
             pi.home()
             wait_for(lambda: pi.status().state == "homed", "homed")
@@ -130,7 +130,7 @@ class LiveRig:
 
 @contextmanager
 def answering(rig: Instrument, hello: m.HelloReply, version: str = m.WIRE_VERSION) -> Iterator[None]:
-    """A Pi that says `hello` and stands at rest, whatever it is asked."""
+    """Run a fake Pi that answers `hello`, and to every other request that it is at rest."""
     rest = m.StatusReply(
         state=hello.state, homed=True, x_mm=0, y_mm=0, scan_id="", row_index=-1, take=0, points=0, pulses=0,
         last_seq=0, fault=0, reason="",

@@ -1,4 +1,4 @@
-"""Recorded scans, as calibration looks at them: their rows, board by board."""
+"""Read recorded scans for calibration: open a scan, and iterate over the rows of a board."""
 
 from __future__ import annotations
 
@@ -12,36 +12,35 @@ from polysight.host.calibration.files import SourceScan
 from polysight.host.capture import row_words
 from polysight.host.store import RawSource, open_source, raw_source
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 
 def open_raw(folder: Path, rig: Instrument | None = None) -> RawSource:
-    """A recorded scan whose chirps are there. Raises DataError.
-
-    `rig` is for recordings that bring none of their own.
-    """
+    """Open a recorded scan with raw data; `rig` is for recordings without a rig file. Raises DataError."""
     source = raw_source(open_source(folder, rig), folder)
     if next(iter(source.rows()), None) is None:
         raise DataError(
-            f"{folder}: no row is recorded whole",
+            f"{folder}: no complete row",
             "the scan was stopped in its first row, or files are missing",
-            f"`polysight resume {folder}` takes the missing rows",
+            f"`polysight resume {folder}` records the missing rows",
+            code=ErrorCode.NO_DATA,
         )
     return source
 
 
-def facts_of(source: RawSource, folder: Path) -> SourceScan:
-    """Where a calibration comes from."""
+def source_scan(source: RawSource, folder: Path) -> SourceScan:
+    """Return the entry of a scan in the `sources` of a calibration file."""
     return SourceScan(source.scan_id, str(folder), source.simulated, len(list(source.rows())))
 
 
 def board_rows(
-    source: RawSource, board: str, at_most: int | None = None
+    source: RawSource, board: str, limit: int | None = None
 ) -> Iterator[tuple[int, NDArray[np.int16], NDArray[np.bool_]]]:
-    """Index, words int16 [frame, sample, 2, rx] and valid bool [frame] of rows; `at_most` of them, evenly spread."""
+    """Yield index, words int16 [frame, sample, 2, rx] and valid bool [frame] of rows; `limit` evenly spaced rows."""
     rows = list(source.rows())
-    if at_most is not None and len(rows) > at_most:
-        rows = [rows[i] for i in np.linspace(0, len(rows) - 1, at_most).round().astype(int)]
+    if limit is not None and len(rows) > limit:
+        rows = [rows[i] for i in np.linspace(0, len(rows) - 1, limit).round().astype(int)]
     for row in rows:
         recorded = source.read_row(board, row)
         samples, rx = source.instrument.chirp.samples, len(source.instrument.antennas.rx_mm)

@@ -1,0 +1,142 @@
+"""`polysight process` and `image`: images are written first and stay; old products stay until new ones are complete."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.host.jobs.process import all_rows, make_products, publish_images
+from polysight.host.pipeline import Pipeline
+from polysight.host.process import Options
+from polysight.host.products import read_products
+from polysight.host.products.files import FINISHED
+from polysight.host.store import MANIFEST, ScanFolder, manifest
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import DataError
+from tests.support.commands import content, told_by
+from tests.support.pipelines import pipeline_of
+from tests.support.refusals import refused
+
+
+@pytest.fixture(scope="module")
+def scan(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = Path(shutil.copytree(two_plates, tmp_path_factory.mktemp("first") / "scan"))
+    all_rows(ScanFolder.load(folder), folder)
+    return folder
+
+
+def test_the_image_is_written_before_anything_is_derived_from_it(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen: list[bool] = []
+    finish = Pipeline.finish
+
+    def finished(self: Pipeline, *words: object) -> object:
+        seen.append(read_products(tmp_path / "out").valid.any())
+        return finish(self, *words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Pipeline, "finish", finished)
+    assert main(["process", str(scan), "--out", str(tmp_path / "out")]) in (0, 5)
+    assert seen == [True]
+    assert str(tmp_path / "out" / "image.npz") in capsys.readouterr().err
+    assert (tmp_path / "out" / "report.html").exists()
+
+
+def test_images_published_beside_a_scan_are_those_of_all_rows_at_once(scan: Path, tmp_path: Path) -> None:
+    pipeline = pipeline_of(ScanFolder.load(scan), live=True)
+    publish_images(pipeline, tmp_path)
+    first, whole = read_products(tmp_path), pipeline.form_images()
+    assert (first.valid == whole.valid).mean() > 0.999
+    at = first.valid & whole.valid
+    for one, other in ((first.h, whole.h), (first.v, whole.v)):
+        assert np.abs(one - other)[at].max() < 1e-5 * np.abs(other[at]).max()
+
+
+def test_an_earlier_report_stays_until_the_new_one_is_complete(scan: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "report.html").write_text("earlier")
+    publish_images(all_rows(ScanFolder.load(scan), scan), out)
+    assert [p.name for p in out.iterdir()] == ["report.html"]
+
+
+def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise DataError("no metal", code=ErrorCode.NO_DATA)
+
+    pipeline, out = all_rows(ScanFolder.load(scan), scan), tmp_path / "out"
+    publish_images(pipeline, out)
+    monkeypatch.setattr(Pipeline, "examine", fails)
+    with refused(ErrorCode.NO_DATA):
+        make_products(pipeline, out, Options(), ())
+    assert read_products(out).valid.any()
+
+
+def test_progress_is_reported_before_each_step(scan: Path, tmp_path: Path) -> None:
+    steps: list[str] = []
+    all_rows(ScanFolder.load(scan), scan).finish(tmp_path, Options(model="none"), (), steps.append)
+    assert steps == ["point response", "materials", "figures and report"]
+
+
+def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path) -> None:
+    there = tmp_path / "scan"
+    shutil.copytree(scan, there)
+    shutil.rmtree(there / "raw")  # the samples are enough
+    told_by("image", there, "--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
+    products = read_products(tmp_path / "out")
+    assert products.h.shape == (30, 60)
+    np.testing.assert_allclose(np.diff(products.x_m), 2.5e-3)
+    distance = ScanFolder.load(scan).instrument.geometry.object_distance_mm
+    assert products.scan["instrument"]["geometry"]["object_distance_mm"] == distance + 4
+
+
+@pytest.mark.parametrize("grid", ["60", "60x30", "0x30@2", "60x30@0", "60x30@two", "60x30@2@3"])
+def test_an_invalid_grid_is_refused(grid: str) -> None:
+    with pytest.raises(SystemExit):
+        main(["image", "scan", "--out", "out", "--grid", grid])
+
+
+METAL = "-40,10,30,30"  # inside the copper
+
+
+def rename_pet(scan: Path, name: str) -> None:
+    truth = content(scan / "truth.json")
+    truth["plates"][1]["name"] = name
+    (scan / "truth.json").write_text(json.dumps(truth))
+
+
+def add_retakes(scan: Path) -> None:
+    """Add two retakes to the manifest, and mark row 5 as kept though incomplete."""
+    facts = manifest.read(scan / MANIFEST).facts
+    rejected = [{"fact": "row_rejected", "row": row, "take": 1, "reasons": ["test"]} for row in (2, 5)]
+    (kept,) = (f for f in facts if f["fact"] == "row_committed" and f["row"] == 5)
+    kept["kept_incomplete"] = True
+    (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in [facts[0], *rejected, *facts[1:]]))
+
+
+def test_right_names_and_retakes_are_counted_and_the_mark_of_an_earlier_run_is_removed(
+    two_plates: Path, tmp_path: Path
+) -> None:
+    scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
+    rename_pet(scan, "no such material")
+    shown = told_by("process", scan, "--out", out, "--metal", METAL)
+    segments = content(out / "materials.json")["segments"]
+    for value in (f"{len(segments)} patches", "0 of 1 plates", out / "report.html", f"{out}/"):
+        assert str(value) in shown
+    quality = content(out / "quality.json")
+    assert quality["verdict"]["level"] == "care"
+    assert (quality["rows_retaken"], quality["rows_incomplete"]) == (0, [])
+
+    (out / FINISHED).write_text("{}")
+    (pet,) = (s for s in segments if s["truth"] and s["truth"]["name"] == "no such material")
+    rename_pet(scan, pet["name"])
+    add_retakes(scan)
+    assert "1 of 1 plates" in told_by("process", scan, "--out", out, "--metal", METAL)
+    assert not (out / FINISHED).exists()
+    quality = content(out / "quality.json")
+    assert (quality["rows_retaken"], quality["rows_incomplete"]) == (2, [5])

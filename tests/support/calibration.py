@@ -1,0 +1,30 @@
+"""Made-up calibration files: a measured filter, and a metal reference with gains that vary over the plane."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from polysight.host.calibration.files import BoardFilter, FilterFile, SourceScan, header
+from polysight.host.imaging import ImagedWith, image_grid
+from polysight.host.polarimetry import PlaneReference, plane_reference
+from polysight.shared.config import Instrument
+
+SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
+
+
+def filter_file(corner_khz: float = 180.5) -> FilterFile:
+    """Both receivers with the same corners, measured with the published rig's."""
+    board = BoardFilter([corner_khz, 355.25], [1.5, 2.5], [175.0, 350.0], 100.0, 1900.0, 640, 0.05)
+    return FilterFile(**header("hpf", SOURCES), boards={"RH": board, "RV": board})
+
+
+def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
+    """The images of a noisy plate, made with this rig."""
+    rng, grid = np.random.default_rng(seed), image_grid(rig)
+    y, x = np.meshgrid(np.linspace(0, 1, grid.y_m.size), np.linspace(0, 1, grid.x_m.size), indexing="ij")
+    gain = (1 + 0.2 * y) * np.exp(1j * x)
+    noise = 1 + 0.02 * (rng.standard_normal((2, *x.shape)) + 1j * rng.standard_normal((2, *x.shape)))
+    plate = plane_reference(gain * noise[0], 0.7 * noise[1], grid.x_m, grid.y_m, smooth_mm=4.0, name="plate")
+    return replace(plate, made_with=ImagedWith.of(rig, {}))

@@ -259,8 +259,8 @@ class Executor:
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
         spec = burst_of(command)
-        if spec.pulses * spec.period_ns > m.MOST_PULSES_S * 1e9:
-            lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MOST_PULSES_S:g} s"
+        if spec.pulses * spec.period_ns > m.MAX_PULSES_AT_REST_S * 1e9:
+            lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
             raise RefusedError(PiFault.NOT_READY, lasts, "the lines are busy meanwhile", "ask for fewer pulses")
         self._pulsing.append(request)
         self._loop.send(spec)
@@ -349,7 +349,7 @@ class Executor:
         )  # fmt: skip
         self.hello = m.HelloReply(
             pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
-            scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placing,
+            scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placement_settings,
         )  # fmt: skip
 
 

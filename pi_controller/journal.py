@@ -293,7 +293,7 @@ class Journal:
         An event that is not journalled has the number of the last one that is.
         """
         self._pending += issubclass(kind, m.JOURNALLED) and self._file is not None and not self.broken
-        fields = {k: v[: m.MOST_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
+        fields = {k: v[: m.MAX_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
         event = kind(scan_id=self.scan_id, seq=self.last_seq, t_mono_ns=time.monotonic_ns(), **fields)
         self._batch.append((event, m.pack(event)))
 

@@ -14,7 +14,7 @@ from polysight.shared import messages as m
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
 
 
 class RefusedError(PolysightError):
@@ -83,7 +83,7 @@ RULES = (
     Rule("settled", "ending", "ready idle fault", "finish_row"),
 )
 LIMITS_S: dict[State, float] = {
-    "homing": HOMING_LIMIT_S,
+    "homing": HOMING_TIMEOUT_S,
     "stopping": 3.0,  # from STOP to standstill
     "done": 1.0,  # from the stage's `done` to the last burst
 }  # running: set for each row; all others: no limit

@@ -21,7 +21,7 @@ from polysight.shared.config import Stage
 from polysight.shared.errors import ProtocolError
 from polysight.shared.faults import PiFault, StageError, explain
 from polysight.shared.raster import Row
-from polysight.shared.stage_line import HOMING_LIMIT_S, Immediate, Reply
+from polysight.shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
 STATUS_EVENT_S = 0.24
 RESTS = 3  # consecutive statuses at rest after which the reply to the end of a motion counts as lost
@@ -272,7 +272,7 @@ class RowMachine(Machine):
     def _time_out(self) -> None:
         if not self._terminating:
             reasons = {
-                "homing": f"not homed after {HOMING_LIMIT_S} s",
+                "homing": f"not homed after {HOMING_TIMEOUT_S} s",
                 "running": f"the row has not ended after {self.row_limit_s:.0f} s",
                 "stopping": "the stage did not stop",
             }

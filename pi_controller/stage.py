@@ -20,13 +20,13 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ProtocolError
 from polysight.shared.faults import StageError, explain
 from polysight.shared.raster import Row
-from polysight.shared.stage_line import HOMING_LIMIT_S, Immediate, Parameter, Reply
+from polysight.shared.stage_line import HOMING_TIMEOUT_S, Immediate, Parameter, Reply
 
 IDLE_STATUS_S = 1.0
 STOP_LIMIT_S = 3.0  # from STOP to standstill
 CLEAR_RETRY_S = 0.05
 MOST_MM = 1e6  # limit of a position in the messages
-MOTION_LIMIT_S = HOMING_LIMIT_S  # no motion takes longer than homing
+MOTION_LIMIT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
 
 
 class StageDriver:

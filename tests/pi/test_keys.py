@@ -23,7 +23,7 @@ from polysight.shared.config import load_instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.faults import PiFault
-from polysight.shared.sockets import HOST_KEYS, Refusals, requester
+from polysight.shared.sockets import HOST_KEYS, HandshakeMonitor, requester
 from polysight.shared.tables import decode, to_builtins
 from tests.support.paths import REPO, RIG_FILE
 from tests.support.refusals import refused as expect_refused
@@ -80,9 +80,9 @@ def client_of(context):
         socket = context.socket(kind)
         socket.curve_publickey, socket.curve_secretkey = load_certificate(mine)
         socket.curve_serverkey = load_certificate(pis)[0]
-        made.append((Refusals(socket), socket))
+        made.append((HandshakeMonitor(socket), socket))
         socket.connect(address.replace("0.0.0.0", "127.0.0.1"))
-        return socket, made[-1][0].seen
+        return socket, made[-1][0].refused
 
     yield make
     for refusals, socket in made:

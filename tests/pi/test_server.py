@@ -21,7 +21,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     radar = WireClient(hub, listen=instrument.pi.sync_out)
     hello = host.ask(m.Hello())
     assert (hello.backend, hello.firmware, hello.state) == ("wires", "fake", "ready")
-    assert hello.stage == instrument.stage.placing
+    assert hello.stage == instrument.stage.placement_settings
     assert hello.t_unix_ns > 1_600_000_000 * 10**9
     done = host.row(1)
     burst, n = instrument.burst, instrument.grid.columns

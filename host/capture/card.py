@@ -44,7 +44,7 @@ class CardClient:
     Raises
     ------
     DeviceError
-        when the command port is in use or the host address is not this machine's.
+        if the command port is in use or the host address is not this machine's.
     """
 
     def __init__(self, board: Board, timeout_s: float, kernel_root: Path = Path("/")) -> None:
@@ -85,7 +85,7 @@ class CardClient:
         """Send the 18 bytes of command 0x04, once; returns the status bits the card reported meanwhile.
 
         Not sent again when no reply comes: it may be writing. Callers use :func:`program_eeprom`.
-        Raises DeviceError when the card refuses or is silent.
+        Raises DeviceError if the card refuses or is silent.
         """
         self._status = Status(0)
         self._check(self._exchange(Code.CONFIGURE_EEPROM, body, 1), Code.CONFIGURE_EEPROM)
@@ -100,7 +100,7 @@ class CardClient:
         Raises
         ------
         DeviceError
-            when the card refuses or is silent.
+            if the card refuses or is silent.
         """
         for attempt in range(ATTEMPTS):
             self.take_status()
@@ -115,7 +115,7 @@ class CardClient:
         raise self._silent(Code.RECORD_START, ATTEMPTS)
 
     def record_stop(self) -> None:
-        """Stop the record. A card that does not record may refuse; that is no error. Raises DeviceError when silent."""
+        """Stop the record. A card that does not record may refuse; that is no error. Raises DeviceError if silent."""
         self._exchange(Code.RECORD_STOP, b"", ATTEMPTS)
 
     def wait_completed(self, limit_s: float) -> None:
@@ -222,7 +222,7 @@ class EepromSettings:
     Raises
     ------
     ConfigError
-        when a card with these settings could not be reached.
+        if a card with these settings could not be reached.
     """
 
     host_address: str
@@ -303,9 +303,9 @@ def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -
     Raises
     ------
     ConfigError
-        when the confirmation is another; nothing was sent.
+        if the confirmation is another; nothing was sent.
     DeviceError
-        when the card is silent, refuses, or reports an EEPROM failure.
+        if the card is silent, refuses, or reports an EEPROM failure.
     """
     if confirmed != settings.confirmation:
         raise ConfigError(

@@ -98,14 +98,14 @@ class Counters:
 
 
 def encode_request(code: int, data: bytes = b"") -> bytes:
-    """A request as sent to the card. Raises ProtocolError when `data` is longer than the card takes."""
+    """A request as sent to the card. Raises ProtocolError if `data` is longer than the card takes."""
     if len(data) > MAX_REQUEST_DATA:
         raise ProtocolError(f"request data of {len(data)} bytes is longer than {MAX_REQUEST_DATA}")
     return _HEAD.pack(REQUEST_MAGIC, code, len(data)) + data + _FOOTER.pack(FOOTER)
 
 
 def decode_request(raw: bytes) -> tuple[int, bytes]:
-    """(code, data) of a request. Raises ProtocolError when the bytes are not a request."""
+    """(code, data) of a request. Raises ProtocolError if the bytes are not a request."""
     if len(raw) < _HEAD.size + _FOOTER.size:
         raise ProtocolError(f"request of {len(raw)} bytes is shorter than its frame")
     magic, code, size = _HEAD.unpack_from(raw)
@@ -121,7 +121,7 @@ def encode_reply(code: int, status: int) -> bytes:
 
 
 def decode_reply(raw: bytes) -> Reply:
-    """A reply or asynchronous status. Raises ProtocolError when the bytes are not one."""
+    """A reply or asynchronous status. Raises ProtocolError if the bytes are not one."""
     if len(raw) != _REPLY.size:
         raise ProtocolError(f"reply of {len(raw)} bytes, expected {_REPLY.size}: {raw[:16].hex(' ')}")
     magic, code, status, footer = _REPLY.unpack(raw)
@@ -159,7 +159,7 @@ def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
 def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
     """(sequence, byte count); the byte count is the number of payload bytes before this packet.
 
-    Raises ProtocolError when there is no payload.
+    Raises ProtocolError if there is no payload.
     """
     if len(packet) <= PACKET_HEADER_BYTES:
         raise ProtocolError(f"data packet of {len(packet)} bytes holds no payload")

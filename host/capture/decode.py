@@ -69,7 +69,7 @@ def decode_row(
     Raises
     ------
     DataError
-        when the payload is shorter than frames x samples x rx say.
+        if the payload is shorter than frames x samples x rx say.
     """
     words, valid = row_words(payload, mask, frames, samples, rx, swap_iq)
     out = np.empty((rx, frames, samples), dtype=np.complex64)

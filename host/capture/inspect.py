@@ -42,7 +42,7 @@ _UNIFORM = 0.45 * _FULL_SCALE  # standard deviation of values that fill the whol
 
 
 def is_mirrored(power: NDArray[np.float64]) -> bool:
-    """Whether a complex spectrum, float64 [bin], lies at negative frequencies: I and Q are in the other order.
+    """True if a complex spectrum, float64 [bin], lies at negative frequencies: I and Q are in the other order.
 
     Where IF up to 0.9 sample rates is kept (complex 1x) the upper half is no proof; much more power in the last quarter
     than in the first is, because returns come from near. The bins next to zero are left out.
@@ -52,7 +52,7 @@ def is_mirrored(power: NDArray[np.float64]) -> bool:
 
 
 def is_offset_binary(words: NDArray[np.int16]) -> bool:
-    """Whether the values spread far less once their sign bit is turned round."""
+    """True if the values spread far less once their sign bit is turned round."""
     some = words[: 1 << 20]
     return bool(some.size and (some ^ np.int16(-0x8000)).std() < some.std() / 4)
 
@@ -77,7 +77,7 @@ def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
 def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     """Place a record whose length is not known: it reaches from the lowest to the highest byte count.
 
-    Returns its bytes, uint8 [n], and what became of the packets. Raises DataError when they are not of one record.
+    Returns its bytes, uint8 [n], and what became of the packets. Raises DataError if they are not of one record.
     """
     counts = [dca1000.decode_packet_header(p)[1] for p in packets]
     ahead = [dca1000.counter_difference(c, counts[0], dca1000.BYTE_COUNT_BITS) for c in counts]
@@ -165,7 +165,7 @@ class CardReport:
 def inspect_bin(path: Path, known: Known = Known()) -> Report:
     """Inspect a payload file; says so when it does not hold what is known of it.
 
-    Raises DataError when it is absent, or shorter than one chirp.
+    Raises DataError if it is absent, or shorter than one chirp.
     """
     try:
         size = path.stat().st_size
@@ -247,7 +247,7 @@ def _contradiction(values: NDArray[np.uint8], shape: Shape) -> list[str]:
 
 
 def _not_a_capture(payload: NDArray[np.uint8], words: NDArray[np.int16], guesses: list[Guess]) -> str:
-    """Why these bytes were not written by a card; "" when they may have been."""
+    """Why these bytes were not written by a card; "" if they may have been."""
     head = payload[:8].tobytes()
     for magic, kind in MAGIC.items():
         if head.startswith(magic):

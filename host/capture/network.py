@@ -69,7 +69,7 @@ def bind_udp(address: str, port: int, what: str) -> socket.socket:
     Raises
     ------
     DeviceError
-        when the port is taken or the address is not this machine's; `what` says whose socket it is.
+        if the port is taken or the address is not this machine's; `what` says whose socket it is.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
@@ -195,7 +195,7 @@ def usable_packets(buffer_bytes: int) -> int:
 
 
 def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int, rmem_max: Path = _RMEM_MAX) -> str:
-    """A warning when the kernel granted less than was asked for; "" when it did not.
+    """A warning when the kernel granted less than was asked for; "" if it did not.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
     Raises
     ------
     DeviceError
-        when the buffer holds less than two bursts; the remedy is the command that lifts the limit.
+        if the buffer holds less than two bursts; the remedy is the command that lifts the limit.
     """
     enough = max(wanted, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
     remedy = f"`sysctl -w net.core.rmem_max={enough}`, and the same in /etc/sysctl.d/ to keep it"
@@ -264,7 +264,7 @@ def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
 
 
 def route_interface(address: str, root: Path = _ROOT) -> str | None:
-    """The interface whose own subnet holds this address, "" when there is none, None when it cannot be told.
+    """The interface whose own subnet holds this address, "" if there is none, None if it cannot be told.
 
     A route over a gateway is none: a capture card is reached without a router, or not at all.
     """
@@ -286,7 +286,7 @@ def route_interface(address: str, root: Path = _ROOT) -> str | None:
 
 
 def has_link(interface: str, root: Path = _ROOT) -> bool | None:
-    """Whether the interface has a carrier; None when it cannot be told."""
+    """True if the interface has a carrier; None if it cannot be told."""
     folder = root / "sys/class/net" / interface
     try:
         return (folder / "carrier").read_text(encoding="ascii").strip() == "1"
@@ -299,7 +299,7 @@ def has_link(interface: str, root: Path = _ROOT) -> bool | None:
 
 
 def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
-    """Whether a device answered for this address on the local network; None when the kernel does not know."""
+    """True if a device answered for this address on the local network; None if the kernel does not know."""
     try:
         lines = (root / "proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
     except OSError:

@@ -18,6 +18,7 @@ from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed
 from polysight.host.capture.segment import damaged, write_durably
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_bounded
 
@@ -46,7 +47,7 @@ class Evidence(msgspec.Struct, frozen=True):
 def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
     """Write a row's packets durably; returns the file's CRC-32. Without `placed` all of the payload goes in here.
 
-    Raises DeviceError when the disk fails.
+    Raises DeviceError if the disk fails.
     """
     kept = log.kept
     sizes, sequences, counts = log.sizes[:kept], log.sequences[:kept], log.byte_counts[:kept]
@@ -93,7 +94,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
     Raises
     ------
     DataError
-        when the file is absent or damaged, or does not belong to the row.
+        if the file is absent or damaged, or does not belong to the row.
     """
     try:
         line, _, tail = read_bounded(path, PacketLog.most_kept(row.size) + _MOST_RUN_BYTES).partition(b"\n")
@@ -111,7 +112,8 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
             raise ValueError("it does not hold what it says")
         log.malformed = int(head["malformed"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as e:
-        raise DataError(f"{path}: not a readable packet log: {e}", *damaged(path)) from None
+        what = f"{path}: not a readable packet log: {e}"
+        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
     return evidence, log
 
 

@@ -162,7 +162,7 @@ class PacketLog:
 
     @property
     def last_is_short(self) -> bool:
-        """Whether the last packet is smaller than the one before it: a record may have ended."""
+        """True if the last packet is smaller than the one before it: a record may have ended."""
         return self.count > 1 and bool(self._sizes[self.count - 1] < self._sizes[self.count - 2])
 
     @property

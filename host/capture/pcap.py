@@ -36,7 +36,7 @@ class Datagram(NamedTuple):
 
 
 def is_pcap(head: bytes) -> bool:
-    """Whether a file that begins with these four bytes is a pcap or pcapng file, in either byte order."""
+    """True if a file that begins with these four bytes is a pcap or pcapng file, in either byte order."""
     return len(head) >= 4 and any(struct.unpack_from(f"{order}I", head)[0] in (*_MAGIC, _PCAPNG) for order in "<>")
 
 
@@ -46,7 +46,7 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
     Raises
     ------
     DataError
-        when the file is not a classic pcap file of Ethernet packets, or ends within a packet.
+        if the file is not a classic pcap file of Ethernet packets, or ends within a packet.
     """
     try:
         raw = read_bounded(path, _MOST_BYTES)
@@ -110,7 +110,7 @@ def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> 
     Raises
     ------
     DataError
-        when the file is no packet capture, holds nothing from a card, or several cards and none was chosen.
+        if the file is no packet capture, holds nothing from a card, or several cards and none was chosen.
     """
     card, packets = _from_card(path, card_address)
     data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]

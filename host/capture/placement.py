@@ -80,7 +80,7 @@ class Placed:
 
     @property
     def complete(self) -> bool:
-        """Whether every byte is there and nothing more came."""
+        """True if every byte is there and nothing more came."""
         return self.located and not self.missing
 
     def facts(self) -> dict[str, Any]:

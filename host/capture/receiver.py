@@ -161,7 +161,7 @@ class RowCapture(_Words, frozen=True):
 
     @property
     def complete(self) -> bool:
-        """Whether the row is there to the last byte."""
+        """True if the row is there to the last byte."""
         return self.located and not self.missing
 
 
@@ -186,7 +186,7 @@ _answers: Any = msgspec.msgpack.Decoder(Answer)
 
 
 def send(connection: Connection, words: Request | Answer) -> None:
-    """Send one message. Raises DeviceError when the other side is gone."""
+    """Send one message. Raises DeviceError if the other side is gone."""
     try:
         connection.send_bytes(_encoder.encode(words))
     except OSError as e:
@@ -194,12 +194,12 @@ def send(connection: Connection, words: Request | Answer) -> None:
 
 
 def next_request(connection: Connection) -> Request:
-    """The next request. Raises EOFError when the host is gone."""
+    """The next request. Raises EOFError if the host is gone."""
     return _requests.decode(connection.recv_bytes())
 
 
 def next_answer(connection: Connection) -> Answer:
-    """The next answer. Raises EOFError when the receiver is gone."""
+    """The next answer. Raises EOFError if the receiver is gone."""
     return _answers.decode(connection.recv_bytes())
 
 
@@ -226,7 +226,7 @@ class ReceiverProcess:
     Raises
     ------
     DeviceError
-        when the process does not start, or its address and port cannot be bound.
+        if the process does not start, or its address and port cannot be bound.
     """
 
     def __init__(self, board: Board, buffer_bytes: int, core: Core | None = None) -> None:
@@ -265,7 +265,7 @@ class ReceiverProcess:
     def begin_row(self, row: int, take: int, expected_bytes: int, frame_bytes: int, path: Path) -> int:
         """Receive a row into the file at `path` (its index beside it); returns how many stray packets were dropped.
 
-        Raises DeviceError when the file cannot be made.
+        Raises DeviceError if the file cannot be made.
         """
         request = BeginRow(row, take, expected_bytes, frame_bytes, str(path))
         stale = self._ask(request, Began, _ANSWER_LIMIT_S).stale

@@ -47,7 +47,7 @@ class _Row:
         self._preview = Preview(0, request.expected_bytes == 0, ended=False)
 
     def news(self) -> bool:
-        """Whether there is something to tell the host unasked: it may be complete, or its last packet came."""
+        """True if there is something to tell the host unasked: it may be complete, or its last packet came."""
         log = self.log
         if log.payload_bytes < log.expected and not log.last_is_short:
             return False

@@ -157,7 +157,7 @@ def _found(packets: CounterView, live: Flags, expected: int, frame_bytes: int, p
 
 
 def _rival(packets: CounterView, found: Found, rest: Flags, expected: int) -> str:
-    """Why other packets may be the row's record as well as these; "" when they may not.
+    """Why other packets may be the row's record as well as these; "" if they may not.
 
     The host has started one record, so the card's last one is the row's: unless the card began another by itself.
     """
@@ -183,7 +183,7 @@ def later_packets(found: Found, rest: Flags, stop: int, expected: int) -> Flags:
 
 
 def _ends_where_foreseen(found: Found, log: PacketLog) -> bool:
-    """Whether a located record's last byte came, where the records before foretold its start."""
+    """True if a located record's last byte came, where the records before foretold its start."""
     return found.located and found.foreseen and int((found.offsets + log.sizes)[found.own].max()) == log.expected
 
 
@@ -262,7 +262,7 @@ class _Search:
         return verdict
 
     def _ended_within(self, which: Counts, stop: int) -> bool:
-        """Whether a packet that is not full lies before the last: only a record's last one is."""
+        """True if a packet that is not full lies before the last: only a record's last one is."""
         sizes = self._p.sizes[which]
         return bool(((sizes < self._p.full) & (self._p.ahead[which] + sizes < stop)).any())
 
@@ -273,7 +273,7 @@ class _Search:
         return first > 0 and int(ahead[first:].max()) < int(ahead[:first].min())
 
     def _before_switched_on(self, base: int, first: int, line: int) -> bool:
-        """Whether a record from `base` on would reach back behind sequence 1 and byte 0, where counters begin."""
+        """True if a record from `base` on would reach back behind sequence 1 and byte 0, where counters begin."""
         at, lost = self._p.at(first, line), first - base
         return at.byte_count < lost and at.sequence <= lost // self._p.full
 
@@ -283,7 +283,7 @@ class _Search:
         return suspect and which.size > 0 and not (big and self._much(which))
 
     def _is_behind(self, base: int) -> bool:
-        """Whether a record with this base was sent not long before the place where this one was to start."""
+        """True if a record with this base was sent not long before the place where this one was to start."""
         near = -_NEAR * (self._expected + self._p.full)
         return bool(self._ends.size) and near < base < int(self._ends.min())
 

@@ -54,7 +54,7 @@ class Segment:
     Raises
     ------
     DeviceError
-        when the disk has no room or cannot be written.
+        if the disk has no room or cannot be written.
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -76,7 +76,7 @@ class Segment:
             ) from None
 
     def finish(self, data: NDArray[np.uint8]) -> int:
-        """Write the bytes, make them durable, close; returns their CRC-32. Raises DeviceError when the disk fails."""
+        """Write the bytes, make them durable, close; returns their CRC-32. Raises DeviceError if the disk fails."""
         left = np.ascontiguousarray(data).data
         crc = zlib.crc32(left)
         try:
@@ -119,7 +119,7 @@ def write_durably(path: Path, raw: bytes) -> int:
 
 
 def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
-    """The facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError when absent or damaged."""
+    """The facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError if absent or damaged."""
     try:
         head, _, tail = read_bounded(path, MOST_INDEX_BYTES).partition(b"\n")
         facts = json.loads(head)

@@ -51,7 +51,7 @@ class CardSurvey:
 
     @property
     def silent(self) -> str:
-        """The first hop that is wrong; "" when none is."""
+        """The first hop that is wrong; "" if none is."""
         return next((hop.hop for hop in self.hops if hop.verdict == "error"), "")
 
 

@@ -6,7 +6,7 @@ a scan. `result_of` says what a processed scan shows, `draw_products` draws it, 
 """
 
 from polysight.host.catalogue.compare import DIFFERENCE, Comparison, compare, draw_comparison
-from polysight.host.catalogue.notes import NOTES, Notes, is_plain, read_notes, write_notes
+from polysight.host.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes, write_notes
 from polysight.host.catalogue.pictures import (
     AMPLITUDE,
     MAPS,
@@ -20,7 +20,8 @@ from polysight.host.catalogue.pictures import (
 from polysight.host.catalogue.pixels import Pixels
 from polysight.host.catalogue.probe import probe
 from polysight.host.catalogue.result import EXPORT, files_of, result_of
-from polysight.host.catalogue.scans import PROGRAM, Scans, Summary, folder_bytes, summary_of
+from polysight.host.catalogue.scans import Scans, folder_bytes
+from polysight.host.catalogue.summary import PROGRAM, Summary, log_tail, summary_of
 
 __all__ = [
     "AMPLITUDE",
@@ -44,6 +45,8 @@ __all__ = [
     "files_of",
     "folder_bytes",
     "is_plain",
+    "log_tail",
+    "printable",
     "probe",
     "read_notes",
     "result_of",

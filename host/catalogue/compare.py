@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from polysight.host.catalogue.pictures import Picture, picture_of
 from polysight.host.catalogue.pixels import Pixels
 from polysight.host.products import read_products
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Real = NDArray[np.float64]
@@ -72,17 +73,16 @@ def compare(first: Path, second: Path) -> Comparison:
         if not pixels.referenced:
             raise DataError(
                 f"{folder}: cannot be compared", "its images are not referenced to metal, or support no result",
-                "process it with a metal reference",
+                "process it with a metal reference", code=ErrorCode.NO_DATA,
             )  # fmt: skip
     rows, row_inside = _places(a.y_mm, b.y_mm)
     columns, column_inside = _places(a.x_mm, b.x_mm)
     both = row_inside[:, None] & column_inside[None, :] & a.clear & b.clear[np.ix_(rows, columns)]
     if not both.any():
         raise DataError(
-            "the two scans have no place in common",
-            "their images lie apart, or one of them is dark",
-            "take other scans",
-        )
+            "the two scans have no place in common", "their images lie apart, or one of them is dark",
+            "take other scans", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
     at = np.ix_(rows, columns)
     p = np.where(both, a.p - b.p[at], np.nan).astype(np.complex128)
     eps = np.where(both, a.permittivity - b.permittivity[at], np.nan)
@@ -164,7 +164,10 @@ def draw_comparison(found: Comparison, name: str) -> Picture:
         high = max(float(np.percentile(values[seen], 98)), 1e-3) if seen.any() else 1.0
         return picture_of(values, seen, (0.0, max(high, 2 * SIGNIFICANT) if name == "sigmas" else high))
     if name not in ("permittivity", "loss"):
-        raise DataError(f"no map is called {name[:40]!r}", "the name is wrong", "p, sigmas, permittivity or loss")
+        raise DataError(
+            f"no map is called {name[:40]!r}", "the name is wrong", "p, sigmas, permittivity or loss",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
     values = found.permittivity.real if name == "permittivity" else -found.permittivity.imag
     seen = np.isfinite(values)
     reach = max(float(np.percentile(np.abs(values[seen]), 95)), 1e-3) if seen.any() else 1.0

@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from polysight.host.products import write_atomically
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 NOTES = "operator.json"
@@ -43,8 +44,9 @@ def read_notes(folder: Path) -> Notes:
         return Notes()
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as e:
         raise DataError(
-            f"{path}: cannot be read: {e}", "it was edited or damaged", "correct it, or remove it"
-        ) from None
+            f"{path}: cannot be read: {e}", "it was edited or damaged", "correct it, or remove it",
+            code=ErrorCode.FILE_DAMAGED,
+        ) from None  # fmt: skip
 
 
 def is_plain(path: Path) -> bool:
@@ -63,8 +65,8 @@ def write_notes(folder: Path, notes: Notes) -> Notes:
     ConfigError
         when a text is too long, or there are too many tags.
     """
-    text = _shown(notes.notes, keep="\n")
-    tags = tuple(dict.fromkeys(tag for tag in (_shown(t).strip() for t in notes.tags) if tag))
+    text = printable(notes.notes, keep="\n")
+    tags = tuple(dict.fromkeys(tag for tag in (printable(t).strip() for t in notes.tags) if tag))
     wrong = ""
     if len(text) > LONGEST_NOTES:
         wrong = f"the notes have {len(text)} characters, {LONGEST_NOTES} are possible"
@@ -73,14 +75,17 @@ def write_notes(folder: Path, notes: Notes) -> Notes:
     elif long := next((tag for tag in tags if len(tag) > LONGEST_TAG), ""):
         wrong = f"the tag {long[:LONGEST_TAG]!r}... has {len(long)} characters, {LONGEST_TAG} are possible"
     if wrong:
-        raise ConfigError(wrong, "lists have to stay readable", "shorten it; longer texts go into a file of their own")
+        raise ConfigError(
+            wrong, "lists have to stay readable", "shorten it; longer texts go into a file of their own",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
     (folder / f".{NOTES}.part").unlink(missing_ok=True)  # a link there would have another file written
     content = {"notes": text, "tags": list(tags)}
     write_atomically(folder / NOTES, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
     return Notes(text, tags)
 
 
-def _shown(text: str, keep: str = "") -> str:
-    """Without control, direction and half characters, which lists and terminals cannot show."""
+def printable(text: str, keep: str = "") -> str:
+    """Return the text without control, direction and surrogate characters, for lists and terminals."""
     bad = ("Cc", "Cf", "Cs", "Zl", "Zp")
     return "".join(c for c in unicodedata.normalize("NFC", text) if c in keep or unicodedata.category(c) not in bad)

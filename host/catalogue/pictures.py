@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.host.catalogue.pixels import Pixels
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 AMPLITUDE, PHASE = "cividis", "twilight"
@@ -120,7 +121,10 @@ def draw_products(pixels: Pixels, name: str, limits: tuple[float, float] | None 
     Raises DataError where there is no such picture, or nothing to draw.
     """
     if name not in MAPS:
-        raise DataError(f"no picture is called {name[:40]!r}", "the name is wrong", f"one of {', '.join(MAPS)}")
+        raise DataError(
+            f"no picture is called {name[:40]!r}", "the name is wrong", f"one of {', '.join(MAPS)}",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
     values = _channels(pixels)[name] if name.endswith(("_amplitude", "_phase")) else _derived(pixels, name)
     return _picture(values if limits is None else values._replace(limits=limits))
 
@@ -130,7 +134,7 @@ def _derived(pixels: Pixels, name: str) -> _Values:
     if not pixels.referenced:
         raise DataError(
             "no permittivity is shown", "the images are not referenced to metal, or support no result",
-            "process the scan with metal",
+            "process the scan with metal", code=ErrorCode.NO_DATA,
         )  # fmt: skip
     eps = pixels.permittivity
     values = {"p_sigma": pixels.p_sigma, "permittivity": eps.real, "loss": -eps.imag}[name]

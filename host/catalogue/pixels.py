@@ -12,6 +12,7 @@ from polysight.host.materials import axis_mm
 from polysight.host.polarimetry import permittivity_from_ratio, specular_incidence_rad
 from polysight.host.products import SavedProducts
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.tables import decode
 
@@ -101,7 +102,7 @@ class Pixels:
         if "instrument" not in self.products.scan:
             raise DataError(
                 f"{self.products.folder}: the incidence angle is not known", "an earlier release made these products",
-                "process the scan again",
+                "process the scan again", code=ErrorCode.KEY_MISSING,
             )  # fmt: skip
         rig = decode(self.products.scan["instrument"], Instrument, f"{self.products.folder}/scan.json: instrument")
         return specular_incidence_rad(rig)
@@ -138,5 +139,6 @@ class Pixels:
                 f"x = {x_mm:.1f} mm, y = {y_mm:.1f} mm lies outside the image",
                 f"it reaches from x {left:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
                 "give a place in it, in mm from its centre",
+                code=ErrorCode.VALUE_INVALID,
             )
         return int(np.abs(self.y_mm - y_mm).argmin()), int(np.abs(self.x_mm - x_mm).argmin())

@@ -8,10 +8,23 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from polysight.host.acquisition import Wish, ask
-from polysight.host.catalogue import Notes, Scans, Summary, compare, folder_bytes, probe, read_notes, write_notes
+from polysight.host.acquisition import ScanCommand, send_command
+from polysight.host.catalogue import (
+    Notes,
+    Scans,
+    Summary,
+    compare,
+    folder_bytes,
+    printable,
+    probe,
+    read_notes,
+    write_notes,
+)
 from polysight.host.materials import UNKNOWN
 from polysight.shared.errors import DataError, no_such
+
+_NAME_WIDTH = 40
+"""Widest column of names; a longer name pads no other line."""
 
 
 def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
@@ -20,28 +33,33 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
         raise no_such(root)
     catalogue, odd = Scans(root), ""
     if left_out := catalogue.left_out():
-        odd = f"; not shown, for they are links or have names that cannot be shown: {', '.join(left_out)}"
-    found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _words(s)]
+        odd = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
+    found = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _searched(s)]
     if as_json:
-        rows = [asdict(s) | {"bytes": folder_bytes(root / s.name)} for s in found]
+        rows = [asdict(s) | {"bytes": _bytes_of(root, s)} for s in found]
         sys.stdout.write(json.dumps({"scans": rows}, indent=1, ensure_ascii=False) + "\n")
         return 0
-    width = max((len(s.name) for s in found), default=0)
+    width = min(max((len(s.name) for s in found), default=0), _NAME_WIDTH)
     for s in found:
-        size = folder_bytes(root / s.name) / 1e6
-        told = [
-            s.state,
-            f"{s.committed}/{s.rows} rows" if s.rows else "",
-            s.verdict,
-            ", ".join(map(_called, s.materials)),
-        ]
-        told += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
-        sys.stdout.write(f"{s.name:{width}}  {size:8.1f} MB  {'  '.join(t for t in told if t)}\n")
+        sys.stdout.write(f"{s.name:{width}}  {_bytes_of(root, s) / 1e6:8.1f} MB  {printable(_line(s))}\n")
     sys.stdout.write(f"{len(found)} scans under {root}{odd}\n")
     return 0
 
 
-def _words(s: Summary) -> str:
+def _bytes_of(root: Path, s: Summary) -> int:
+    """Size on the disk; 0 for a folder that does not answer."""
+    return 0 if s.state == "silent" else folder_bytes(root / s.name)
+
+
+def _line(s: Summary) -> str:
+    """State, rows, verdict, materials and tags of a scan."""
+    parts = [s.state, f"{s.committed}/{s.rows} rows" if s.rows else "", s.verdict, ", ".join(map(_called, s.materials))]
+    parts += ["simulated" if s.simulated else "", " ".join(f"#{tag}" for tag in s.tags)]
+    parts.append(s.reason if s.state == "failed" and not s.rows else "")
+    return "  ".join(part for part in parts if part)
+
+
+def _searched(s: Summary) -> str:
     return " ".join((s.name, s.scan_id, s.rig, s.state, s.notes, *s.tags, *s.materials)).casefold()
 
 
@@ -53,8 +71,8 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
     if text is not None or add or remove:
         tags = tuple(t for t in dict.fromkeys((*notes.tags, *add)) if t not in remove)
         notes = write_notes(folder, Notes(notes.notes if text is None else text, tags))
-    sys.stdout.write(f"{notes.notes}\n" if notes.notes else "")
-    sys.stdout.write(f"tags: {', '.join(notes.tags) or 'none'}\n")
+    text = f"{notes.notes}\n" if notes.notes else ""
+    sys.stdout.write(printable(f"{text}tags: {', '.join(notes.tags) or 'none'}", keep="\n") + "\n")
     return 0
 
 
@@ -62,7 +80,7 @@ def ask_scan(folder: Path, wish: str) -> int:
     """Ask a running scan for something; returns 0 when it has heard. Raises ScanError."""
     if not folder.is_dir():
         raise no_such(folder)
-    ask(folder, Wish(wish))
+    send_command(folder, ScanCommand(wish))
     sys.stdout.write(f"{folder}: heard {wish}\n")
     return 0
 
@@ -87,7 +105,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
         lines.append(f"in patch {patch['label']}: {_called(patch.get('name'))}")
     lines += [f"  {n['sigmas']:g} standard deviations from {n['name']}" for n in found["nearest"]]
     lines.append(found["profile_why"] or "range profile: --json")
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     return 0
 
 
@@ -118,7 +136,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
             continue
         sure = "" if pair["sigmas"] is None else f": {pair['sigmas']:g} standard deviations"
         lines.append(f"{where}: permittivity differs by {_complex(d)}{sure}")
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     return 0
 
 

@@ -6,7 +6,13 @@ scene (`KnownScene`); it returns a `MaterialsResult`. A `Classifier` names patch
 between scans is in `patch_files`, boxes with names in `labels`; `published` reads the published data set's files.
 """
 
-from polysight.host.materials.analyse import analyse, image_centre_mm, permittivity_change, pixel_accuracy
+from polysight.host.materials.analyse import (
+    analyse,
+    expected_pixel_accuracy,
+    image_centre_mm,
+    permittivity_change,
+    pixel_accuracy,
+)
 from polysight.host.materials.classify import (
     DISCRIMINANT,
     MODELS,
@@ -192,6 +198,7 @@ __all__ = [
     "entries_of",
     "entries_of_boxes",
     "estimate_permittivity",
+    "expected_pixel_accuracy",
     "feature_matrix",
     "find_metal",
     "fit_concentration",

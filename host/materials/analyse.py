@@ -251,11 +251,25 @@ def pixel_accuracy(result: MaterialsResult) -> float | None:
 
     Patches rightly called unknown, because the library does not hold their material, do not count.
     """
-    judged = [r for r in result.patches if r.verdict is not None and r.truth is not None]
-    judged = [r for r in judged if r.verdict.name != UNKNOWN or r.truth.name in result.library]
-    pairs = [(r.names, r.truth.name) for r in judged if r.names is not None]
-    total = sum(names.size for names, _ in pairs)
-    return sum(int((names == name).sum()) for names, name in pairs) / total if total else None
+    right = [n.names == truth for n, truth in _pixels_with_truth(result)]
+    return float(np.concatenate(right).mean()) if right else None
+
+
+def expected_pixel_accuracy(result: MaterialsResult) -> float | None:
+    """Share of the pixels of :func:`pixel_accuracy` that the best classifier is expected to name right.
+
+    It is the mean probability of each pixel's likeliest material, so that no choice of names is expected to do better
+    on these data. None without known truth, or if the classifier gives no probabilities.
+    """
+    shares = [n.confidence for n, _ in _pixels_with_truth(result)]
+    known = [s for s in shares if s is not None]
+    return float(np.concatenate(known).mean()) if known and len(known) == len(shares) else None
+
+
+def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
+    """Named patches whose truth is known, with the truth's name; without those rightly called unknown."""
+    judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
+    return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]
 
 
 def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, float]:

@@ -140,11 +140,15 @@ class PatchName:
 
 @dataclass(frozen=True)
 class NamedPatch:
-    """Names of a patch's pixels [n], their distances over the threshold [n], and the patch's verdict."""
+    """Names of a patch's pixels [n], their distances over the threshold [n], and the patch's verdict.
+
+    `confidence` [n]: probability of each pixel's likeliest material, 0 for unusable pixels; None: the model gives none.
+    """
 
     names: npt.NDArray[np.str_]
     distance: Real
     verdict: PatchName
+    confidence: Real | None = None
 
 
 class Classifier:
@@ -234,6 +238,10 @@ class Classifier:
             at = number == i
             pixels = found.pixel_names[at], found.pixel_distance[at]
             out[i] = self._named(good[i], pixels, self._patch_name(found, row))
+            if found.pixel_confidence is not None:
+                confidence = np.zeros(good[i].size)
+                confidence[good[i]] = found.pixel_confidence[at]
+                out[i] = replace(out[i], confidence=confidence)
         return out
 
     def _patch_name(self, found: NamedScan, row: int) -> PatchName:

@@ -161,6 +161,7 @@ class ErrorDiscriminant(Model):
             prior = (1 - others) * probability[:, :-1] + others / self.names.size
             pixel_cost = pixel_cost - 2 * np.log(prior[patch])
         of = np.arange(len(x)), pixel_cost.argmin(axis=1)
+        in_library = 1.0 if others is None else 1 - (1 - others) * probability[patch, -1]
         return NamedScan(
             self.names[of[1]],
             np.sqrt(pixel_q[of] / self.pixel_level),
@@ -171,6 +172,7 @@ class ErrorDiscriminant(Model):
             far,
             probability,
             self.names,
+            in_library * probabilities(pixel_cost, np.full(len(x), np.inf)).max(axis=1),
         )
 
     def _fit_patches(self, residual: Real, material: npt.NDArray, plate: npt.NDArray, dof: int) -> None:

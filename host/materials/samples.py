@@ -172,6 +172,8 @@ class NamedScan:
     ----------
     pixel_names, pixel_distance
         Likeliest material of each pixel, [n], and its distance over the threshold: above 1 is unknown.
+    pixel_confidence
+        Probability of that material, [n]; None: the model gives none.
     patches
         Patch numbers, sorted, [patches].
     names, confidence, distance
@@ -192,6 +194,7 @@ class NamedScan:
     distances: Real | None = None
     probabilities: Real | None = None
     materials: npt.NDArray | None = None
+    pixel_confidence: Real | None = None
 
 
 @dataclass(frozen=True)

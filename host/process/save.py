@@ -17,6 +17,7 @@ from polysight.host.materials import (
     Classifier,
     MaterialsResult,
     TruthPlate,
+    expected_pixel_accuracy,
     labels_of,
     pack_labels,
     pack_patches,
@@ -227,8 +228,10 @@ def _result_lines(scan: Scan, found: MaterialsResult, rows: list[dict[str, Any]]
     foreign = [r for r in known if r["name"] == UNKNOWN and not r["truth"]["in_library"]]  # neither right nor wrong
     known = [r for r in known if r not in foreign]
     right = sum(r["name"] == r["truth"]["name"] for r in known)
-    accuracy = pixel_accuracy(found)
+    accuracy, expected = pixel_accuracy(found), expected_pixel_accuracy(found)
     share = "" if accuracy is None else f", {100 * accuracy:.1f} % of their pixels"
+    if share and expected is not None:
+        share += f" (their own confidence expects {100 * expected:.1f} %)"
     aside = f"{len(foreign)} not in the library, and called unknown" if foreign else ""
     named = f"{right} of {len(known)} plates named right{share}" if known else ""
     return head, "; ".join(part for part in (named, aside) if part)

@@ -1,22 +1,19 @@
 """The report of a processed scan, its figures and tables, and exports for other programs.
 
-`context_of` collects what a report shows, `write_report` makes the page; `sync_report` shows what synchronisation
-leaves of errors; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from saved products; `write_cphd` writes a
-scan's phase history for other SAR processors.
+`context_of` collects the content of a report, `write_report` writes the page; `write_sync_report` reports the residual
+errors of synchronisation; `export` writes HDF5, MATLAB, NetCDF, Zarr, PNG and CSV from saved products; `write_cphd`
+writes a scan's phase history for other SAR processors.
 """
 
 from polysight.host.report.context import ReportContext, classifier_sentence, context_of
 from polysight.host.report.cphd import Channel as CphdChannel
 from polysight.host.report.cphd import PhaseHistory, write_cphd
 from polysight.host.report.exports import export, export_folder
-from polysight.host.report.figures import banner_png, draw_channel, draw_overview, figures
-from polysight.host.report.focus_figure import focus_figure
-from polysight.host.report.fonts import figure_label, font_families
-from polysight.host.report.label_figure import label_figure
+from polysight.host.report.figures import draw_channel, draw_overview, figures, focus_figure, label_figure
 from polysight.host.report.report import write_report
-from polysight.host.report.style import PALETTE, extent_mm, png
+from polysight.host.report.style import INK, MUTED, PALETTE, STAMP, extent_mm, figure_label, font_families, png
 from polysight.host.report.sync_report import QUANTITIES, SyncReport, write_sync_report
-from polysight.host.report.tables import INK, MUTED, STAMP, manifest_sentence, recorded_sentence
+from polysight.host.report.tables import manifest_sentence, recorded_sentence
 
 __all__ = [
     "INK",
@@ -28,7 +25,6 @@ __all__ = [
     "PhaseHistory",
     "ReportContext",
     "SyncReport",
-    "banner_png",
     "classifier_sentence",
     "context_of",
     "draw_channel",

@@ -1,6 +1,6 @@
-"""What a report is made of, as plain arrays and dicts: the report knows nothing of how they came about.
+"""Content of a report as plain arrays and dicts, independent of how they were computed.
 
-`context_of` fills it from what was found in a scan.
+`context_of` fills it from the result of a scan, `ReportContext.of_products` from saved products.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, pixel_accuracy
+from polysight.host.materials import Classifier, MaterialsResult, TruthPlate, expected_pixel_accuracy, pixel_accuracy
 from polysight.host.products import SavedProducts, withhold
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.raster import RasterPlan
@@ -24,14 +24,14 @@ Labels = npt.NDArray[np.int32]
 
 @dataclass(frozen=True)
 class ReportContext:
-    """Everything a report shows. What is None or empty is left out of it.
+    """Everything a report shows; fields that are None or empty are left out of the report.
 
     Attributes
     ----------
     title
         Heading, the scan's or scene's name.
     simulated
-        Stamps SIMULATED on the page, every figure and every table.
+        If true, the page, every figure and every table are stamped SIMULATED.
     x_m, y_m
         Pixel centres, rig frame, metres, [nx] and [ny]. Figures show millimetres from the image centre.
     h, v, p
@@ -39,44 +39,45 @@ class ReportContext:
     valid
         bool [ny, nx]; invalid pixels are drawn grey.
     metal_referenced
-        Whether h, v, p are relative to metal (0 dB = metal) or in arbitrary units.
+        True if h, v, p are relative to metal (0 dB = metal), else they have arbitrary units.
     materials
         Rows as `polysight.host.materials.MaterialsResult.rows` makes them, in the order of their labels.
     segments
         int32 [ny, nx], 0 = nothing, else the row's label.
     pixel_names
-        Row label to (names str [n] of the interior's pixels in image order, interior bool [ny, nx]), for the
-        pixel-wise map; may be empty.
+        Row label to (names str [n] of the interior's pixels in image order, interior bool [ny, nx]); may be empty.
     truth
-        Plates known beforehand: dicts with name, box_mm (x0, y0, x1, y1 from the image centre), permittivity
-        (complex or None for metal). None when unknown.
+        True plates: dicts with name, box_mm (x0, y0, x1, y1 from the image centre), permittivity (complex or None for
+        metal). None if unknown.
     metal_how
         One sentence: which patch is the metal reference and how it was chosen.
     pixel_accuracy
-        Share of interior pixels named right, where the truth is known.
+        Share of interior pixels named right; None without truth.
+    expected_accuracy
+        Share that the best classifier is expected to reach on the same pixels, by their own probabilities.
     library_note
-        Where the classifier's library comes from and how well it does on scans left out.
+        Origin of the classifier's library, and its score on scans left out.
     quality
-        The content of quality.json. Known keys: `boards` {name: {frames_expected, frames_received, ...,
-        synchronisation: {stage: {quantity: std}}}} and `seconds_per_stage` {stage: s}. Further keys are listed as
-        they are.
+        Content of quality.json. Known keys: `boards` {name: {frames_expected, frames_received, ...,
+        synchronisation: {stage: {quantity: std}}}} and `seconds_per_stage` {stage: s}. Other keys are listed
+        unchanged.
     config
         Short summary, key to text or number, in the order to show.
     provenance
         Scan id, times, versions; key to text.
     notes
-        Sentences shown at the top, such as what never ran on hardware.
+        Sentences shown at the top.
     plan
-        Where the positions of the scan were; with `quality`'s `masked_columns` it makes the map of what was masked.
+        Raster of the scan; with `masked_columns` of `quality` it gives the map of masked positions.
     rx_gains
-        Board to its RX: gain_db and phase_deg against the first, which were divided out.
+        Board to gain_db and phase_deg of each RX against the first, which were divided out.
     rig_file
-        The whole rig file as text.
+        The rig file as text.
     verdict
-        How far the result may be trusted; where not given that of `quality`, None when it does not say. Where it is
-        `none`, the context drops whatever it was given of names, permittivities and truth: nothing can show them.
+        Level of trust and its reasons; default: that of `quality`, if it has one. With the level `none` the context
+        drops all names, permittivities and truth, so that nothing can show them.
     error_budget
-        What materials.json says of leakage, plane, angle and metal.
+        `error_budget` of materials.json: leakage, plane, angle and metal.
     """
 
     title: str
@@ -94,6 +95,7 @@ class ReportContext:
     truth: list[dict[str, Any]] | None = None
     metal_how: str = ""
     pixel_accuracy: float | None = None
+    expected_accuracy: float | None = None
     library_note: str = ""
     quality: dict[str, Any] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
@@ -114,18 +116,37 @@ class ReportContext:
         nothing: dict[str, Any] = {
             "materials": [{**row, "metal_reference": False} for row in bare],
             "quality": _without_results(self.quality),
-            **{"pixel_names": {}, "truth": None, "pixel_accuracy": None, "library_note": "", "metal_how": ""},
+            **{"pixel_names": {}, "truth": None, "pixel_accuracy": None, "expected_accuracy": None},
+            **{"library_note": "", "metal_how": ""},
         }
         for name, value in nothing.items():
             object.__setattr__(self, name, value)
 
+    @classmethod
+    def of_products(cls, products: SavedProducts, segments: Labels | None = None) -> ReportContext:
+        """Return a context with the images and patches of saved products; unknown origin counts as simulated."""
+        return cls(
+            title=products.scan_id,
+            simulated=products.simulated is not False,
+            x_m=products.x_m,
+            y_m=products.y_m,
+            h=products.h,
+            v=products.v,
+            p=products.p,
+            valid=products.valid,
+            metal_referenced=bool(products.materials),
+            materials=products.segments,
+            segments=segments,
+            verdict=products.verdict,
+        )
+
     @property
     def judged(self) -> bool:
-        """False where the verdict is that nothing can be said of the patches."""
+        """False if the verdict is `none`: names and permittivities are withheld."""
         return self.verdict is None or self.verdict.usable
 
     def with_products(self, folder: Path) -> ReportContext:
-        """The same with patches, verdict and error budget as the folder's materials.json has them, if it is there."""
+        """Return a copy with patches, verdict and error budget of the folder's materials.json, if there is one."""
         saved = SavedProducts(folder)
         if not saved.materials:
             return self
@@ -134,7 +155,7 @@ class ReportContext:
 
 
 def _without_results(quality: dict[str, Any]) -> dict[str, Any]:
-    """quality.json without what it says of names and permittivities."""
+    """Return the content of quality.json without names and permittivities."""
     out = {k: v for k, v in quality.items() if k != "pixel_accuracy"}
     if isinstance(out.get("incidence"), dict):
         out["incidence"] = {k: v for k, v in out["incidence"].items() if "permittivity" not in k}
@@ -156,7 +177,7 @@ def context_of(
     provenance: dict[str, Any] | None = None,
     notes: Sequence[str] = (),
 ) -> ReportContext:
-    """Everything a report shows of a :class:`polysight.host.materials.MaterialsResult`; the rest is passed on."""
+    """Return the context of a :class:`polysight.host.materials.MaterialsResult`; other arguments are passed on."""
     return ReportContext(
         title=title,
         simulated=simulated,
@@ -172,6 +193,7 @@ def context_of(
         truth=[{"name": t.name, "box_mm": t.box_mm, "permittivity": t.permittivity} for t in plates] or None,
         metal_how=result.metal.how,
         pixel_accuracy=pixel_accuracy(result),
+        expected_accuracy=expected_pixel_accuracy(result),
         library_note=named_by,
         quality=quality or {},
         config=config or {},
@@ -181,14 +203,14 @@ def context_of(
 
 
 def classifier_sentence(classifier: Classifier) -> str:
-    """What names, and how well it names scans it has not seen."""
+    """Describe a classifier, its library, and its score on scans left out of training."""
     library, fit = classifier.library, classifier.fit
     kind = "simulated " if library.simulated else ""
     angles = " and ".join(f"{a:g}" for a in classifier.angles_deg)
     out = f"{classifier.model} on |H|, |V| and complex P"
     judged = fit.get("judged", {}).get(classifier.model)
     if judged and fit.get("model") != classifier.model:
-        out += ", asked for; not the one that names by default"
+        out += ", chosen by the user; not the default model"
     out += f"; library of {len(library.names)} materials from {len(library.scans)} {kind}scans, {angles} degrees."
     if judged:
         out += (
@@ -206,7 +228,7 @@ def classifier_sentence(classifier: Classifier) -> str:
         out += "."
         if missing := fit.get("not_judged"):
             out += (
-                f" Of its {fit['materials']} materials {len(missing)} could not be judged, because one scan alone holds"
+                f" Of its {fit['materials']} materials {len(missing)} could not be judged, because only one scan has"
                 f" them: {', '.join(missing)}."
             )
     return f"{out} {library.note}".strip()

@@ -1,9 +1,9 @@
-"""A scan's phase history as CPHD 1.1, the standard by which SAR processors take it (NGA.STND.0068, written by sarkit).
+"""Write a scan's phase history as CPHD 1.1, the input format of SAR processors (NGA.STND.0068, by sarkit).
 
-The scene is laid on the equator where the Greenwich meridian meets it: the rig's origin has no place on the Earth. The
-object plane is the ground, the rig stands above it; x of the rig points east and y south, so that rig and Earth are
-right-handed alike. Bistatic: a channel a receiving antenna, a vector a stage position. Signals are of the domain FX
-with SGN = +1: an echo that comes later than one from the reference point by t turns by exp(+j 2 pi f t).
+The scene is placed at latitude and longitude 0, because the rig has no position on the Earth. The object plane is the
+ground, the rig is above it; x of the rig points east and y south, so that both frames are right-handed. The data are
+bistatic: one channel for each receiving antenna, one vector for each stage position. Signals are in the domain FX with
+SGN = +1: an echo later than that of the reference point by t has the factor exp(+j 2 pi f t).
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ from numpy.typing import NDArray
 
 from polysight.host.products import temporary_path
 from polysight.host.store import versions
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Floats = NDArray[np.float64]
 EARTH_RADIUS_M = 6_378_137.0
-"""WGS 84, at the equator."""
+"""Equatorial radius of WGS 84."""
 NAMESPACE = "http://api.nsgreg.nga.mil/schema/cphd/1.1.0"
 _NO_START = "1970-01-01T00:00:00Z"
-"""The standard wants a start; where none is known this stands for it, and a parameter says so."""
+"""Replaces an unknown start, which the standard requires; a parameter of the file says so."""
 _EACH = (
     ("TxTime", 1), ("TxPos", 3), ("TxVel", 3), ("RcvTime", 1), ("RcvPos", 3), ("RcvVel", 3), ("SRPPos", 3),
     ("aFDOP", 1), ("aFRR1", 1), ("aFRR2", 1), ("FX1", 1), ("FX2", 1), ("TOA1", 1), ("TOA2", 1), ("TDTropoSRP", 1),
     ("SC0", 1), ("SCSS", 1), ("SIGNAL", 1),
 )  # fmt: skip
-"""Parameters of a vector, and how many words of 8 bytes each takes."""
+"""Parameters of a vector and their sizes in words of 8 bytes."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One receiving antenna: samples complex64 [vector, frequency], place [vector, 3] in metres, valid bool [vector].
+    """One receiving antenna: samples complex64 [vector, frequency], position [vector, 3] in m, valid bool [vector].
 
-    Samples have the phase +2 pi f (path - direct path) / c of `direct_m`, metres; polarisation "H" or "V".
+    The phase of samples is +2 pi f (path - `direct_m`) / c, with the direct path in metres; polarisation "H" or "V".
     """
 
     name: str
@@ -53,24 +54,24 @@ class Channel:
 
 @dataclass(frozen=True)
 class PhaseHistory:
-    """A scan as its rig frame has it; vectors in the order of time.
+    """A scan's phase history in the rig frame; vectors in the order of time.
 
     Attributes
     ----------
     started_utc
-        When the scan began, ISO 8601; empty: not known.
+        Start of the scan, ISO 8601; empty if not known.
     channels
         All receiving antennas.
     time_s, tx_m, velocity_m_s
-        float64 [vector], [vector, 3], [vector, 3]: nominal time, place of the transmitting antenna, its velocity.
+        float64 [vector], [vector, 3], [vector, 3]: nominal time, position and velocity of the transmitting antenna.
     frequencies_hz
         float64 [frequency], evenly spaced.
     gate_m
-        Smallest and largest excess path that the samples hold.
+        Smallest and largest excess path of the range gate.
     centre_m
-        Middle of the image, on the object plane [3].
+        Centre of the image, on the object plane [3].
     shape, pixel_m
-        Pixels of the image (ny, nx), and their distance.
+        Pixels of the image (ny, nx), and their pitch.
     """
 
     scan_id: str
@@ -88,14 +89,14 @@ class PhaseHistory:
 
 
 def to_earth(places_m: Floats, z_m: float, vector: bool = False) -> Floats:
-    """Places [..., 3] of the rig's frame as Earth-centred ones; object plane at `z_m`. A `vector` is only turned."""
+    """Convert positions [..., 3] of the rig frame to Earth-centred; object plane at `z_m`. Only rotate a `vector`."""
     x, y, z = np.moveaxis(np.asarray(places_m, np.float64), -1, 0)
     up = -z if vector else EARTH_RADIUS_M + z_m - z
     return np.stack([up, x, -y], axis=-1)
 
 
 def write_cphd(path: Path, history: PhaseHistory) -> None:
-    """Write the file. Raises ConfigError when sarkit is not installed, OSError when the disk fails."""
+    """Write the CPHD file. Raises ConfigError if sarkit is not installed, OSError if the file cannot be written."""
     try:
         cphd: Any = import_module("sarkit.cphd")
         etree: Any = import_module("lxml.etree")
@@ -104,6 +105,7 @@ def write_cphd(path: Path, history: PhaseHistory) -> None:
             "CPHD needs the package sarkit, which is not installed",
             "only this export uses it, so it is an extra",
             "pip install 'polysight[export]', or pip install sarkit",
+            code=ErrorCode.PACKAGE_MISSING,
         ) from None
     vectors = {channel.name: _vectors(history, channel) for channel in history.channels}
     root = etree.Element(f"{{{NAMESPACE}}}CPHD", nsmap={None: NAMESPACE})
@@ -127,20 +129,20 @@ def write_cphd(path: Path, history: PhaseHistory) -> None:
 
 
 def _reference_path_m(history: PhaseHistory, channel: Channel) -> Floats:
-    """Path from TX over the scene's middle to the receiving antenna, [vector]."""
+    """Return the path from TX over the scene's centre to the receiving antenna, [vector]."""
     out = np.linalg.norm(history.tx_m - history.centre_m, axis=1)
     return out + np.linalg.norm(channel.rx_m - history.centre_m, axis=1)
 
 
 def _signal(history: PhaseHistory, channel: Channel) -> NDArray[np.complex64]:
-    """Samples whose phase counts from the scene's middle, in place of the direct path."""
+    """Return the samples with the scene's centre as reference of the phase, instead of the direct path."""
     later = (channel.direct_m - _reference_path_m(history, channel)) / SPEED_OF_LIGHT_M_S
     turned = channel.samples * np.exp(2j * np.pi * np.outer(later, history.frequencies_hz))
     return turned.astype(np.complex64)
 
 
 def _vectors(history: PhaseHistory, channel: Channel) -> dict[str, Any]:
-    """Parameters of each vector of a channel. Vectors without data have SIGNAL 0."""
+    """Return the parameters of each vector of a channel. Vectors without data have SIGNAL 0."""
     c, f, z = SPEED_OF_LIGHT_M_S, history.frequencies_hz, float(history.centre_m[2])
     path = _reference_path_m(history, channel)
     toa = (np.array(history.gate_m)[:, None] + channel.direct_m - path) / c
@@ -172,9 +174,9 @@ def _vectors(history: PhaseHistory, channel: Channel) -> dict[str, Any]:
 
 
 def _tables(history: PhaseHistory, vectors: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """All of the XML but the reference geometry, in the order of the schema."""
+    """Return the content of the XML without the reference geometry, in the order of the schema."""
     f, t, started = history.frequencies_hz, history.time_s, history.started_utc or _NO_START
-    known = "as recorded" if history.started_utc else "unknown; the times of this file count from no real one"
+    known = "as recorded" if history.started_utc else "unknown; the start in this file is a placeholder"
     toa = [np.min([v["TOA1"] for v in vectors.values()]), np.max([v["TOA2"] for v in vectors.values()])]
     return {
         "CollectionID": {
@@ -187,7 +189,7 @@ def _tables(history: PhaseHistory, vectors: Mapping[str, Mapping[str, Any]]) -> 
             "ReleaseInfo": "UNRESTRICTED",
             "Parameter": [
                 {"@name": "simulated", "#": str(history.simulated).lower()},
-                {"@name": "place", "#": "a laboratory: latitude, longitude and height are not where it is"},
+                {"@name": "place", "#": "a laboratory: latitude, longitude and height are placeholders"},
                 {"@name": "start", "#": known},
                 {"@name": "samples", "#": "range-gated, Hann-weighted over the sweep, direct path taken out"},
             ],
@@ -225,7 +227,7 @@ def _tables(history: PhaseHistory, vectors: Mapping[str, Mapping[str, Any]]) -> 
 
 
 def _scene(history: PhaseHistory) -> dict[str, Any]:
-    """Where the object plane is: x of the image area points along the rig's y."""
+    """Return the scene's coordinates; x of the image area points along the rig's y."""
     centre, z = history.centre_m, float(history.centre_m[2])
     (ny, nx), pixel = history.shape, history.pixel_m
     x, y = nx * pixel / 2, ny * pixel / 2
@@ -316,7 +318,7 @@ def _xyz(place: Floats) -> dict[str, float]:
 
 
 def _fill(etree: Any, node: Any, content: Any) -> None:
-    """Put content into an element: tables as children, lists as repeated children, `@` attributes, `#` the text."""
+    """Fill an element: dicts become children, lists repeated children, `@` keys attributes, `#` the text."""
     if not isinstance(content, dict):
         node.text = str(content).lower() if isinstance(content, bool) else _number(content)
         return

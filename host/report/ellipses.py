@@ -1,4 +1,4 @@
-"""The permittivities in the plane of real part and loss: estimates, ellipses of their errors, and the truth."""
+"""Figure of the permittivities, loss over real part: estimates, error ellipses and the truth."""
 
 from __future__ import annotations
 
@@ -17,9 +17,17 @@ from matplotlib.patheffects import withStroke
 
 from polysight.host.products import permittivity_spread
 from polysight.host.report.context import ReportContext
-from polysight.host.report.fonts import font_families
-from polysight.host.report.style import colours_of, dress, patch_colour, patch_label, png, short_label
-from polysight.host.report.tables import INK, MUTED
+from polysight.host.report.style import (
+    INK,
+    MUTED,
+    colours_of,
+    dress,
+    patch_colour,
+    patch_label,
+    png,
+    short_label,
+    style_legend,
+)
 
 SHARES = {0.68: 2.279, 0.95: 5.991}
 """Share of draws to the squared radius that holds it: quantiles of chi-squared with two degrees of freedom."""
@@ -27,20 +35,20 @@ _STYLES: dict[float, dict[str, Any]] = {
     0.68: {"linestyle": "-", "linewidth": 1.2},
     0.95: {"linestyle": "--", "linewidth": 0.8},
 }
-_LABEL_PT, _NEAR_PT = (9.0, 9.0), 5.0  # a number's room, and that of a point
+_LABEL_PT, _NEAR_PT = (9.0, 9.0), 5.0  # sizes of a number and of a point
 _RADII_PT, _ANGLES = (11, 17, 25, 34, 45, 58), 16
 Array = npt.NDArray[np.float64]
 
 
 def ellipse_of(matrix: Array, share: float) -> tuple[float, float, float]:
-    """Width, height and angle in degrees of the ellipse that holds this share of draws with a covariance [2, 2]."""
+    """Return width, height and angle in degrees of the ellipse that holds a share of draws with a covariance [2, 2]."""
     values, vectors = np.linalg.eigh(matrix)
     width, height = 2 * np.sqrt(np.maximum(values, 0.0) * SHARES[share])
     return float(width), float(height), math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
 
 
 def place_numbers(points: Array, obstacles: Array) -> Array:
-    """Places for a label beside each point, so that labels cover neither one another nor a point.
+    """Place a label beside each point so that labels cover neither one another nor a point.
 
     Parameters
     ----------
@@ -51,7 +59,7 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
 
     Returns
     -------
-    [n, 2]: the labels' middles; the nearest free place of each, else the one that covers least.
+    [n, 2]: the labels' middles: for each the nearest free place, else the one that covers least.
     """
     taken: list[Array] = []
     solid = np.concatenate([points, obstacles.reshape(-1, 2)])
@@ -72,9 +80,9 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
 
 
 def permittivity_figure(ctx: ReportContext) -> bytes | None:
-    """PNG of the estimates with ellipses of 68 % and 95 %, and the truth as crosses; None without any.
+    """Return a PNG of the estimates with ellipses of 68 % and 95 %, and the truth as crosses; None without estimates.
 
-    Patches are numbered; a legend names them. Where only the pixels' spread is known, bars show that.
+    Patches are numbered; a legend names them. Without a covariance, bars show the spread of the pixels.
     """
     rows = [r for r in ctx.materials if r.get("permittivity")]
     if not rows:
@@ -133,7 +141,7 @@ def _draw_estimate(ax: Axes, row: dict[str, Any], colour: str) -> None:
 
 
 def _set_limits(ax: Axes, rows: Sequence[dict[str, Any]]) -> None:
-    """Around estimates, truths and ellipses; one very uncertain patch must not shrink all others to a dot."""
+    """Set limits around estimates, truths and ellipses; one very uncertain patch must not shrink all others."""
     centres = np.array([(r["permittivity"]["real"], -r["permittivity"]["imag"]) for r in rows])
     certain = np.concatenate([centres, np.array([t for r in rows if (t := _truth(r))], float).reshape(-1, 2)])
     half = np.array([_half_size(r["permittivity"]) for r in rows])
@@ -146,7 +154,7 @@ def _set_limits(ax: Axes, rows: Sequence[dict[str, Any]]) -> None:
 
 
 def _half_size(e: dict[str, Any]) -> tuple[float, float]:
-    """How far what is drawn of an estimate reaches: the 95 % ellipse, or the bars."""
+    """Return how far the drawing of an estimate reaches: its 95 % ellipse, or its bars."""
     if spread := permittivity_spread(e):
         radius = math.sqrt(SHARES[0.95])
         return radius * spread.real_std, radius * spread.loss_std
@@ -173,13 +181,11 @@ def _legend(fig: Figure, rows: Sequence[dict[str, Any]], colours: dict[str, str]
         ]
     if with_truth:
         handles.append(Line2D([], [], color=INK, marker="x", linestyle="", markeredgewidth=1.5, label="truth"))
-    legend = fig.legend(handles=handles, loc="outside right upper", fontsize=7.5, frameon=False)
-    for text in legend.get_texts():
-        text.set(family=list(font_families()), parse_math=False, color=INK)
+    style_legend(fig.legend(handles=handles, loc="outside right upper", fontsize=7.5, frameon=False))
 
 
 def _write_numbers(fig: Figure, ax: Axes, rows: Sequence[dict[str, Any]], truths: Sequence[Sequence[float]]) -> None:
-    """The patches' numbers beside their points, with a line where a number is further away."""
+    """Write the patches' numbers beside their points, with a line to numbers that are further away."""
     per_point = fig.dpi / 72
     estimates = np.array([(r["permittivity"]["real"], -r["permittivity"]["imag"]) for r in rows])
     points = ax.transData.transform(estimates) / per_point

@@ -1,4 +1,4 @@
-"""Saved products as files for other programs (`polysight export`): HDF5, NetCDF, Zarr, MATLAB, PNG, CSV."""
+"""Export saved products for other programs (`polysight export`): HDF5, NetCDF, Zarr, MATLAB, PNG, CSV."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ from polysight.host.products import (
 )
 from polysight.host.report.context import ReportContext
 from polysight.host.report.figures import figures
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 
 def write_csv(path: Path, products: SavedProducts) -> None:
-    """Write the table as CSV: comma, UTF-8, a header line; what is not known is empty. Numbers keep all digits.
+    """Write the table of materials as CSV: comma, UTF-8, a header line; unknown values are empty, digits are kept.
 
-    The last columns, `verdict` and `verdict_reasons` (JSON), say the same in every line; products of earlier releases
-    are written without them.
+    The last columns, `verdict` and `verdict_reasons` (JSON), are the same in every line; products without a verdict
+    have none.
     """
     columns = material_columns(products)
     count = len(columns["patch"])
@@ -53,7 +54,7 @@ _PLANES = {
     "v": "p-polarised channel",
     "p": "polarisation ratio H / V",
     "p_sigma": "standard deviation of p: root of the mean variance of its real and imaginary part",
-    "valid": "whether the scan illuminates the pixel",
+    "valid": "true if the scan illuminates the pixel",
 }
 _TEXT = ("name", "true_name", "dominated_by", "refused", "drawn_as")
 _UNITS = {"mm": "mm", "deg": "degree", "db": "dB", "m": "m"}
@@ -67,21 +68,22 @@ def _h5py() -> Any:
             "HDF5 needs the package h5py, which is not installed",
             "only this export uses it, so it is an extra",
             "pip install 'polysight[export]', or pip install h5py",
+            code=ErrorCode.PACKAGE_MISSING,
         ) from None
 
 
 def write_hdf5(path: Path, products: SavedProducts) -> None:
-    """Write a file of these products.
+    """Write an HDF5 file of the products.
 
-    /h, /v, /p complex64 [y, x], /valid bool [y, x], where known /p_sigma float32 [y, x]; /x, /y float64 in metres, the
-    dimension scales of all of them; group /materials with a column for each of
+    /h, /v, /p complex64 [y, x], /valid bool [y, x], if known /p_sigma float32 [y, x]; /x, /y float64 in metres, their
+    dimension scales; group /materials with a column for each of
     :func:`polysight.host.products.material_columns`; attributes scan_id, simulated, convention, verdict, and as JSON
-    verdict_reasons, config, versions; the JSON files under /documents. /entry shows the images by NeXus classes.
+    verdict_reasons, config, versions; the JSON files under /documents; /entry links the images by NeXus classes.
 
     Raises
     ------
     ConfigError
-        when h5py is not installed.
+        if h5py is not installed.
     """
     h5py = _h5py()
     part = temporary_path(path)
@@ -114,7 +116,7 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
 
 
 def _add_nexus(h5py: Any, f: Any, products: SavedProducts) -> None:
-    """The same arrays by NeXus classes: NXentry with NXdata and NXinstrument, links to what is there already."""
+    """Add NXentry with NXdata and NXinstrument, with links to the arrays."""
 
     def group(parent: Any, name: str, kind: str, **attributes: Any) -> Any:
         made = parent.create_group(name)
@@ -140,7 +142,7 @@ def _documents(products: SavedProducts) -> dict[str, dict[str, Any]]:
 
 
 def _write_materials(h5py: Any, group: Any, columns: dict[str, list[Any]]) -> None:
-    """One dataset a column: text, bool or float64, not a number where a value is not known."""
+    """Write one dataset for each column: text, bool, int32 or float64; NaN for unknown values."""
     for name, values in columns.items():
         if name in _TEXT:
             group.create_dataset(name, data=[v or "" for v in values], dtype=h5py.string_dtype())
@@ -159,10 +161,10 @@ _LONGEST_NAME = 63
 
 
 def write_mat(path: Path, products: SavedProducts) -> None:
-    """Write `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, struct `materials` of columns, structs `config`, `versions`.
+    """Write a MATLAB file: `h`, `v`, `p`, `valid` [y, x], `x_m`, `y_m`, structs `materials`, `config`, `versions`.
 
-    Where known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON). `quality_json` and `materials_json` are
-    those files as text: jsondecode reads them.
+    If known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON). `quality_json` and `materials_json` are the
+    files as text, for jsondecode.
     """
     content = {
         "h": products.h,
@@ -189,7 +191,7 @@ def write_mat(path: Path, products: SavedProducts) -> None:
 
 
 def _column(values: list[Any], text: bool) -> Any:
-    """A column of numbers, not a number where one is not known; of text, a cell array."""
+    """Return a column of numbers (NaN if unknown) or of bools, or a cell array of text."""
     if text:
         return np.array([v or "" for v in values], dtype=object)[:, None]
     if values and all(isinstance(v, bool) for v in values):
@@ -198,7 +200,7 @@ def _column(values: list[Any], text: bool) -> Any:
 
 
 def _struct(node: Any) -> Any:
-    """Nested tables as structs; names made into MATLAB's; lists that are not plain numbers as cell arrays."""
+    """Convert nested dicts to structs with MATLAB's names; lists other than of numbers become cell arrays."""
     if isinstance(node, dict):
         return {_name(k): _struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
     if isinstance(node, list | tuple):
@@ -217,22 +219,9 @@ def _name(key: str) -> str:
 
 
 def write_pngs(folder: Path, products: SavedProducts) -> list[Path]:
-    """Amplitude (dB), phase (degrees) of H, V and P, and what is known of the materials, as PNG; returns the files."""
-    context = ReportContext(
-        title=products.scan_id,
-        simulated=products.simulated is not False,
-        x_m=products.x_m,
-        y_m=products.y_m,
-        h=products.h,
-        v=products.v,
-        p=products.p,
-        valid=products.valid,
-        metal_referenced=bool(products.materials),
-        materials=products.segments,
-        verdict=products.verdict,
-    )
+    """Write the figures of the images and materials as PNG; return the files."""
     paths = []
-    for name, data in figures(context).items():
+    for name, data in figures(ReportContext.of_products(products)).items():
         paths.append(folder / f"{name}.png")
         write_atomically(paths[-1], data)
     return paths
@@ -243,35 +232,40 @@ _FOLDER = "export"
 
 
 def export_folder(folder: Path, out: Path | None) -> Path:
-    """The folder that is exported into, made: `out`, or one beside `folder`. Raises ConfigError for a link."""
+    """Create and return the folder for exports: `out`, or one beside `folder`. Raises ConfigError if that is a link."""
     if out is None:
         out = folder.parent / f"{folder.name}-{_FOLDER}"
         if out.is_symlink():
-            raise ConfigError(f"{out} is a link", "files would be replaced elsewhere", "give --out, or remove the link")
+            raise ConfigError(
+                f"{out} is a link", "files elsewhere would be overwritten", "give --out, or remove the link",
+                code=ErrorCode.PATH_OUTSIDE,
+            )  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)
     return out
 
 
 def export(folder: Path, formats: list[str], out: Path | None) -> int:
-    """Write the formats asked for; prints each file when it is there, and on stderr which one is being made.
+    """Write the requested formats; print each format to stderr before, each file to stdout after writing it.
 
     Raises
     ------
     PolysightError
-        when no format was asked for, the products cannot be read, or a package is missing.
+        if no format is requested, the products cannot be read, or a package is missing.
     """
     if not formats:
         raise ConfigError(
             "nothing to export",
-            "no format was named",
-            "add --hdf5, --netcdf, --zarr, --mat, --png, --csv or --cphd, or several of them",
+            "no format was given",
+            "add one or more of --hdf5, --netcdf, --zarr, --mat, --png, --csv, --cphd",
+            code=ErrorCode.KEY_MISSING,
         )
     products = read_products(folder)
     if "csv" in formats and not products.materials:
         raise DataError(
             f"{products.folder}: no materials.json",
-            "only images were made of this scan",
-            "polysight process names them",
+            "this scan has images only",
+            "polysight process finds the materials",
+            code=ErrorCode.FILE_MISSING,
         )
     out = export_folder(products.folder, out)
     for kind in formats:

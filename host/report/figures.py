@@ -1,25 +1,42 @@
-"""All figures of a report, and its images: amplitude and phase of H, V and P, with axes in millimetres.
+"""Figures of a report and of single commands: amplitude and phase of H, V and P, with axes in millimetres.
 
-Amplitude in a perceptually uniform, colour-blind safe map (cividis), phase in a cyclic one (twilight). `maps` and
-`ellipses` draw the patches.
+Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight). `maps` and
+`ellipses` draw the patches. `label_figure` shows the boxes of a label file, `focus_figure` a sweep over depth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
+from polysight.host.materials import Box, axis_mm
+from polysight.host.products import SavedProducts
 from polysight.host.report.context import ReportContext
 from polysight.host.report.ellipses import permittivity_figure
-from polysight.host.report.maps import draw_materials, draw_truth, map_figure, permittivity_map
-from polysight.host.report.style import axis_mm, dress, extent_mm, new_axes, png, shorten_labels, write_label
-from polysight.host.report.tables import MUTED, coverage_figure, masked_positions
+from polysight.host.report.maps import coverage_figure, draw_materials, draw_truth, map_figure, permittivity_map
+from polysight.host.report.style import (
+    INK,
+    MUTED,
+    STAMP,
+    MapLabel,
+    colour_bar,
+    dress,
+    extent_mm,
+    figure_label,
+    fit_labels,
+    new_axes,
+    png,
+    shorten_labels,
+    write_label,
+)
+from polysight.host.report.tables import masked_positions
 
 FIGURES: dict[str, str] = {
     "amplitude_h": "Amplitude H (s-polarised)",
@@ -32,6 +49,8 @@ FIGURES: dict[str, str] = {
 _INSIDE = 0.6  # of a patch's box: what lies further out is its edge
 _PERCENTILES = (5.0, 95.0)
 _LEAST_DEG, _MOST_DEG = 20.0, 300.0
+_METAL, _OTHER = "#ff9e3d", "#ffffff"  # boxes drawn by hand
+_FOCUS_RANGE_DB = 30.0
 Limits = tuple[float, float]
 
 
@@ -45,10 +64,10 @@ def _db(values: npt.NDArray) -> npt.NDArray[np.float64]:
 
 
 def phase_limits_deg(ctx: ReportContext) -> Limits | None:
-    """Range of the phase of P inside the judged patches, degrees; None where the whole circle is needed.
+    """Return the range of the phase of P inside the judged patches, degrees; None if it is nearly the whole circle.
 
-    The metal reference, which has 0 degrees by definition, counts only where there is no other patch.
-    Around the circular mean, so that values on both sides of 180 degrees lie side by side: limits may pass it.
+    The metal reference, 0 degrees by definition, counts only if there is no other patch. The range is taken around the
+    circular mean, so that values on both sides of 180 degrees lie side by side: limits may pass 180.
     """
     x, y = axis_mm(ctx.x_m), axis_mm(ctx.y_m)
     inside: list[npt.NDArray] = []
@@ -78,42 +97,37 @@ def _decibels(ctx: ReportContext) -> str:
 
 
 def draw_channel(ax: Axes, ctx: ReportContext, key: str, phase_deg: Limits | None = None):
-    """Draw one of FIGURES on an axes; returns the image for a colour bar, and the bar's label.
+    """Draw one of FIGURES on an axes; return the image for a colour bar, and the bar's label.
 
-    Phases are drawn from -180 to 180 degrees, or from and to `phase_deg`, which may pass 180.
+    Phases span -180 to 180 degrees, or `phase_deg`, which may pass 180.
     """
     kind, _, channel = key.partition("_")
     data = {"h": ctx.h, "v": ctx.v, "p": ctx.p}[channel]
-    extent = extent_mm(ctx)
+    unit, colours = _decibels(ctx), "cividis"
+    fade = _fade(ctx) if kind == "phase" or channel == "p" else None
     if kind == "phase":
-        angle = np.degrees(np.angle(np.where(np.isfinite(data), data, 1)))
+        unit, colours = "degrees", "cividis" if phase_deg else "twilight"
         low, high = phase_deg or (-180.0, 180.0)
         middle = (low + high) / 2
-        angle = (angle - middle + 180) % 360 - 180 + middle
-        shown = ax.imshow(
-            _shown(ctx, angle), extent=extent, origin="lower", cmap="cividis" if phase_deg else "twilight", vmin=low,
-            vmax=high, alpha=_fade(ctx), interpolation="nearest",
-        )  # fmt: skip
-        return shown, "degrees"
-    level = _db(data)
-    finite = level[np.isfinite(data)] if ctx.valid is None else level[np.isfinite(data) & ctx.valid]
-    if channel == "p":
-        bottom, top = _ratio_range_db(ctx, level)
-        shown = ax.imshow(
-            _shown(ctx, level), extent=extent, origin="lower", cmap="cividis", vmin=bottom, vmax=top,
-            alpha=_fade(ctx), interpolation="nearest",
-        )  # fmt: skip
-        return shown, _decibels(ctx)
-    top = 0.0 if ctx.metal_referenced else float(np.percentile(finite, 99.8)) if finite.size else 0.0
+        values = np.degrees(np.angle(np.where(np.isfinite(data), data, 1)))
+        values = (values - middle + 180) % 360 - 180 + middle
+    elif channel == "p":
+        values = _db(data)
+        low, high = _ratio_range_db(ctx, values)
+    else:
+        values = _db(data)
+        finite = values[np.isfinite(data)] if ctx.valid is None else values[np.isfinite(data) & ctx.valid]
+        high = 0.0 if ctx.metal_referenced else float(np.percentile(finite, 99.8)) if finite.size else 0.0
+        low = high - 35
     shown = ax.imshow(
-        _shown(ctx, level), extent=extent, origin="lower", cmap="cividis", vmin=top - 35, vmax=top,
+        _shown(ctx, values), extent=extent_mm(ctx), origin="lower", cmap=colours, vmin=low, vmax=high, alpha=fade,
         interpolation="nearest",
     )  # fmt: skip
-    return shown, _decibels(ctx)
+    return shown, unit
 
 
 def _ratio_range_db(ctx: ReportContext, level: npt.NDArray) -> tuple[float, float]:
-    """Range of |P| in dB to show: that of the patches' medians where there are some, else of the bright pixels."""
+    """Return the range of |P| to show, dB: that of the patches' medians if there are any, else of the bright pixels."""
     medians = [complex(r["ratio"]["real"], r["ratio"]["imag"]) for r in ctx.materials if r.get("ratio")]
     values = np.array([20 * np.log10(abs(m)) for m in medians if m != 0])
     if values.size == 0:
@@ -124,12 +138,12 @@ def _ratio_range_db(ctx: ReportContext, level: npt.NDArray) -> tuple[float, floa
 
 
 def _fade(ctx: ReportContext) -> npt.NDArray[np.float64]:
-    """Opacity of ratio and phase: where nothing reflects they are noise, and fade into the background."""
+    """Return the opacity of ratio and phase: pixels without signal are noise and fade into the background."""
     return np.clip((_strength_db(ctx) + 26) / 8, 0.0, 1.0)
 
 
 def _strength_db(ctx: ReportContext) -> npt.NDArray[np.float64]:
-    """Level of both channels together, each relative to its own brightest, for fading what holds no signal."""
+    """Return the level of both channels together, dB, each relative to its own brightest."""
     power = np.zeros(ctx.h.shape)
     for channel in (ctx.h, ctx.v):
         p = np.nan_to_num(np.abs(channel).astype(np.float64) ** 2, nan=0.0, posinf=0.0)
@@ -139,18 +153,14 @@ def _strength_db(ctx: ReportContext) -> npt.NDArray[np.float64]:
 
 
 def channel_figure(ctx: ReportContext, key: str) -> bytes:
-    """PNG of one of FIGURES, with axes in mm and a colour bar. The phase of P has the range that the patches have."""
+    """Return a PNG of one of FIGURES with a colour bar. The phase of P spans the range of the patches."""
     fig, ax = new_axes()
     limits = phase_limits_deg(ctx) if key == "phase_p" else None
     shown, unit = draw_channel(ax, ctx, key, limits)
     dress(ax, FIGURES[key], ctx.simulated)
     if key.endswith("_p"):
         _write_ratios(ax, ctx, key)
-    bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.03, extend="both" if limits else "neither")
-    bar.set_label(unit, fontsize=8, color=MUTED)
-    bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
-    if bar.solids is not None:
-        bar.solids.set_alpha(1)
+    bar = colour_bar(fig, ax, shown, unit, "both" if limits else "neither")
     if unit == "degrees" and limits is None:
         bar.set_ticks([-180, -90, 0, 90, 180])
     elif limits is not None:  # beyond 180 the circle begins again
@@ -160,7 +170,7 @@ def channel_figure(ctx: ReportContext, key: str) -> bytes:
 
 
 def _write_ratios(ax: Axes, ctx: ReportContext, key: str) -> None:
-    """The median of each patch in figures: small differences do not show as colours."""
+    """Write each patch's median as a number: small differences do not show as colours."""
     for row in ctx.materials:
         ratio = row.get("ratio")
         if ratio:
@@ -171,7 +181,7 @@ def _write_ratios(ax: Axes, ctx: ReportContext, key: str) -> None:
 
 
 def draw_overview(fig: Figure, axes: Sequence[Axes], ctx: ReportContext, bar_labels: bool = False) -> None:
-    """Draw amplitude H, V, P with colour bars on the first three axes, and the materials on a fourth one."""
+    """Draw amplitude H, V, P with colour bars on the first three axes, and the materials on the fourth if given."""
     for ax, key, title in zip(
         axes[:3],
         ("amplitude_h", "amplitude_v", "amplitude_p"),
@@ -180,12 +190,7 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], ctx: ReportContext, bar_lab
     ):
         shown, unit = draw_channel(ax, ctx, key)
         dress(ax, title, ctx.simulated)
-        bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
-        if bar_labels:
-            bar.set_label(unit, fontsize=8, color=MUTED)
-        bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
-        if bar.solids is not None:
-            bar.solids.set_alpha(1)
+        colour_bar(fig, ax, shown, unit if bar_labels else "")
     labels = []
     for ax in axes[3:]:
         labels += draw_materials(ax, ctx, size=6.5)
@@ -193,19 +198,8 @@ def draw_overview(fig: Figure, axes: Sequence[Axes], ctx: ReportContext, bar_lab
     shorten_labels(fig, labels)
 
 
-def banner_png(path: Path, ctx: ReportContext) -> None:
-    """One wide picture: amplitude H, V, P and the material map side by side, written to `path`."""
-    fig = Figure(figsize=(15.0, 3.7), dpi=120, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
-    axes = list(fig.subplots(1, 4))
-    draw_overview(fig, axes, ctx)
-    for ax in axes[1:]:
-        ax.set_ylabel("")
-    path.write_bytes(png(fig))
-
-
 def figures(ctx: ReportContext) -> dict[str, bytes]:
-    """All figures of a report by file name (without suffix)."""
+    """Return all figures of a report as PNG, by file name without suffix."""
     out = {key: channel_figure(ctx, key) for key in FIGURES}
     if ctx.materials:
         out["materials"] = map_figure(ctx, draw_materials, "Materials found" if ctx.judged else "Patches found")
@@ -217,3 +211,75 @@ def figures(ctx: ReportContext) -> dict[str, bytes]:
     if ctx.truth:
         out["truth"] = map_figure(ctx, draw_truth, "Truth")
     return out
+
+
+def label_figure(products: SavedProducts, boxes_mm: Mapping[str, Box], metal: str | None) -> bytes:
+    """Return a PNG of |H| with boxes and their names; the metal reference has another colour.
+
+    Parameters
+    ----------
+    products
+        The processed scan.
+    boxes_mm
+        Name to (x0, y0, x1, y1), millimetres from the image centre.
+    metal
+        Name of the metal reference; None without one.
+    """
+    context = ReportContext.of_products(products)
+    fig, ax = new_axes(5.4, 4.8)
+    shown, unit = draw_channel(ax, context, "amplitude_h")
+    labels = []
+    for number, (name, (x0, y0, x1, y1)) in enumerate(boxes_mm.items(), 1):
+        colour = _METAL if name == metal else _OTHER
+        for edge, width in (("#10141b", 3.0), (colour, 1.5)):
+            ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor=edge, linewidth=width))
+        text, below = figure_label(name, f"box {number}"), "metal" if name == metal else ""
+        written = f"{text}\n{below}" if below else text
+        middle = write_label(ax, (x0 + x1) / 2, (y0 + y1) / 2, written, 8.5, on_dark=True)
+        labels.append(MapLabel(middle, str(number), text, colour, below))
+    dress(ax, "Amplitude H, and the boxes", context.simulated)
+    colour_bar(fig, ax, shown, unit)
+    fit_labels(fig, labels, 4.9)
+    return png(fig)
+
+
+def focus_figure(
+    sweep: dict[str, Any],
+    before: npt.NDArray[np.complexfloating],
+    after: npt.NDArray[np.complexfloating],
+    x_m: npt.NDArray[np.float64],
+    y_m: npt.NDArray[np.float64],
+    simulated: bool,
+) -> bytes:
+    """Return a PNG of a sweep over depth, and of H before and after focusing.
+
+    `sweep` has the keys `depths_mm`, `sharpness`, `depth_mm`, `tilt_deg` and `certain`.
+    """
+    fig = Figure(figsize=(13.0, 4.2), dpi=140, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    curve, *pictures = fig.subplots(1, 3, width_ratios=[1.1, 1, 1])
+    curve.plot(sweep["depths_mm"], sweep["sharpness"], "o-", color="#44AA99", markersize=4)
+    curve.axvline(0, color=MUTED, linewidth=1, linestyle=":", label="rig file")
+    curve.axvline(sweep["depth_mm"], color="#882255", linewidth=1.4, label=f"found: {sweep['depth_mm']:+.2f} mm")
+    curve.set_xlabel("plane, relative to the rig file (mm)", fontsize=9, color=MUTED)
+    curve.set_ylabel("sharpness of the untilted plane", fontsize=9, color=MUTED)
+    tilt = sweep["tilt_deg"]
+    title = f"Tilt found: {tilt[0]:+.2f}° in x, {tilt[1]:+.2f}° in y" if sweep["certain"] else "No clear maximum"
+    curve.set_title(title, loc="left", fontsize=10, color=INK)
+    curve.legend(fontsize=8, frameon=False)
+    top = max(float(np.abs(before).max()), float(np.abs(after).max()), 1e-30)
+    x, y = axis_mm(x_m), axis_mm(y_m)
+    for ax, image, title in zip(
+        pictures, (before, after), ("H on the rig file's plane", "H on the found plane"), strict=True
+    ):
+        level = 20 * np.log10(np.maximum(np.abs(image) / top, 1e-6))
+        shown = ax.pcolormesh(
+            x, y, level, cmap="cividis", vmin=-_FOCUS_RANGE_DB, vmax=0, shading="nearest", rasterized=True
+        )
+        ax.set_title(title, loc="left", fontsize=10, color=INK)
+        ax.set_aspect("equal")
+        ax.set_xlabel("x (mm)", fontsize=9, color=MUTED)
+        colour_bar(fig, ax, shown, "dB")
+    if simulated:
+        fig.suptitle("SIMULATED", fontsize=9, color=STAMP, fontweight="bold", x=0.99, ha="right")
+    return png(fig)

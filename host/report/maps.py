@@ -1,4 +1,4 @@
-"""Maps of patches: what they were named, what lies there in truth, and their permittivity with its error."""
+"""Maps: names of the patches, the true plates, permittivities with their errors, and masked stage positions."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
@@ -20,32 +21,34 @@ from polysight.host.products import permittivity_spread
 from polysight.host.report.context import ReportContext
 from polysight.host.report.style import (
     HATCH,
+    INK,
     METAL_COLOUR,
+    MUTED,
     REFUSED_COLOUR,
     UNKNOWN_COLOUR,
     MapLabel,
+    colour_bar,
     colours_of,
     dress,
     extent_mm,
-    name_legend,
+    fit_labels,
     new_axes,
     outline_of,
     patch_colour,
     patch_label,
     plate_label,
     png,
-    shorten_labels,
     write_label,
 )
-from polysight.host.report.tables import INK, MUTED
 
-_ROOM = 0.09  # of a map's height: what a label of two lines needs
+_ROOM = 0.09  # of a map's height, for a label of two lines
+_POSITION_COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: readable without colour
 
 
 def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapLabel]:
-    """Material map: the majority's colour over each patch, each interior pixel in the colour of its own name.
+    """Draw the material map: each patch in the colour of its name, each interior pixel in that of its own name.
 
-    Patches that were not judged are hatched grey. Returns the labels.
+    Patches that were not judged are hatched grey. Return the labels.
     """
     colours = colours_of(ctx)
     rgb = np.ones((*ctx.h.shape, 3)) * np.array(to_rgb("#f3f5f8"))
@@ -75,14 +78,14 @@ def draw_materials(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapL
 
 
 def _keep_inside(ax: Axes, text: Text, top_mm: float) -> None:
-    """Put a label below the upper edge of its patch where there is no room above: it would reach into the title."""
+    """Put a label below the upper edge of its patch if it would reach into the title."""
     bottom, top = ax.get_ylim()
     if top_mm > top - _ROOM * (top - bottom):
         text.set(y=min(top_mm, top) - 1.0, verticalalignment="top")
 
 
 def _crop(ax: Axes, ctx: ReportContext) -> None:
-    """Limits around what lies on the plane, the same for the map and the truth, square, inside the image."""
+    """Set limits around patches and plates: square, inside the image, the same for map and truth."""
     boxes = [r["box_mm"] for r in ctx.materials] + [t["box_mm"] for t in ctx.truth or []]
     left, right, bottom, top = extent_mm(ctx)
     if boxes:
@@ -101,7 +104,7 @@ def _crop(ax: Axes, ctx: ReportContext) -> None:
 
 
 def draw_truth(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapLabel]:
-    """The plates as they really lie. Returns the labels."""
+    """Draw the true plates. Return the labels."""
     colours = colours_of(ctx)
     _crop(ax, ctx)
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
@@ -121,27 +124,24 @@ def draw_truth(ax: Axes, ctx: ReportContext, size: float = 7.5) -> list[MapLabel
 
 
 def map_figure(ctx: ReportContext, draw: Callable[[Axes, ReportContext], list[MapLabel]], title: str) -> bytes:
-    """PNG of a material map or of the truth. Where names lack room all become numbers, with a legend below."""
+    """Return a PNG of a material map or of the truth. If names lack room all become numbers, with a legend below."""
     fig, ax = new_axes(4.6, 4.6)
     labels = draw(ax, ctx)
     dress(ax, title, ctx.simulated)
     ax.set_facecolor("#f3f5f8")
-    replaced = shorten_labels(fig, labels)
-    if replaced:
-        fig.set_figheight(4.7 + 0.17 * ((len(replaced) + 1) // 2))
-        name_legend(fig, replaced)
+    fit_labels(fig, labels, 4.7)
     return png(fig)
 
 
 def relative_error(permittivity: Mapping[str, Any]) -> float | None:
-    """Standard error of a complex permittivity relative to its size; None where it is not known."""
+    """Return the standard error of a permittivity relative to its size; None if it is not known."""
     spread = permittivity_spread(permittivity)
     size = math.hypot(permittivity["real"], permittivity["imag"])
     return None if spread is None or size == 0 else math.hypot(spread.real_std, spread.loss_std) / size
 
 
 def permittivity_map(ctx: ReportContext) -> bytes | None:
-    """PNG of the patches filled by eps' with its standard error, and of the relative error; None without any error."""
+    """Return a PNG of eps' with its standard error in each patch, and of the relative error; None without errors."""
     known = {r["label"]: e for r in ctx.materials if (e := r.get("permittivity")) and permittivity_spread(e)}
     if not known:
         return None
@@ -149,13 +149,14 @@ def permittivity_map(ctx: ReportContext) -> bytes | None:
     FigureCanvasAgg(fig)
     real = {label: e["real"] for label, e in known.items()}
     errors = {label: 100 * (relative_error(e) or 0.0) for label, e in known.items()}
-    middle = {label: f"{e['real']:.2f}\n± {_std(e):.2f}" for label, e in known.items()}
+    stds = {label: spread.real_std for label, e in known.items() if (spread := permittivity_spread(e))}
+    middle = {label: f"{e['real']:.2f}\n± {stds[label]:.2f}" for label, e in known.items()}
     percent = {label: f"{v:.0f} %" if v >= 10 else f"{v:.1f} %" for label, v in errors.items()}
     low, high = min(real.values()), max(real.values())
     margin = max(0.1 * (high - low), 0.25)
     left, right = fig.subplots(1, 2)
-    _fill_patches(left, ctx, real, middle, ("viridis", low - margin, high + margin, "real part ε′"))
-    _fill_patches(right, ctx, errors, percent, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|"))
+    _fill_patches(fig, left, ctx, real, middle, ("viridis", low - margin, high + margin, "real part ε′"))
+    _fill_patches(fig, right, ctx, errors, percent, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|"))
     dress(left, "Permittivity ε′ ± standard error", simulated=False)
     dress(right, "Relative error of ε", ctx.simulated)
     for ax in (left, right):
@@ -164,19 +165,15 @@ def permittivity_map(ctx: ReportContext) -> bytes | None:
     return png(fig)
 
 
-def _std(permittivity: Mapping[str, Any]) -> float:
-    spread = permittivity_spread(permittivity)
-    return math.nan if spread is None else spread.real_std
-
-
 def _fill_patches(
+    fig: Figure,
     ax: Axes,
     ctx: ReportContext,
     values: dict[int, float],
     texts: dict[int, str],
     scale: tuple[str, float, float, str],
 ) -> None:
-    """Patches in the colours of their values; those without one are grey, and hatched where they were not judged.
+    """Fill patches in the colours of their values; others are grey, hatched if they were not judged.
 
     `scale` is the colour map, the values at its ends, and the colour bar's label.
     """
@@ -198,6 +195,26 @@ def _fill_patches(
         )  # fmt: skip
     _crop(ax, ctx)
     ax.set_aspect("equal")
-    bar = ax.figure.colorbar(colours, ax=ax, fraction=0.046, pad=0.03)
-    bar.set_label(scale[3], fontsize=8, color=MUTED)
-    bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
+    colour_bar(fig, ax, colours, scale[3])
+
+
+def coverage_figure(ctx: ReportContext, masks: dict[str, npt.NDArray[np.bool_]]) -> Figure:
+    """Return a map of masked stage positions for each board, millimetres from the middle of the grid.
+
+    `masks` as of :func:`polysight.host.report.tables.masked_positions`; the context must hold the plan.
+    """
+    plan = ctx.plan
+    if plan is None:
+        raise ValueError("a map of positions needs the plan")
+    width, height = plan.columns * plan.step_x_mm, plan.rows * plan.step_y_mm
+    extent = (-width / 2, width / 2, -height / 2, height / 2)
+    size = (9.0, 0.9 + 4.2 * min(1.2, max(0.3, height / width)))
+    fig = Figure(figsize=size, dpi=130, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    for ax, (name, mask) in zip(fig.subplots(1, len(masks), squeeze=False)[0], masks.items(), strict=True):
+        colours = ListedColormap(_POSITION_COLOURS)
+        ax.imshow(mask, origin="lower", extent=extent, cmap=colours, vmin=0, vmax=1, interpolation="nearest")
+        dress(ax, f"{name}: {mask.mean():.2%} masked", ctx.simulated)
+        ax.set_xlabel("stage offset x (mm)", fontsize=9, color=MUTED)
+        ax.set_ylabel("stage offset y (mm)", fontsize=9, color=MUTED)
+    return fig

@@ -1,4 +1,4 @@
-"""`report.html`: one self-contained page, images inline, and the same figures as files."""
+"""Write `report.html`, one self-contained page with inline images, and the same figures as files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DASH = "–"
 def write_report(out_dir: Path, ctx: ReportContext) -> Path:
     """Write `report.html` and `figures/*.png` into a folder.
 
-    Patches, verdict and error budget are those of the folder's materials.json where it is there already.
+    Patches, verdict and error budget are those of the folder's materials.json, if it exists.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def write_report(out_dir: Path, ctx: ReportContext) -> Path:
 
 
 def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
-    """The page as text, with the given PNG figures inline."""
+    """Return the page as text, with the given PNG figures inline."""
     environment = Environment(
         loader=PackageLoader("polysight.host.report", "."),
         autoescape=select_autoescape(["html"]),
@@ -88,13 +88,13 @@ def render(ctx: ReportContext, pictures: dict[str, bytes]) -> str:
 
 
 def _code(words: str) -> Markup:
-    """Text with `commands` in it, for the page."""
+    """Escape text and mark `commands` in it as code."""
     parts = [escape(part) for part in words.split("`")]
     return Markup("").join(Markup("<code>{}</code>").format(part) if i % 2 else part for i, part in enumerate(parts))
 
 
 def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """What would shrink the errors: each measurement once, with the patches that it would help."""
+    """Return the measurements that would shrink the errors, each with the patches that it helps."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         if row["do"]:
@@ -103,7 +103,7 @@ def _remedies(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
 
 
 def _replaced_names(ctx: ReportContext) -> list[str]:
-    """`patch 1: ?? is NAME` for each name that the figures' fonts do not have."""
+    """Return `patch 1: ?? is NAME` for each name that the figures' fonts cannot draw."""
     pairs = [(patch_label(r), str(r["name"])) for r in ctx.materials if r.get("name")]
     pairs += [(plate_label(t, k), str(t["name"])) for k, t in enumerate(ctx.truth or [], 1)]
     return [f"{label} is {name}" for label, name in pairs if label != name]
@@ -115,12 +115,12 @@ def _lead(ctx: ReportContext) -> str:
     what = "simulated scan" if ctx.simulated else "scan"
     return (
         f"Co- and cross-polarised images of a {what}, {nx} × {ny} pixels of {pixel:g} mm: "
-        "what reflects where, what it is made of, and how good the data were."
+        "reflectivity, materials and quality of the data."
     )
 
 
 def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
-    """One line of the materials table, formatted."""
+    """Format one line of the materials table."""
     truth = r.get("truth") or None
     e = r.get("permittivity")
     true_eps = truth["permittivity"] if truth else None
@@ -165,7 +165,7 @@ def _row(r: dict[str, Any], colours: dict[str, str]) -> dict[str, Any]:
 
 
 def _estimate(e: dict[str, Any]) -> dict[str, str]:
-    """A segment's permittivity with its errors and where they come from, formatted."""
+    """Format a segment's permittivity with its errors and their main source."""
     out = {"real": f"{e['real']:.2f}", "loss": f"{-e['imag']:.2f}"}
     spread = permittivity_spread(e)
     if spread is not None:

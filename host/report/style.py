@@ -1,31 +1,39 @@
-"""What all figures share: colours of materials, axes in millimetres, titles, labels, PNG bytes.
+"""Style of all figures: colours, fonts, axes in millimetres, titles, colour bars, labels, legends, PNG bytes.
 
-Materials have the colour-blind safe palette of Paul Tol ("muted", then "light"). Matplotlib's object interface only: no
-global state, no display.
+Materials have the colour-blind safe palette of Paul Tol ("muted", then "light"). Only matplotlib's object interface is
+used: no global state, no display. Its own font has no Chinese, Japanese or Korean: other installed fonts are tried, and
+a name that no font can draw becomes a short ASCII label. The page itself shows all names in full, by the browser's
+fonts.
 """
 
 from __future__ import annotations
 
 import io
+import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont, fontManager, get_font
+from matplotlib.legend import Legend
 from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox, BboxBase
 
+from polysight.host.materials import axis_mm
 from polysight.host.report.context import ReportContext
-from polysight.host.report.fonts import figure_label, font_families
-from polysight.host.report.tables import INK, MUTED, STAMP
 
+INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
+"""Colours of a figure's text: titles, axes, and the word SIMULATED."""
 PALETTE = (
     "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",
     "#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#99DDFF", "#44BB99", "#BBCC33", "#AAAA00",
@@ -37,8 +45,52 @@ _GAP_PT = 8.0  # between names side by side
 _LONGEST = 26  # characters of a name in a legend
 
 
+OWN = "DejaVu Sans"
+"""The font that comes with matplotlib."""
+FALLBACKS = (
+    "Noto Sans CJK JP", "Noto Sans CJK SC", "Noto Sans CJK TC", "Noto Sans CJK KR", "Noto Sans JP", "Noto Sans SC",
+    "Source Han Sans", "Source Han Sans JP", "Source Han Sans SC", "Source Han Sans CN", "WenQuanYi Zen Hei",
+    "WenQuanYi Micro Hei", "IPAexGothic", "IPAGothic", "TakaoGothic", "VL Gothic", "Hiragino Sans", "PingFang SC",
+    "PingFang HK", "Heiti TC", "Apple SD Gothic Neo", "Yu Gothic", "Meiryo", "MS Gothic", "Microsoft YaHei", "SimHei",
+    "Microsoft JhengHei", "Malgun Gothic", "NanumGothic", "Arial Unicode MS", "Droid Sans Fallback", "Noto Sans",
+)  # fmt: skip
+"""Families with CJK glyphs, in the order in which they are tried."""
+
+
+@cache
+def font_families() -> tuple[str, ...]:
+    """Return the fonts for texts that hold names: matplotlib's own, then the installed ones of FALLBACKS."""
+    installed = {entry.name for entry in fontManager.ttflist}
+    return (OWN, *(family for family in FALLBACKS if family in installed))
+
+
+@cache
+def _glyphs() -> frozenset[int]:
+    return frozenset(code for family in font_families() for code in get_font(findfont(family)).get_charmap())
+
+
+def is_drawable(text: str) -> bool:
+    """True if the installed fonts have every glyph of a text and it runs from left to right.
+
+    Matplotlib neither turns right-to-left text nor joins its letters: Hebrew would be read backwards.
+    """
+    if any(unicodedata.bidirectional(character) in ("R", "AL") for character in text):
+        return False
+    return all(character == "\n" or ord(character) in _glyphs() for character in text)
+
+
+def figure_label(name: str, number: str) -> str:
+    """Return a material's or plate's name if the fonts can draw it, else e.g. `patch 3: ??`.
+
+    `number` identifies the patch or plate without its name, such as `patch 3`; missing glyphs become `?`.
+    """
+    if is_drawable(name):
+        return name
+    return f"{number}: {''.join(c if c.isascii() and c.isprintable() else '?' for c in name)}"
+
+
 def colours_of(ctx: ReportContext) -> dict[str, str]:
-    """Colour of each material that occurs in the results or the truth; the same name has one colour in all figures."""
+    """Return the colour of each material in the results or the truth, the same in all figures."""
     names = {str(r["name"]) for r in ctx.materials if r.get("name")}
     names |= {str(t["name"]) for t in ctx.truth or []}
     for pixels, _ in ctx.pixel_names.values():
@@ -48,20 +100,15 @@ def colours_of(ctx: ReportContext) -> dict[str, str]:
     return {**table, "unknown": UNKNOWN_COLOUR}
 
 
-def axis_mm(axis_m: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Millimetres from the middle of an image axis."""
-    return (axis_m - (axis_m[0] + axis_m[-1]) / 2) * 1e3
-
-
 def extent_mm(ctx: ReportContext) -> tuple[float, float, float, float]:
-    """Left, right, bottom, top edge of the image in millimetres from its centre."""
+    """Return the left, right, bottom, top edge of the image, millimetres from its centre."""
     x, y = axis_mm(ctx.x_m), axis_mm(ctx.y_m)
     hx, hy = (x[1] - x[0]) / 2, (y[1] - y[0]) / 2
     return float(x[0] - hx), float(x[-1] + hx), float(y[0] - hy), float(y[-1] + hy)
 
 
 def new_axes(width: float = 5.0, height: float = 4.6) -> tuple[Figure, Axes]:
-    """A white figure of this size in inches, and its only axes."""
+    """Return a white figure of this size in inches, and its only axes."""
     fig = Figure(figsize=(width, height), dpi=160, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
     ax = fig.add_subplot()
@@ -69,7 +116,7 @@ def new_axes(width: float = 5.0, height: float = 4.6) -> tuple[Figure, Axes]:
 
 
 def dress(ax: Axes, title: str, simulated: bool) -> None:
-    """Title, axes in millimetres, quiet ticks; the word SIMULATED where it is."""
+    """Draw the title, axis labels in millimetres, grey ticks, and the word SIMULATED for simulated data."""
     ax.set_title(title, loc="left", fontsize=11, color=INK, fontweight="bold")
     if simulated:
         ax.text(
@@ -85,10 +132,20 @@ def dress(ax: Axes, title: str, simulated: bool) -> None:
         spine.set_color("#c3c9d1")
 
 
+def colour_bar(fig: Figure, ax: Axes, shown: ScalarMappable, label: str = "", extend: str = "neither") -> Colorbar:
+    """Draw a colour bar beside an axes; it is opaque even if the image fades."""
+    bar = fig.colorbar(shown, ax=ax, fraction=0.046, pad=0.03, extend=extend)
+    bar.set_label(label, fontsize=8, color=MUTED)
+    bar.ax.tick_params(labelsize=8, colors=MUTED, length=2)
+    if bar.solids is not None:
+        bar.solids.set_alpha(1)
+    return bar
+
+
 def write_label(
     ax: Axes, x: float, y: float, text: str, size: float = 8.0, above: bool = False, on_dark: bool = False
 ) -> Text:
-    """Write a name or number with a halo; `above` puts it on top of the point."""
+    """Write a name or number with a halo, centred on a point or `above` it."""
     ink, halo = ("white", "#10141b") if on_dark else (INK, "white")
     return ax.text(
         x, y, text, ha="center", va="bottom" if above else "center", fontsize=size, color=ink, linespacing=1.2,
@@ -97,7 +154,7 @@ def write_label(
 
 
 def patch_label(row: dict[str, Any]) -> str:
-    """What figures write beside a patch."""
+    """Return the text beside a patch in figures."""
     number = f"patch {row['label']}"
     if not row.get("name"):
         return "metal reference" if row.get("metal_reference") else number
@@ -105,13 +162,13 @@ def patch_label(row: dict[str, Any]) -> str:
 
 
 def short_label(text: str) -> str:
-    """A name as legends have it: cut to a line's length."""
+    """Return a name cut to the length of a legend's line."""
     text = " ".join(text.split())
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 def patch_colour(row: dict[str, Any], colours: dict[str, str]) -> str:
-    """Colour of a patch: of its name, or of what it is instead."""
+    """Return a patch's colour: that of its name, of refused patches, or of the metal reference."""
     if row.get("refused"):
         return REFUSED_COLOUR
     if not row.get("name") and row.get("metal_reference"):
@@ -120,12 +177,12 @@ def patch_colour(row: dict[str, Any], colours: dict[str, str]) -> str:
 
 
 def plate_label(plate: dict[str, Any], number: int) -> str:
-    """What the truth's figure writes beside a plate; `number` counts plates from 1."""
+    """Return the text beside a plate in the figure of the truth; `number` counts plates from 1."""
     return figure_label(str(plate["name"]), f"plate {number}")
 
 
 def outline_of(row: dict[str, Any], **style: Any) -> Polygon | Rectangle:
-    """A patch's outline, or its box where there is none; `style` as matplotlib's patches take it."""
+    """Return a patch's outline, or its box if it has none; `style` are options of matplotlib's patches."""
     if row.get("outline_mm"):
         return Polygon(row["outline_mm"], closed=True, **style)
     x0, y0, x1, y1 = row["box_mm"]
@@ -134,16 +191,16 @@ def outline_of(row: dict[str, Any], **style: Any) -> Polygon | Rectangle:
 
 @dataclass(frozen=True)
 class MapLabel:
-    """A name on a map, and what stands for it where there is no room.
+    """A name drawn on a map, and its replacement if there is no room for it.
 
     Attributes
     ----------
     text
-        As drawn.
+        The drawn text.
     number, name, colour
-        Its number on the map, and its line in the legend.
+        The number that replaces the name on the map, and the entry in the legend.
     below
-        Second line that stays, such as the confidence; may be empty.
+        Second line that is kept, such as the confidence; may be empty.
     """
 
     text: Text
@@ -154,7 +211,7 @@ class MapLabel:
 
 
 def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
-    """Replace all labels by their numbers if two touch or one leaves the frame; returns those that were replaced."""
+    """Replace all labels by numbers if two touch or one leaves the frame; return the replaced labels."""
     if not labels:
         return []
     fig.draw_without_rendering()
@@ -173,22 +230,28 @@ def _widened(box: BboxBase, gap: float) -> Bbox:
     return Bbox.from_extents(box.x0 - gap / 2, box.y0, box.x1 + gap / 2, box.y1)
 
 
-def name_legend(fig: Figure, labels: Sequence[MapLabel]) -> None:
-    """A legend below the axes: number and name of each label."""
-    if labels:
-        handles = [
-            Patch(facecolor=one.colour, edgecolor=INK, linewidth=0.6, label=f"{one.number}  {short_label(one.name)}")
-            for one in labels
-        ]
-        legend = fig.legend(
-            handles=handles, loc="outside lower left", ncols=2, fontsize=7.5, frameon=False, handlelength=1.1,
-        )  # fmt: skip
-        for text in legend.get_texts():
-            text.set(family=list(font_families()), parse_math=False, color=INK)
+def fit_labels(fig: Figure, labels: Sequence[MapLabel], height: float) -> None:
+    """Replace names by numbers if they lack room, with a legend below the axes; `height` of the figure then, inches."""
+    replaced = shorten_labels(fig, labels)
+    if not replaced:
+        return
+    fig.set_figheight(height + 0.17 * ((len(replaced) + 1) // 2))
+    handles = [
+        Patch(facecolor=one.colour, edgecolor=INK, linewidth=0.6, label=f"{one.number}  {short_label(one.name)}")
+        for one in replaced
+    ]
+    legend = fig.legend(handles=handles, loc="outside lower left", ncols=2, handlelength=1.1, frameon=False)
+    style_legend(legend)
+
+
+def style_legend(legend: Legend) -> None:
+    """Set the fonts of a legend that holds names."""
+    for text in legend.get_texts():
+        text.set(family=list(font_families()), parse_math=False, color=INK, fontsize=7.5)
 
 
 def png(fig: Figure) -> bytes:
-    """A figure as PNG bytes; without a time stamp, so that the same data gives the same file."""
+    """Return a figure as PNG bytes without a time stamp: the same data gives the same file."""
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()

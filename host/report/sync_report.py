@@ -1,11 +1,10 @@
-"""What synchronisation leaves of frequency, phase and amplitude errors, for any scan: `polysight sync-report`.
+"""Residual frequency, phase and amplitude errors after synchronisation, for any scan: `polysight sync-report`.
 
-The paper's Fig. 15 for the scan at hand: histograms after each of four stages, the Cramer-Rao bounds beside them.
+It is the paper's Fig. 15 for one scan: histograms after each of four stages, with the Cramer-Rao bounds.
 """
 
 from __future__ import annotations
 
-import io
 import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from polysight.host.products import write_atomically, write_json
-from polysight.host.report.tables import INK, MUTED, STAMP
+from polysight.host.report.style import INK, MUTED, STAMP, png
 from polysight.host.sync import STAGES, SyncedRow
 
 PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
@@ -31,7 +30,7 @@ _REACH = 5.0  # standard deviations shown on either side, of the first row's
 
 @dataclass
 class _Stage:
-    """Running sums of one stage: squares, count, and a histogram over a range fixed by the first row."""
+    """Running sums of one stage: squares, count, and a histogram over the range of the first row."""
 
     reach: NDArray[np.float64]
     squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
@@ -52,7 +51,7 @@ class _Stage:
 
 
 class SyncReport:
-    """Gathers the errors of one board, row by row, in constant memory."""
+    """Accumulates the residual errors of one board, row by row, in constant memory."""
 
     def __init__(self, sample_rate_hz: float, linear: tuple[int, int], rx: int) -> None:
         self._rate, self._samples, self._rx = sample_rate_hz, linear[1] - linear[0], rx
@@ -61,7 +60,7 @@ class SyncReport:
         self._snr: list[tuple[float, int]] = []
 
     def add(self, row: SyncedRow) -> None:
-        """Take in a synchronised row."""
+        """Add a synchronised row."""
         self.positions += int(row.valid.sum())
         self.chirps += int(row.chirps[row.valid].sum())
         for name, values in row.errors.items():
@@ -70,22 +69,22 @@ class SyncReport:
                     reach = _REACH * np.maximum(np.sqrt((values**2).mean(axis=1)), 1e-12)
                     self.stages[name] = _Stage(reach)
                 self.stages[name].add(values)
-        told = row.valid & (row.chirps > 1)
-        if row.noise is not None and told.any():
-            ratio = np.median(row.direct_amplitude[told]) ** 2 / np.median(row.noise[told])
-            self._snr.append((float(ratio), int(told.sum())))
+        several = row.valid & (row.chirps > 1)  # one chirp alone has no noise estimate
+        if row.noise is not None and several.any():
+            ratio = np.median(row.direct_amplitude[several]) ** 2 / np.median(row.noise[several])
+            self._snr.append((float(ratio), int(several.sum())))
 
     @property
     def snr(self) -> float:
-        """Direct path over noise, power, one channel of one chirp; nan when no row told."""
+        """Power ratio of direct path and noise in one channel of one chirp; NaN without an estimate."""
         ratios, positions = np.array(self._snr or [(np.nan, 1)]).T
         return float(np.average(ratios, weights=positions))
 
     def bounds(self) -> dict[str, tuple[float, float, float]]:
-        """Cramer-Rao bounds (Hz, rad, relative amplitude) of one tone as strong as the direct path, after each stage.
+        """Return Cramer-Rao bounds (Hz, rad, relative amplitude) of one tone as strong as the direct path, by stage.
 
         Rife and Boorstyn 1974: var(w) = 6 / (snr N (N^2 - 1)), var(phase at the centre) = 1 / (2 snr N), and the same
-        for relative amplitude; N samples on every RX. A chirp with an echo beside the direct path may lie below.
+        for relative amplitude; N samples on every RX. A chirp with an echo close to the direct path may lie below.
         """
         if not self.chirps or not self._snr:
             return {}
@@ -97,10 +96,11 @@ class SyncReport:
             return float(f), float(phase), float(phase)
 
         one, mean = tone(self.snr * self._rx), tone(self.snr * self._rx * chirps)
-        return {"aligned": one, "averaged": mean, "referenced": _times(mean, np.sqrt(2))}
+        f, phase, amplitude = (float(np.sqrt(2)) * bound for bound in mean)
+        return {"aligned": one, "averaged": mean, "referenced": (f, phase, amplitude)}
 
     def summary(self) -> dict[str, Any]:
-        """Plain numbers for sync.json."""
+        """Return the content of sync.json."""
         bounds = self.bounds()
         return {
             "positions": self.positions,
@@ -117,13 +117,8 @@ class SyncReport:
         }
 
 
-def _times(values: tuple[float, float, float], factor: float) -> tuple[float, float, float]:
-    f, p, a = values
-    return f * factor, p * factor, a * factor
-
-
 def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
-    """Histograms of the errors after each stage, the bounds' normal distributions over them, the paper's figures."""
+    """Return a PNG: histograms of errors after each stage, the bounds as normal distributions, the paper's values."""
     fig = Figure(figsize=(11, 9), dpi=110, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
     fig.suptitle(title + ("   SIMULATED" if simulated else ""), color=STAMP if simulated else INK, fontsize=12)
@@ -156,13 +151,11 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
                 ax.plot([], [], color=INK, lw=0.8, ls=":", label=f"paper ±{PAPER[QUANTITIES[i]]:g}")
                 ax.set_xlim(-1.1 * max(reach, PAPER[QUANTITIES[i]]), 1.1 * max(reach, PAPER[QUANTITIES[i]]))
             ax.legend(fontsize=7, loc="upper right", frameon=False)
-    out = io.BytesIO()
-    fig.savefig(out, format="png")
-    return out.getvalue()
+    return png(fig)
 
 
 def text_of(boards: dict[str, dict[str, Any]], simulated: bool) -> str:
-    """The report in words, for people."""
+    """Return the report as text."""
     lines = ["Synchronisation residuals (standard deviations)" + (", simulated data" if simulated else ""), ""]
     for board, s in boards.items():
         snr = "" if s["direct_snr_db"] is None else f", direct path {s['direct_snr_db']} dB over noise a channel"
@@ -179,7 +172,7 @@ def text_of(boards: dict[str, dict[str, Any]], simulated: bool) -> str:
 
 
 def write_sync_report(out: Path, reports: dict[str, SyncReport], scan: str, simulated: bool) -> str:
-    """Write sync.json, sync.txt and sync-BOARD.png into a folder; returns the text."""
+    """Write sync.json, sync.txt and sync-BOARD.png into a folder; return the text."""
     boards = {name: report.summary() for name, report in reports.items()}
     write_json(out / "sync.json", {"scan": scan, "simulated": simulated, "paper": PAPER, "boards": boards})
     for name, report in reports.items():

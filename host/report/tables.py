@@ -1,7 +1,6 @@
-"""Numbers of a report, from the content of quality.json: headline figures, quality tables, and the map of positions.
+"""Numbers of a report from the content of quality.json and materials.json: headline figures and tables.
 
-Tables are plain dicts (caption, head, rows) for the page's template. The map shows which stage positions of each board
-are masked.
+Tables are plain dicts (caption, head, rows) for the page's template.
 """
 
 from __future__ import annotations
@@ -11,17 +10,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
 
 from polysight.host.report.context import ReportContext
 from polysight.shared.raster import RasterPlan
 
-_COLOURS = ("#dfe5ec", "#882255")  # with data light, masked dark: told apart without colour
-INK, MUTED, STAMP = "#1b2330", "#5b6675", "#b3261e"
-"""Colours of a figure's text: titles, axes, and the word SIMULATED."""
-_ROWS: tuple[tuple[str, str], ...] = (
+_IMAGING_ROWS: tuple[tuple[str, str], ...] = (
     ("masked_positions", "Positions masked"),
     ("rows_without_data", "Rows without any data"),
     ("loss_db", "Loss of a point's sum by masked positions (dB)"),
@@ -37,7 +30,7 @@ UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm"
 
 
 def masked_positions(ctx: ReportContext) -> dict[str, npt.NDArray[np.bool_]]:
-    """Board to bool [row, column]: masked, or never recorded. Empty where the plan or the boards are not known."""
+    """Return for each board bool [row, column]: masked or never recorded. Empty if plan or boards are not known."""
     boards = ctx.quality.get("boards")
     if ctx.plan is None or not isinstance(boards, dict):
         return {}
@@ -55,17 +48,17 @@ def _mask(board: dict[str, Any], plan: RasterPlan) -> npt.NDArray[np.bool_]:
 
 
 def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
-    """How many positions of each board are masked; "" where that is not known."""
+    """Say how many positions of each board are masked; "" if that is not known."""
     if not masks:
         return ""
     if not any(m.any() for m in masks.values()):
         return "Every position of every board has data."
-    told = [f"{name} {int(m.sum())} of {m.size} ({m.mean():.2%})" for name, m in masks.items()]
-    return f"Positions without data, left out of the images: {', '.join(told)}."
+    counts = [f"{name} {int(m.sum())} of {m.size} ({m.mean():.2%})" for name, m in masks.items()]
+    return f"Positions without data, left out of the images: {', '.join(counts)}."
 
 
 def recorded_sentence(coverage: Mapping[str, Any]) -> str:
-    """Rows and frames of quality.json's `coverage` against the plan, for the terminal."""
+    """Compare recorded rows and frames with the plan, from `coverage` of quality.json."""
     planned, absent = coverage["positions_planned"], coverage["positions_absent"]
     out = f"rows: {coverage['rows_recorded']} of {coverage['rows_planned']} recorded"
     if absent:
@@ -75,62 +68,32 @@ def recorded_sentence(coverage: Mapping[str, Any]) -> str:
 
 
 def manifest_sentence(coverage: Mapping[str, Any]) -> str:
-    """What is wrong with the manifest; "" when nothing is."""
+    """Describe the faults of the manifest, from `coverage` of quality.json; "" without faults."""
     faults = coverage["manifest"]
-    return f"The manifest is damaged: {'; '.join(faults)}. `polysight validate` says what is lost." if faults else ""
+    return f"The manifest is damaged: {'; '.join(faults)}. `polysight validate` lists the losses." if faults else ""
 
 
 def _share(part: int, whole: int, digits: int) -> str:
-    """A share in percent; 100 % only when nothing is missing."""
+    """Format a share in percent; "100 %" only if nothing is missing."""
     if part >= whole:
         return "100 %"
     return f"{min(100 * part / whole, 100 - 10**-digits):.{digits}f} %"
 
 
-def coverage_figure(ctx: ReportContext, masks: dict[str, npt.NDArray[np.bool_]]) -> Figure:
-    """A map of the stage's offsets for each board; axes in millimetres from the middle of the grid."""
-    plan = ctx.plan
-    if plan is None:
-        raise ValueError("a map of positions needs the plan")
-    width, height = plan.columns * plan.step_x_mm, plan.rows * plan.step_y_mm
-    extent = (-width / 2, width / 2, -height / 2, height / 2)
-    fig = Figure(figsize=(9.0, 0.9 + 4.2 * min(1.2, max(0.3, height / width))), dpi=130, layout="constrained")
-    FigureCanvasAgg(fig)
-    for ax, (name, mask) in zip(fig.subplots(1, len(masks), squeeze=False)[0], masks.items(), strict=True):
-        ax.imshow(
-            mask, origin="lower", extent=extent, cmap=ListedColormap(_COLOURS), vmin=0, vmax=1,
-            interpolation="nearest", aspect="equal",
-        )  # fmt: skip
-        ax.set_title(f"{name}: {mask.mean():.2%} masked", loc="left", fontsize=10, color=INK, fontweight="bold")
-        ax.set_xlabel("stage offset x (mm)", fontsize=9, color=MUTED)
-        ax.set_ylabel("stage offset y (mm)", fontsize=9, color=MUTED)
-        ax.tick_params(labelsize=8, colors=MUTED, length=3)
-        if ctx.simulated:
-            ax.text(
-                1.0, 1.02, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom", fontsize=8, color=STAMP,
-                fontweight="bold",
-            )  # fmt: skip
-    return fig
-
-
 def imaging_table(imaging: Any) -> Table | None:
-    """Table of quality.json's `imaging`, a column for each board; None without it."""
+    """Return the table of `imaging` of quality.json, a column for each board; None without it."""
     boards = {k: v for k, v in imaging.items() if isinstance(v, dict)} if isinstance(imaging, dict) else {}
     if not boards:
         return None
     rows = [
-        _cells(heading, *(_number(board.get(key), _between(key)) for board in boards.values()))
-        for key, heading in _ROWS
+        _cells(heading, *(_number(board.get(key), " × " if key.endswith("_mm") else ", ") for board in boards.values()))
+        for key, heading in _IMAGING_ROWS
         if any(key in board for board in boards.values())
     ]
     caption = "Imaging. The point response is computed for the middle of the image, with taper and mask as they are."
     for notice in imaging.get("notices", ()):
         caption += f" {notice}."
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
-
-
-def _between(key: str) -> str:
-    return " × " if key.endswith("_mm") else ", "
 
 
 def _number(value: Any, between: str = " × ") -> str:
@@ -142,7 +105,7 @@ def _number(value: Any, between: str = " × ") -> str:
 
 
 def text(value: Any) -> str:
-    """A value as a person reads it: thousands grouped, few digits, yes and no, lists with commas."""
+    """Format a value for reading: grouped thousands, few digits, yes and no, lists with commas."""
     if value is None:
         return "–"
     if isinstance(value, bool | np.bool_):
@@ -162,7 +125,7 @@ def text(value: Any) -> str:
 
 
 def pretty(key: str) -> str:
-    """A key as a heading: `RH if_hz` becomes `RH IF (Hz)`."""
+    """Format a key as a heading: `RH if_hz` becomes `RH IF (Hz)`."""
     words = key.replace("_", " ").split()
     unit = UNITS.get(words[-1]) if len(words) > 1 else None
     if unit:
@@ -172,35 +135,36 @@ def pretty(key: str) -> str:
 
 
 def key_numbers(ctx: ReportContext, rows: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """The headline figures: what a reader wants to know first."""
+    """Return the headline figures: value and text."""
     out: list[dict[str, str]] = []
 
     def add(value: str, what: str) -> None:
         out.append({"value": value, "text": what})
 
-    if ctx.truth and any(m.get("name") for m in ctx.materials):  # of what nobody named nothing is wrong
+    if ctx.truth and any(m.get("name") for m in ctx.materials):
         right = sum(r["right"] for r in rows)
         strange = sum(r["strange"] for r in rows)
-        aside = f", {strange} told apart as not in the library" if strange else ""
+        aside = f", {strange} recognised as not in the library" if strange else ""
         add(f"{right} of {len(ctx.truth) - strange}", f"plates named right{aside}")
     elif rows:
         add(str(len(rows)), "patches found")
     if ctx.pixel_accuracy is not None:
-        add(f"{100 * ctx.pixel_accuracy:.1f} %", "of interior pixels named right")
+        expected = ctx.expected_accuracy
+        aside = "" if expected is None else f"; their own confidence expects {100 * expected:.1f} %"
+        add(f"{100 * ctx.pixel_accuracy:.1f} %", f"of interior pixels named right{aside}")
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")
     for value, what in _received(ctx.quality):
         add(value, what)
-    seconds = _stage_seconds(ctx.quality)
-    if isinstance(seconds, dict) and seconds:
-        total = sum(float(s) for s in seconds.values() if isinstance(s, int | float))
+    if seconds := ctx.quality.get("seconds_per_stage"):
+        total = sum(map(float, seconds.values()))
         add(f"{total:.1f} s" if total < 100 else f"{total / 60:.1f} min", "of processing, all stages")
     return out
 
 
 def _received(quality: dict[str, Any]) -> list[tuple[str, str]]:
-    """Rows and frames received: of the plan, or of the recorded rows for products of releases that do not tell it."""
+    """Return shares of rows and frames received: of the plan, or of recorded rows in products without `coverage`."""
     coverage, boards = quality.get("coverage"), quality.get("boards")
     if coverage:
         rows, planned = coverage["rows_planned"], coverage["frames_planned"]
@@ -218,20 +182,18 @@ def _received(quality: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def quality_tables(quality: dict[str, Any]) -> list[Table]:
-    """Tables of the known parts of quality.json, then one of whatever else is in it."""
-    known = {"boards", "residuals", "seconds_per_stage", "seconds", "imaging", "verdict", "error_budget"}
+    """Return tables of the known parts of quality.json, then one of all other keys."""
+    known = {"boards", "seconds_per_stage", "imaging", "verdict", "error_budget"}
     boards = quality.get("boards")
-    residuals = quality.get("residuals") or _residuals_of(boards)
     parts = (
         _boards(boards),
-        _residuals(residuals),
+        _residuals(boards),
         imaging_table(quality.get("imaging")),
-        _seconds(_stage_seconds(quality)),
+        _seconds(quality.get("seconds_per_stage")),
     )
     out = [part for part in parts if part]
-    rest = [(k, v) for k, v in quality.items() if k not in known]
-    if rest:
-        flat = _flatten(dict(rest), nested=False)
+    if rest := {k: v for k, v in quality.items() if k not in known}:
+        flat = _flatten(rest, nested=False)
         rows = [_cells(pretty(k), text(v)) for k, v in flat.items()]
         out.append({"caption": "Rows, masked data and other figures.", "head": [], "rows": rows})
     return out
@@ -239,20 +201,20 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
 
 _SOURCES = {
     "measured": "measured (rig file)",
-    "prior and scene": "not measured; its prior, and what the scene shows of it",
+    "prior and scene": "not measured; estimated from its prior and the scene",
     "scene": "estimated from the scene",
 }
 
 
 def budget_table(budget: Mapping[str, Any]) -> Table | None:
-    """What the error budget found: leakage, plane and angle with their errors, evidence for metal; None without it."""
+    """Return the table of the error budget: leakage, plane, angle, evidence for metal; None without any of them."""
     rows = [*_leakage_rows(budget.get("leakage")), *_plane_rows(budget.get("plane"), budget.get("incidence"))]
     metal = budget.get("metal") or {}
     if metal.get("score") is not None:
-        told = f"score {_signed(metal['score'], 1)} from {metal.get('others', 0)} other patches"
+        evidence = f"score {_signed(metal['score'], 1)} from {metal.get('others', 0)} other patches"
         if metal.get("channel_ratio_db") is not None:
-            told += f"; V over H {_signed(metal['channel_ratio_db'], 1)} dB beside the direct path"
-        rows.append(_cells("Evidence that the reference is metal", told))
+            evidence += f"; V over H {_signed(metal['channel_ratio_db'], 1)} dB relative to the direct path"
+        rows.append(_cells("Evidence that the reference is metal", evidence))
     if not rows:
         return None
     caption = "What the errors of the permittivities were computed with. ± is a standard deviation."
@@ -270,8 +232,8 @@ def _leakage_rows(leakage: Mapping[str, Any] | None) -> list[dict[str, Any]]:
             std = (leakage.get("std") or (None, None))[i]
             error = "" if std is None else f" ± {std:.3f}"
             sign = "+" if value[1] >= 0 else "−"
-            told = f"{_signed(value[0], 3)} {sign} {abs(value[1]):.3f}i{error}"
-            rows.append(_cells(f"Leakage of {channel.upper()}, relative to its own channel", told))
+            number = f"{_signed(value[0], 3)} {sign} {abs(value[1]):.3f}i{error}"
+            rows.append(_cells(f"Leakage of {channel.upper()}, relative to its own channel", number))
     return rows
 
 
@@ -281,11 +243,11 @@ def _plane_rows(plane: Mapping[str, Any] | None, incidence: Mapping[str, Any] | 
         std = incidence.get("std_deg")
         rows.append(_cells("Incidence angle", f"{incidence['deg']:.2f}°" + ("" if std is None else f" ± {std:.2f}°")))
     if plane and not plane.get("known"):
-        rows.append(_cells("Plane of the plates", "not found; taken as the rig file says"))
+        rows.append(_cells("Plane of the plates", "not found; that of the rig file is used"))
     elif plane:
         std = plane.get("offset_std_mm")
         offset = f"{_signed(plane.get('offset_mm') or 0.0, 1)} mm" + ("" if std is None else f" ± {std:.1f} mm")
-        rows.append(_cells("Plane of the plates, beside the rig file's", offset))
+        rows.append(_cells("Plane of the plates, relative to the rig file", offset))
         tilt = plane.get("tilt_deg")
         if tilt and None not in tilt:
             rows.append(_cells("Tilt of the plane", f"{_signed(tilt[0], 2)}° in x, {_signed(tilt[1], 2)}° in y"))
@@ -296,7 +258,7 @@ def _plane_rows(plane: Mapping[str, Any] | None, incidence: Mapping[str, Any] | 
 
 
 def _signed(value: float, digits: int) -> str:
-    """A number with its sign, a true minus, and no negative zero."""
+    """Format a number with its sign, a true minus, and no negative zero."""
     return f"{round(float(value), digits) + 0.0:+.{digits}f}".replace("-", "−")
 
 
@@ -304,23 +266,19 @@ def _cells(*cells: str, share: float | None = None) -> dict[str, Any]:
     return {"cells": list(cells), "share": share}
 
 
-def _stage_seconds(quality: dict[str, Any]) -> Any:
-    return quality.get("seconds_per_stage", quality.get("seconds"))
-
-
 def _boards(boards: Any) -> Table | None:
-    """A line for each figure and a column for each board: it stays narrow enough for a phone."""
+    """Return a table with a line for each figure and a column for each board: narrow enough for a phone."""
     if not isinstance(boards, dict) or not boards:
         return None
     flat = {name: _numbers_of(board) for name, board in boards.items()}
     keys = dict.fromkeys(k for board in flat.values() for k in board)
     rows = [_cells(pretty(k), *(text(board.get(k)) for board in flat.values())) for k in keys]
-    caption = "Frames by board, of the rows that were recorded. What is missing is masked, never invented."
+    caption = "Frames by board, of the recorded rows. Missing data are masked, never interpolated."
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
 
 
 def _numbers_of(board: dict[str, Any]) -> dict[str, Any]:
-    """A board's figures, those in tables one by one: `direct_path_hz` {median} becomes `direct_path_median_hz`."""
+    """Flatten a board's figures: `direct_path_hz` {median} becomes `direct_path_median_hz`."""
     out: dict[str, Any] = {}
     for key, value in board.items():
         if key in _NOT_LISTED:
@@ -333,34 +291,26 @@ def _numbers_of(board: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _residuals_of(boards: Any) -> dict[str, Any]:
-    """{stage: {board: {quantity: std}}} from what the boards hold under `synchronisation`."""
-    out: dict[str, Any] = {}
-    for name, board in boards.items() if isinstance(boards, dict) else ():
-        for stage, value in (board.get("synchronisation") or {}).items():
-            out.setdefault(stage, {})[name] = value
-    return out
-
-
-def _residuals(residuals: Any) -> Table | None:
-    """{stage: {board: {quantity: std}}} or {stage: {quantity: std}} as one table, a column for each quantity."""
-    if not isinstance(residuals, dict) or not residuals:
-        return None
+def _residuals(boards: Any) -> Table | None:
+    """Return a table of `synchronisation` of all boards: a line for each stage, a column for each quantity."""
     flat: dict[str, dict[str, Any]] = {}
-    for stage, value in residuals.items():
-        flat[str(stage)] = _flatten(value) if isinstance(value, dict) else {"std": value}
+    for name, board in boards.items() if isinstance(boards, dict) else ():
+        for stage, quantities in (board.get("synchronisation") or {}).items():
+            flat.setdefault(stage, {}).update(_flatten({name: quantities}))
+    if not flat:
+        return None
     keys = list(dict.fromkeys(k for v in flat.values() for k in v))
     rows = [_cells(pretty(stage), *(text(v.get(k)) for k in keys)) for stage, v in flat.items()]
     head = ["After stage", *map(pretty, keys)]
     caption = (
         "Residual (standard deviation) after each stage of synchronisation: of one chirp as received and aligned, of"
-        " the direct path in a position's average, and of the object referenced to it; amplitude beside its mean."
+        " the direct path in a position's average, and of the object referenced to it; amplitude relative to its mean."
     )
     return {"caption": caption, "head": head, "rows": rows}
 
 
 def _flatten(value: dict[str, Any], prefix: str = "", nested: bool = True) -> dict[str, Any]:
-    """Paths to values; one level deep only unless `nested`."""
+    """Return path to value for nested dicts; only one level deep if `nested` is false."""
     out: dict[str, Any] = {}
     for k, v in value.items():
         name = f"{prefix} {k}".strip()
@@ -369,10 +319,9 @@ def _flatten(value: dict[str, Any], prefix: str = "", nested: bool = True) -> di
     return out
 
 
-def _seconds(seconds: Any) -> Table | None:
-    if not isinstance(seconds, dict) or not seconds:
+def _seconds(seconds: Mapping[str, float] | None) -> Table | None:
+    if not seconds:
         return None
-    numbers = {str(k): float(v) for k, v in seconds.items() if isinstance(v, int | float)}
-    longest = max([*numbers.values(), 1e-9])
-    rows = [_cells(pretty(k), f"{v:.2f} s", share=round(100 * v / longest, 1)) for k, v in numbers.items()]
+    longest = max([*seconds.values(), 1e-9])
+    rows = [_cells(pretty(k), f"{v:.2f} s", share=round(100 * v / longest, 1)) for k, v in seconds.items()]
     return {"caption": "Time by stage.", "head": [], "rows": rows}

@@ -13,10 +13,11 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, RedirectResponse, Response
 from starlette.routing import Route
 
-from polysight.host.serve.control import UnknownWishError, control_routes
+from polysight.host.serve.control import control_routes
 from polysight.host.serve.guard import Guard, refused
 from polysight.host.serve.reading import reading_routes
 from polysight.host.serve.site import Site
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, PolysightError
 
 STATIC = Path(__file__).parent / "static"
@@ -33,18 +34,22 @@ def make_app(site: Site) -> Starlette:
     """The application of a site."""
 
     async def page(request: Request) -> Response:
-        if request.url.path == "/" and site.scans.only is not None:
+        path, only = request.url.path, site.scans.only
+        if path == "/" and only is not None:
             return RedirectResponse("/watch")  # a browser keeps the fragment, and the token in it
-        return FileResponse(STATIC / PAGES[request.url.path])
+        if path in ("/scan", "/watch") and only is None and not request.query_params.get("scan"):
+            return RedirectResponse("/")
+        return FileResponse(STATIC / PAGES[path])
 
     files = {path.name for path in STATIC.iterdir() if path.suffix in (".js", ".css", ".svg")}
     routes = [Route(path, page) for path in PAGES]
     routes += [Route(f"/{name}", _static(name)) for name in sorted(files)]
+    routes.append(Route("/favicon.ico", _static("icon.svg")))
     routes += reading_routes(site) + control_routes(site)
     return Starlette(
         routes=routes,
         middleware=[Middleware(Guard, access=site.access)],
-        exception_handlers={PolysightError: _told, UnknownWishError: _unknown, 404: _nothing, Exception: _fault},
+        exception_handlers={PolysightError: _error, 404: _not_found, Exception: _fault},
     )
 
 
@@ -56,26 +61,23 @@ def _static(name: str) -> Callable[[Request], Awaitable[Response]]:
     return file
 
 
-async def _told(request: Request, e: Exception) -> Response:
-    """An error in its three parts."""
+async def _error(request: Request, e: Exception) -> Response:
     del request
     if not isinstance(e, PolysightError):
         raise e
     status = 400 if isinstance(e, ConfigError) else 404 if isinstance(e, DataError) else 409
-    return refused(status, e.what, e.remedy, e.why)
+    return refused(503 if e.code is ErrorCode.NO_ANSWER else status, e.code, e.what, e.why, e.remedy)
 
 
-async def _unknown(request: Request, e: Exception) -> Response:
-    del request
-    return refused(404, "There is no such wish", str(e))
-
-
-async def _nothing(request: Request, e: Exception) -> Response:
+async def _not_found(request: Request, e: Exception) -> Response:
     del request, e
-    return refused(404, "Nothing is here", "begin at the list of scans")
+    return refused(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
 
 
 async def _fault(request: Request, e: Exception) -> Response:
     sys.stderr.write(f"{request.method} {request.url.path}\n{''.join(traceback.format_exception(e))}")
     sys.stderr.flush()
-    return refused(500, f"A fault of the server: {type(e).__name__}", "report it, with what its terminal says")
+    what = f"An internal error of the server: {type(e).__name__}"
+    return refused(
+        500, ErrorCode.OTHER, what, "a defect of this program", "report it, with the server's terminal output"
+    )

@@ -22,6 +22,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from polysight.host.serve.connections import HEAD_BYTES
+from polysight.shared.error_codes import ErrorCode
 
 TOKEN_HEADER = "X-Polysight-Token"
 BODY_BYTES, BODY_S = 1 << 16, 10.0
@@ -142,32 +143,42 @@ class Guard:
         try:
             await self._app(scope, _limited(receive), _with_headers(send))
         except BodyError as e:
-            await _closing(refused(e.status, e.what, "send less, or sooner"))(scope, receive, _with_headers(send))
+            answer = refused(e.status, ErrorCode.MESSAGE_INVALID, e.what, "", "send less, or sooner")
+            await _closing(answer)(scope, receive, _with_headers(send))
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
         """Why a request is not let in."""
         method, path = scope["method"], scope["path"]
         if sum(len(name) + len(value) for name, value in scope["headers"]) > HEAD_BYTES:
-            return refused(431, f"The head is longer than {HEAD_BYTES} bytes", "send less")
+            what = f"The head is longer than {HEAD_BYTES} bytes"
+            return refused(431, ErrorCode.MESSAGE_INVALID, what, "no page sends so much", "send less")
         if not self._access.knows_host(headers.get("host", "")):
             return refused(
-                400, "This server has another name", "open the address that it printed; --allow-host NAME adds one"
-            )
+                400, ErrorCode.HOST_UNKNOWN, "This server has another name", "the request names another host",
+                "open the address that it printed; --allow-host NAME adds one",
+            )  # fmt: skip
         if method not in ("GET", "HEAD", "POST"):
-            return refused(405, "This cannot be asked", "GET or POST")
+            return refused(405, ErrorCode.MESSAGE_INVALID, f"{method} is not supported", "", "use GET or POST")
         if not path.startswith("/api/"):
-            return None if method != "POST" else refused(405, "Nothing can be asked here", "GET it")
+            wrong = refused(405, ErrorCode.MESSAGE_INVALID, "A page takes no POST", "", "use GET")
+            return wrong if method == "POST" else None
         if not _same_site(headers, scope.get("scheme", "http"), writes=method == "POST"):
-            return refused(403, "Another site asks", "use the page that this server serves")
+            return refused(
+                403, ErrorCode.ORIGIN_FOREIGN, "The request comes from a page of another site", "only this server's own"
+                " pages may ask", "use the page that this server serves",
+            )  # fmt: skip
         if length_of(headers) > BODY_BYTES:
-            return refused(413, f"More than {BODY_BYTES} bytes", "send less")
+            return refused(413, ErrorCode.MESSAGE_INVALID, f"More than {BODY_BYTES} bytes", "", "send less")
         return self._unknown(scope, headers)
 
     def _unknown(self, scope: Scope, headers: Headers) -> Response | None:
         """Whether token or session are missing for what is asked."""
         access, writes = self._access, scope["method"] == "POST"
         if writes and not access.control and scope["path"] != "/api/session":
-            return refused(403, "This view is read-only", "start it with --control to have buttons")
+            return refused(
+                403, ErrorCode.READ_ONLY, "This view is read-only", "it was started so",
+                "start it with --control to have buttons",
+            )  # fmt: skip
         if not writes and (access.loopback or not access.token or scope["path"] in _OPEN_PATHS):
             return None
         port, client = int((scope.get("server") or ("", 0))[1] or 0), str((scope.get("client") or ("",))[0])
@@ -175,7 +186,8 @@ class Guard:
         if not writes and session:
             return None
         if not session and self._wrong.spent(client):
-            answer = refused(429, "Too many wrong tokens came from your address", "try again in a second")
+            what = "Too many wrong tokens came from your address"
+            answer = refused(429, ErrorCode.BUSY, what, "somebody is guessing", "try again in a second")
             answer.headers["Retry-After"] = "1"
             return answer
         if access.holds_token(headers):
@@ -183,13 +195,14 @@ class Guard:
         self._wrong.note(client)
         status = 403 if writes else 401
         return refused(
-            status, "The token is wrong or missing", "open the address that the server printed when it started"
-        )
+            status, ErrorCode.TOKEN_WRONG, "The token is wrong or missing", "another server start has another token",
+            "open the address that the server printed when it started",
+        )  # fmt: skip
 
 
-def refused(status: int, what: str, do: str, why: str = "") -> Response:
-    """An answer in the three parts of every error."""
-    return JSONResponse({"what": what, "why": why, "do": do}, status)
+def refused(status: int, code: ErrorCode, what: str, why: str, do: str) -> Response:
+    """An error as JSON: its code, and the three parts that people read."""
+    return JSONResponse({"code": code, "what": what, "why": why, "do": do}, status)
 
 
 def _closing(answer: Response) -> Response:

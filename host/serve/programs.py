@@ -7,7 +7,6 @@ stop as from a terminal: by files in `<scan>/control/`. No signal is ever sent t
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 import threading
@@ -16,14 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from polysight.host.catalogue import PROGRAM, is_plain
+from polysight.host.catalogue import PROGRAM, is_plain, log_tail
 from polysight.host.serve import launcher
 from polysight.host.serve.launcher import started_ticks
 from polysight.shared.errors import DeviceError, ScanError
 
 KINDS = ("scan", "process", "export", "doctor", "train")
-_TAIL_BYTES = 16384
-_SHOWN = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\x00-\x08\x0b-\x1f\x7f\u202a-\u202e\u2066-\u2069]")
 
 
 @dataclass(frozen=True)
@@ -142,7 +139,7 @@ def program_of(folder: Path, kind: str) -> Program | None:
     running = started_ticks(pid) == ticks
     status = None if running else _status(base.with_suffix(".status"))
     shown = ["polysight", *words[3:]] if words[1:3] == ["-m", "polysight"] else words
-    return Program(kind, running, status, tuple(shown), began, _tail(base.with_suffix(".log")))
+    return Program(kind, running, status, tuple(shown), began, log_tail(base.with_suffix(".log")))
 
 
 def _status(path: Path) -> int | None:
@@ -150,18 +147,3 @@ def _status(path: Path) -> int | None:
         return int(path.read_text(encoding="ascii")[:8])
     except (OSError, ValueError):
         return None
-
-
-def _tail(path: Path) -> str:
-    """The log's end since the program's start, as a page may show it."""
-    if not is_plain(path):
-        return ""
-    try:
-        with path.open("rb") as f:
-            f.seek(max(0, f.seek(0, 2) - _TAIL_BYTES))
-            text = f.read().decode("utf-8", errors="replace")
-    except OSError:
-        return ""
-    lines = text.replace("\r\n", "\n").split("\n")
-    starts = [k for k, line in enumerate(lines) if line.startswith("--- ")]
-    return _SHOWN.sub("", "\n".join(lines[starts[-1] + 1 :] if starts else lines)).strip()

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from polysight.host.page import Watch
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 
 STREAMS = 48
@@ -36,28 +37,40 @@ class Watches:
         self._lock = threading.Lock()
 
     def of(self, name: str, folder: Path) -> Watch:
-        """The watch of a scan. Raises DeviceError when too many are looked at."""
+        """The watch of a scan. Raises DeviceError when too many are open."""
+        watch = self._find(name)
+        if watch is None:
+            watch = Watch(folder, self._control)  # reads the folder: without the lock, for it may hang
+            with self._lock:
+                if name not in self._open:
+                    watch.start()
+                    self._open[name] = (watch, time.monotonic())
+                watch = self._open[name][0]
+        return watch
+
+    def _find(self, name: str) -> Watch | None:
+        """The open watch of a scan; None if there is none and room for one. Raises DeviceError."""
         with self._lock:
             if name in self._kept:
                 return self._kept[name]
             self._sweep(name)
             if name in self._open:
                 watch, _ = self._open[name]
-            else:
-                if len(self._open) >= _MOST:
-                    raise DeviceError(f"{_MOST} live views are open", "each takes a part of a processor", "close one")
-                watch = Watch(folder, self._control)
-                watch.start()
-            self._open[name] = (watch, time.monotonic())
-            return watch
+                self._open[name] = (watch, time.monotonic())
+                return watch
+            if len(self._open) >= _MOST:
+                raise DeviceError(
+                    f"{_MOST} live views are open", "each takes a part of a processor", "close one", code=ErrorCode.BUSY
+                )
+        return None
 
     def _sweep(self, wanted: str) -> None:
-        """Close what nobody looks at; when there are too many, those that nobody has a stream of at once."""
+        """Close watches without pages: after a while, or at once when there are too many."""
         now, full = time.monotonic(), len(self._open) >= _MOST
         for name, (watch, used) in list(self._open.items()):
             idle = not self._streams.get(name) and name != wanted
             if idle and (full or now - used > _LINGER_S):
-                watch.close()
+                threading.Thread(target=watch.close, name="close", daemon=True).start()  # its folder may hang
                 del self._open[name]
 
     @contextmanager

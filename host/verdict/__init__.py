@@ -1,8 +1,8 @@
-"""How far a result may be trusted: one verdict for every scan, with its reasons and what to do about each.
+"""The verdict: whether a scan's results can be used, with reasons and remedies.
 
-`Verdict` holds a level (`good`, `care`, `none`) and `Reason`s in order of weight; it is written as `verdict` into
-quality.json and materials.json and shown by every command, the report and the live view. The rules that turn evidence
-into reasons are in `rules`.
+`Verdict` holds a level (`good`, `care`, `none`) and `Reason`s in order of weight. It is written as `verdict` into
+quality.json and materials.json, and shown by all commands, the report and the live view. The functions `*_reasons` are
+the rules that turn evidence into reasons; `verdict_of` joins the reasons to a verdict.
 """
 
 from polysight.host.verdict.rules import (

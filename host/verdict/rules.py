@@ -1,6 +1,6 @@
-"""From evidence to reasons: each rule looks at one kind of evidence and says what it found, why, and what to do.
+"""Rules of the verdict: each turns one kind of evidence into reasons (what was found, why it matters, what to do).
 
-A rule returns no reason where all is well. Limits are named constants here and nowhere else.
+A rule returns no reasons if its evidence is good. All limits are constants of this module.
 """
 
 from __future__ import annotations
@@ -13,32 +13,34 @@ import numpy as np
 from polysight.host.verdict.verdict import Reason
 
 FEW_POSITIONS = 0.5
-"""Share of absent or masked positions from which nothing can be said of the scene."""
+"""Share of absent or masked positions above which there is no result."""
 SOME_POSITIONS = 0.005
-"""Share of absent or masked positions that is worth a word."""
+"""Share of masked positions above which the result needs care."""
 DIRECT_SNR_NONE_DB = -14.0
-"""Direct path over noise in one sample of one chirp and channel, below which there is none."""
+"""Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
 DIRECT_SNR_CARE_DB = 0.0
-"""The simulated rig has 5.5 dB, as the paper's phase errors suggest; 12 dB less are a path that is nearly blocked."""
+"""Same, below which it counts as weak. The simulated rig has 5.5 dB, as the paper's phase errors suggest."""
 DIRECT_LEVELS = (0.4, 3.0)
-"""Metal's brightness beside the direct path: the published rig's echo and direct path lie within a factor of 1.5."""
+"""Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
 DIRECT_PHASE_CARE_RAD = 0.05
-"""Phase of the object referenced to the direct path, from position to position; 0.004 is usual."""
+"""Standard deviation of the object's phase from position to position; usually 0.004."""
 PLANE_FAR_MM, PLANE_TILT_DEG = 3.0, 0.5
+"""Distance and tilt of the plates' plane against the rig file, above which the result needs care."""
 PLANE_GATE_MM = 13.0
+"""Distance at which the plates lie at the edge of the range gate."""
 PLATE_ACROSS_DEG = 0.5
-"""Tilt across the plane of incidence that turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
+"""Tilt of a plate across the plane of incidence; turns the polarisation by 0.4 degrees: 3 to 6 % of a permittivity."""
 BRIGHTNESS_CARE = 0.2
-"""ln of |H| beside a half space's: rough, tilted, high plates stay within 0.13 (simulated), thin sheets reach 0.5."""
+"""ln of |H| over that of a half space: rough, tilted, high plates stay within 0.13 (simulated), thin sheets to 0.5."""
 LEAKAGE_SHARE = 0.02
-"""Relative error of a permittivity by leakage that is worth a word."""
+"""Relative error of permittivities by leakage, above which the result needs care."""
 LIBRARY_ANGLE_DEG = 0.3
-"""The ratio of a material changes by 3 % in 0.3 degrees."""
+"""Difference from the library's angle; the ratio of a material changes by 3 % in 0.3 degrees."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Rows and frames beside the plan: counts, and what is wrong with the manifest."""
+    """Counts of recorded rows and frames against the plan, and the faults of the manifest."""
 
     rows_planned: int
     rows_recorded: int
@@ -48,7 +50,7 @@ class Coverage:
 
     @classmethod
     def of(cls, coverage: Mapping[str, object]) -> Coverage:
-        """From `coverage` of quality.json."""
+        """Read `coverage` of quality.json."""
         manifest = coverage.get("manifest", ())
         faults = tuple(map(str, manifest)) if isinstance(manifest, list | tuple) else ()
         keys = ("rows_planned", "rows_recorded", "frames_planned", "frames_received")
@@ -57,7 +59,7 @@ class Coverage:
 
 
 def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Reason]:
-    """Rows, frames and manifest against the plan. `masked_share` counts positions masked in recorded rows."""
+    """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
     out = []
     absent = 1 - coverage.rows_recorded / coverage.rows_planned if coverage.rows_planned else 1.0
     if coverage.rows_recorded < coverage.rows_planned:
@@ -66,12 +68,10 @@ def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Rea
         out.append(Reason(
             level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * absent:.1f} % of the positions)",
             "the scan was stopped, or rows were lost; plates there are missing or distorted",
-            "`polysight resume SCAN` takes the missing rows", 5 + absent,
+            "`polysight resume SCAN` records the missing rows", 5 + absent,
         ))  # fmt: skip
     out += [
-        Reason(
-            "care", fault, "a row that was recorded is not in the images", "`polysight validate SCAN` says more", 6.0
-        )
+        Reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
         for fault in coverage.manifest
     ]
     frames = 1 - coverage.frames_received / coverage.frames_planned if coverage.frames_planned else 1.0
@@ -87,48 +87,48 @@ def recording_reasons(coverage: Coverage, masked_share: float = 0.0) -> list[Rea
 
 
 def direct_path_reasons(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Reason]:
-    """One board's direct path: its level over noise, what synchronisation leaves, and where it was found."""
+    """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
     if found_share < FEW_POSITIONS or (snr_db is not None and snr_db < DIRECT_SNR_NONE_DB):
         return [Reason(
             "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
-            "without it no position is synchronised, and the images mean nothing",
+            "without it no position is synchronised, and the images are meaningless",
             "clear the line of sight from transmitter to receiver; check that the transmitter is on", 10.0,
         )]  # fmt: skip
     out = []
     if snr_db is not None and snr_db < DIRECT_SNR_CARE_DB:
         out.append(Reason(
             "care", f"{board}: the direct path is weak, {snr_db:.0f} dB over noise in one chirp (5 dB are usual)",
-            "it is partly blocked, or the antennas look elsewhere; it is the reference of every phase",
-            "clear the line of sight; check the antennas' aim", 3.0,
+            "it is partly blocked, or the antennas point elsewhere; it is the reference of all phases",
+            "clear the line of sight; check the antennas' direction", 3.0,
         ))  # fmt: skip
     if phase_rad is not None and phase_rad > DIRECT_PHASE_CARE_RAD:
         out.append(Reason(
-            "care", f"{board}: synchronisation leaves {phase_rad:.3f} rad from position to position (0.004 is usual)",
+            "care", f"{board}: residual phase {phase_rad:.3f} rad from position to position (0.004 is usual)",
             "a weak direct path, or a strong reflector near it", "look at the synchronisation table of the report", 2.5,
         ))  # fmt: skip
     return out
 
 
 def level_reasons(levels: Mapping[str, float | None]) -> list[Reason]:
-    """Metal's brightness beside the direct path in each channel (None: not known)."""
+    """Judge metal's brightness relative to the direct path in each channel (None: not known)."""
     out = []
     for channel, level in levels.items():
         if level is not None and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
             weak = level > DIRECT_LEVELS[1]
             state = "weak" if weak else "strong"
-            what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB beside it"
+            what = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
             why = (
-                "the direct path is weakened by something in its way; the object reaches into its estimate"
+                "something in its way weakens the direct path; the object disturbs its estimate"
                 if weak
-                else "the object is far weaker than the direct path: the antennas look elsewhere, or this is not metal"
+                else "the object is far weaker than the direct path: the antennas point elsewhere, or it is not metal"
             )
-            do = "clear the line of sight from transmitter to receivers, and check the antennas' aim"
+            do = "clear the line of sight from transmitter to receivers, and check the antennas' direction"
             out.append(Reason("care", what, why, do, 3.5))
     return out
 
 
 def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
-    """Patches that are no plates (noise, several kinds together): number to why."""
+    """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials)."""
     if patches == 0:
         return [Reason(
             "none", "no patch was found", "nothing in the image stands out from its background",
@@ -148,7 +148,7 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
         Reason(
             "care",
             f"patch{'es' * (len(labels) > 1)} {', '.join(map(str, labels))} not judged: {what}",
-            "what is said of a patch holds for one flat plate",
+            "results hold for one flat plate per patch",
             "move the plates apart, or draw their boxes (polysight label; process --labels)",
             2.0,
         )
@@ -157,20 +157,20 @@ def signal_reasons(refused: Mapping[int, str], patches: int) -> list[Reason]:
 
 
 def metal_reasons(patch: str, enough: bool, sure: bool, given: bool, against: bool, alone: bool) -> list[Reason]:
-    """The metal reference: shown to be metal by the scene, given by the user, or neither.
+    """Judge the metal reference: confirmed by the scene, given by the user, or neither.
 
     Parameters
     ----------
     patch
-        What it is called, e.g. "patch 3".
+        Its name, e.g. "patch 3".
     enough, sure
-        The rest of the scene shows that it is metal; and beyond doubt.
+        The rest of the scene shows that it is metal; and with certainty.
     given
-        A person says so.
+        The user chose it.
     against
-        What is seen speaks against it.
+        The scene contradicts it.
     alone
-        No other patch tells.
+        No other patch gives evidence.
     """
     give = "lay a metal plate into the scene and name it (--metal X,Y,W,H), or use `polysight calibrate metal`"
     if given and against:
@@ -178,7 +178,7 @@ def metal_reasons(patch: str, enough: bool, sure: bool, given: bool, against: bo
             Reason(
                 "none" if not enough and not alone else "care",
                 f"the given metal reference ({patch}) does not look like metal",
-                "it does not return both polarisations alike, or the other patches are no possible materials beside it",
+                "it reflects H and V differently, or relative to it the other patches are impossible materials",
                 give,
                 8.0,
             )
@@ -190,36 +190,36 @@ def metal_reasons(patch: str, enough: bool, sure: bool, given: bool, against: bo
             Reason(
                 "care",
                 f"the metal reference ({patch}) is likely metal, not certainly",
-                "a wet or conducting plate could look like it; all permittivities hang on it",
+                "a wet or conducting plate could look like it; all permittivities depend on it",
                 give,
                 2.8,
             )
         ]
-    why = "seen from it the other patches are no possible materials, or too few of them tell"
+    why = "relative to it the other patches are impossible materials, or too few of them give evidence"
     if alone:
         why = "nothing else in the scene can show that it is metal"
     return [Reason("none", f"no metal reference: {patch} is not shown to be metal", why, give, 8.0)]
 
 
 def leakage_reasons(measured: bool, determined: bool, relative_error: float) -> list[Reason]:
-    """Leakage that was not measured: `relative_error` is the median error that it leaves in the permittivities."""
+    """Judge leakage that was not measured; `relative_error` is its median effect on the permittivities."""
     if measured or relative_error < LEAKAGE_SHARE:
         return []
     source = "estimated from the scene" if determined else "never measured; its prior is used"
     return [Reason(
         "care",
-        f"leakage was {source}: it leaves {100 * relative_error:.0f} % in permittivities, and names suffer too",
+        f"leakage was {source}: permittivities are uncertain by {100 * relative_error:.0f} %, names less reliable",
         "the rig file has no leakage_std: leakage up to 0.1 of any phase is possible",
         "measure it once with metal strips: `polysight leakage` (docs/how-to/calibration.md)", 1.5,
     )]  # fmt: skip
 
 
 def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Reason]:
-    """Where the plates lie beside the rig file's plane."""
+    """Judge the position of the plates' plane against the rig file."""
     if not known:
         return [Reason(
             "care",
-            f"nothing tells where the plane is; the angle is the rig file's, +-{theta_std_deg:.2f} degrees",
+            f"the plane was not found; the angle is the rig file's, +-{theta_std_deg:.2f} degrees",
             "no patch has a clear echo", "measure the plane's distance, or scan a flat plate (polysight focus)", 2.0,
         )]  # fmt: skip
     if abs(offset_mm) > PLANE_GATE_MM:
@@ -232,20 +232,20 @@ def plane_reasons(known: bool, offset_mm: float, tilt_deg: tuple[float, float], 
     if abs(offset_mm) > PLANE_FAR_MM:
         out.append(Reason(
             "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
-            "the object was put elsewhere, or object_distance_mm is wrong",
+            "the object is at another distance, or object_distance_mm is wrong",
             "correct geometry.object_distance_mm in the rig file", 1.6,
         ))  # fmt: skip
     if tilt > PLANE_TILT_DEG:
         out.append(Reason(
             "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
-            "tilted plates shine past the scanned positions",
+            "tilted plates reflect past the scanned positions",
             "lay the plates parallel to the stage", 1.4,
         ))  # fmt: skip
     return out
 
 
 def tilt_reasons(across_deg: Mapping[int, float]) -> list[Reason]:
-    """Plates that rise across the plane of incidence: patch number to degrees."""
+    """Judge the tilts of plates across the plane of incidence: patch number to degrees."""
     tilted = {label: angle for label, angle in across_deg.items() if abs(angle) > PLATE_ACROSS_DEG}
     if not tilted:
         return []
@@ -253,16 +253,16 @@ def tilt_reasons(across_deg: Mapping[int, float]) -> list[Reason]:
     more = "" if len(tilted) == 1 else f" ({len(tilted)} patches in all)"
     return [Reason(
         "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{more}",
-        "what that changes of the light is corrected, but the polarisation turns with it: 5 to 13 % of a permittivity"
-        " a degree", "lay plates and metal flat; shim the one that rises", 1.3,
+        "its illumination is corrected, but the polarisation turns with it: 5 to 13 % of a permittivity per degree",
+        "lay plates and metal flat; shim the tilted one", 1.3,
     )]  # fmt: skip
 
 
 def passivity_reasons(gaining: Mapping[int, str]) -> list[Reason]:
-    """Patches whose permittivity is that of no passive material beyond its error: number to what is wrong with it."""
+    """Judge patches whose permittivity is impossible for a passive material: number to the fault."""
     return [
         Reason(
-            "care", f"patch {label} is not printed as a material: {what}",
+            "care", f"patch {label} has no permittivity: {what}",
             "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place",
             "measure leakage; if the plate is thin, fit it as a layer (polysight permittivity --layer)", 2.2,
         )
@@ -271,25 +271,25 @@ def passivity_reasons(gaining: Mapping[int, str]) -> list[Reason]:
 
 
 def brightness_reasons(off: Mapping[int, float]) -> list[Reason]:
-    """Plates brighter or darker than half spaces of their permittivity: patch number to ln of |H| beside theirs."""
+    """Judge brightness: patch number to ln of |H| over that of a half space of its permittivity."""
     out = []
     for label, ln in off.items():
         if abs(ln) > BRIGHTNESS_CARE:
             share, than = 100 * abs(float(np.expm1(ln))), "brighter" if ln > 0 else "darker"
             out.append(Reason(
                 "care", f"patch {label} is {share:.0f} % {than} than a half space of its permittivity",
-                "it may be thin, layered, rough, or partly in a shadow: a thin plate's permittivity is another one",
+                "it may be thin, layered, rough, or partly in a shadow; the permittivity of a thin plate is then wrong",
                 "fit it as a layer (polysight permittivity --layer), or lay it flat and free", 1.7,
             ))  # fmt: skip
     return out
 
 
 def incidence_reasons(angle_deg: float, library_deg: float | None) -> list[Reason]:
-    """The angle that was found beside the library's."""
+    """Judge the incidence angle against the library's."""
     if library_deg is None or abs(angle_deg - library_deg) <= LIBRARY_ANGLE_DEG:
         return []
     return [Reason(
-        "care", f"the scan looks at {angle_deg:.2f} degrees, the library was made at {library_deg:.2f}",
-        "the ratio of a material changes by a tenth in a degree: names may be wrong",
+        "care", f"the scan has an incidence angle of {angle_deg:.2f} degrees, the library {library_deg:.2f}",
+        "the ratio of a material changes by 10 % in a degree: names may be wrong",
         "make a library at this angle, or move the plane", 1.8,
     )]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The verdict's structure: a level, and reasons in order of weight."""
+"""Structure of a verdict: a level, and reasons in order of weight."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from polysight.shared.errors import PolysightError
 
 Level = Literal["good", "care", "none"]
 LEVELS: dict[Level, str] = {"good": "good", "care": "usable with care", "none": "no result"}
-"""Level to the words it is shown with."""
+"""Level to its text."""
 _ORDER: tuple[Level, ...] = ("none", "care", "good")
 
 
-class NoResult(PolysightError):  # noqa: N818 (it is a result, told as an error ends a command)
-    """The data do not support any material or permittivity; images are kept. Commands exit with this status."""
+class NoResult(PolysightError):  # noqa: N818 (a result that ends a command like an error)
+    """The data do not support any material or permittivity; images are kept. Sets the exit status of commands."""
 
     exit_status = 7
 
 
 @dataclass(frozen=True)
 class Reason:
-    """One piece of evidence that counts: what was found, why it matters, what to do.
+    """One finding that limits the trust in a result: what was found, why it matters, what to do.
 
     Attributes
     ----------
     level
-        The best level that a result with this reason can have.
+        Best possible level of a result with this reason.
     what, why, do
         One plain sentence each, without a full stop.
     weight
-        Reasons of one level are shown in order of falling weight.
+        Reasons of one level are sorted by falling weight.
     """
 
     level: Level
@@ -41,13 +41,13 @@ class Reason:
     weight: float = 1.0
 
     def to_dict(self) -> dict[str, str]:
-        """What JSON holds of it."""
+        """Return the dict for JSON."""
         return {"what": self.what, "why": self.why, "do": self.do}
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How far a result may be trusted, and why."""
+    """Level of trust in a result, and its reasons."""
 
     level: Level
     reasons: tuple[Reason, ...] = ()
@@ -59,15 +59,15 @@ class Verdict:
 
     @property
     def usable(self) -> bool:
-        """Whether names and permittivities may be shown."""
+        """True if names and permittivities may be shown."""
         return self.level != "none"
 
     def to_dict(self) -> dict[str, Any]:
-        """`{"level": ..., "reasons": [{"what", "why", "do"}, ...]}` for JSON."""
+        """Return `{"level": ..., "reasons": [{"what", "why", "do"}, ...]}` for JSON."""
         return {"level": self.level, "reasons": [r.to_dict() for r in self.reasons]}
 
     def lines(self, most: int | None = None) -> list[str]:
-        """Text for a terminal: the level, then each reason with what to do; at most so many reasons."""
+        """Return text for a terminal: the level, then each reason and remedy; at most `most` reasons."""
         shown = self.reasons[:most]
         out = [f"verdict:  {self.text}"]
         for r in shown:
@@ -79,20 +79,20 @@ class Verdict:
         return out
 
     def error(self, kept: str = "") -> NoResult:
-        """The error that ends a command without a result. `kept` says where the images are."""
+        """Return the error that ends a command without a result; `kept` says where the images are."""
         first = self.reasons[0] if self.reasons else Reason("none", "no result", "", "")
         remedy = "; ".join(part for part in (first.do, kept) if part)
         return NoResult(f"no result: {first.what}", first.why, remedy)
 
 
 def verdict_of(reasons: Iterable[Reason]) -> Verdict:
-    """The verdict from all reasons: its level is the worst of theirs, `good` without any."""
+    """Join reasons to a verdict; its level is the worst of theirs, `good` without reasons."""
     ordered = sorted(reasons, key=lambda r: (_ORDER.index(r.level), -r.weight))
     return Verdict(ordered[0].level if ordered else "good", tuple(ordered))
 
 
 def read_verdict(content: Mapping[str, Any]) -> Verdict | None:
-    """The verdict in the content of quality.json or materials.json; None in products of earlier releases."""
+    """Read the verdict in the content of quality.json or materials.json; None if there is none."""
     raw = content.get("verdict")
     if not isinstance(raw, Mapping) or raw.get("level") not in LEVELS:
         return None

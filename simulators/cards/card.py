@@ -66,7 +66,7 @@ class CardEndpoint:
     Raises
     ------
     DeviceError
-        when the card's addresses cannot be taken.
+        if the card's addresses cannot be taken.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class CardEndpoint:
     def power_cycle(self) -> None:
         """Switch the card off and on: the addresses in its EEPROM are taken.
 
-        Raises DeviceError when those are not addresses of this machine.
+        Raises DeviceError if those are not addresses of this machine.
         """
         before = self.card.network
         self.card.power_cycle()
@@ -215,7 +215,7 @@ class CardEndpoint:
 
     @property
     def due(self) -> bool:
-        """Whether the record ends now if nothing more comes."""
+        """True if the record ends now if nothing more comes."""
         deadline_s = self.card.deadline_s
         return deadline_s is not None and self.wire_s() >= deadline_s
 
@@ -224,7 +224,7 @@ class CardEndpoint:
         self.emit(self.card.tick(self.wire_s()), link_is_up)
 
     def flush(self) -> float | None:
-        """Send what may be sent now; seconds until there is more to do, None when all is sent."""
+        """Send what may be sent now; seconds until there is more to do, None if all is sent."""
         return self.sender.flush(self._clock_s, self.card.packet_delay_s / self._time_scale)
 
     def _keep_sender_counts(self) -> None:
@@ -261,7 +261,7 @@ class SimulatedCard:
     Raises
     ------
     DeviceError
-        when the card's addresses cannot be taken.
+        if the card's addresses cannot be taken.
     """
 
     def __init__(

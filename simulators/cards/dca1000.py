@@ -74,7 +74,7 @@ class Network(NamedTuple):
 
     @staticmethod
     def decode(body: bytes) -> Network:
-        """Parse the 18 bytes of command 0x04. Raises ProtocolError when there are not 18."""
+        """Parse the 18 bytes of command 0x04. Raises ProtocolError if there are not 18."""
         if len(body) != 18:
             raise ProtocolError(f"EEPROM body of {len(body)} bytes, expected 18")
         host, card, mac = body[3::-1], body[7:3:-1], body[13:7:-1]
@@ -237,7 +237,7 @@ class Card:
 
     @property
     def deadline_s(self) -> float | None:
-        """When :meth:`tick` will end the record if no LVDS data comes; None when nothing is recorded."""
+        """When :meth:`tick` will end the record if no LVDS data comes; None if nothing is recorded."""
         if not self._recording:
             return None
         if self._last_data_s is None:

@@ -155,7 +155,7 @@ class CommandFaults:
             self._bits[code] = self._bits.get(code, 0) | 1 << bit
 
     def heard(self) -> bool:
-        """Whether the next request reaches the card and will be answered."""
+        """True if the next request reaches the card and will be answered."""
         draw, self._draw_reply = self._rng.random(2)
         if self._answers_left == 0:
             self._counts["requests_unanswered"] += 1
@@ -166,7 +166,7 @@ class CommandFaults:
         return True
 
     def refused(self, code: int) -> bool:
-        """Whether the card fails to carry this command out."""
+        """True if the card fails to carry this command out."""
         return code in self._faults.refuse
 
     def status_after(self, code: int) -> int:
@@ -174,7 +174,7 @@ class CommandFaults:
         return self._bits.get(code, 0)
 
     def reply_arrives(self) -> bool:
-        """Whether the reply to the request just heard reaches the host."""
+        """True if the reply to the request just heard reaches the host."""
         if self._answers_left is not None:
             self._answers_left -= 1
         if self._draw_reply < self._faults.reply_loss:

@@ -43,7 +43,7 @@ class ReceiveQueue:
             self._table = None
 
     def look(self) -> tuple[int, int] | None:
-        """Kernel bytes waiting, and datagrams dropped so far; None when no such socket is on this machine."""
+        """Kernel bytes waiting, and datagrams dropped so far; None if no such socket is on this machine."""
         if self._table is None:
             return None
         text = os.pread(self._table, 1 << 20, 0)
@@ -81,7 +81,7 @@ class CardSender:
     Raises
     ------
     DeviceError
-        when the card's address cannot be taken.
+        if the card's address cannot be taken.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class CardSender:
         return {"packets_sent": self.packets, "bytes_sent": self.payload_bytes, "waits": self.waits}
 
     def dropped_by_receiver(self) -> int | None:
-        """Datagrams the receiving socket had no room for; None when it is not on this machine."""
+        """Datagrams the receiving socket had no room for; None if it is not on this machine."""
         seen = self._receiver.look()
         return None if seen is None else seen[1]
 
@@ -147,7 +147,7 @@ class CardSender:
         self._queued_bytes += rows.size
 
     def flush(self, clock_s: Callable[[], float], packet_interval_s: float) -> float | None:
-        """Send what may be sent now; seconds until there is more to do, None when all is sent.
+        """Send what may be sent now; seconds until there is more to do, None if all is sent.
 
         Parameters
         ----------
@@ -260,7 +260,7 @@ def bound_udp(address: str, port: int) -> socket.socket:
 
 
 def _can_segment(s: socket.socket) -> bool:
-    """Whether this kernel cuts large buffers into datagrams (UDP_SEGMENT, Linux 4.18 and later)."""
+    """True if this kernel cuts large buffers into datagrams (UDP_SEGMENT, Linux 4.18 and later)."""
     try:
         s.setsockopt(socket.IPPROTO_UDP, _UDP_SEGMENT, 0)
     except OSError:

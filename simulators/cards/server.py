@@ -54,13 +54,13 @@ class CardServer:
 
     @property
     def more_expected(self) -> bool:
-        """Whether the stage is in a row, or pulses for its last trigger are still to come."""
+        """True if the stage is in a row, or pulses for its last trigger are still to come."""
         return self._track.moving or self._trigger_ns > self._pulse_ns
 
     def serve(self, stop: Event) -> None:
         """Work until `stop` is set; `power_cycle`, when set, switches every card off and on.
 
-        Raises DeviceError when the wires break, or a card's new address cannot be taken.
+        Raises DeviceError if the wires break, or a card's new address cannot be taken.
         """
         timeout: float = 0.0
         while not stop.is_set():

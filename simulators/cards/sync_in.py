@@ -22,7 +22,7 @@ _KEEP = 4096
 def sync_line(rig: Instrument, board: Board) -> int:
     """The GPIO line that drives this board's SYNC_IN: the one line of a fan-out, else the board's own, in file order.
 
-    Raises ConfigError when there are fewer lines than boards.
+    Raises ConfigError if there are fewer lines than boards.
     """
     if rig.pi.wiring in ("fanout", "spi"):
         return rig.pi.sync_out[0]
@@ -137,7 +137,7 @@ class StageTrack:
 
     @property
     def moving(self) -> bool:
-        """Whether the last motion line has the stage moving along x."""
+        """True if the last motion line has the stage moving along x."""
         return bool(self._lines) and self._lines[-1].vx_um_s != 0
 
     def places(self, pulses: list[Pulse]) -> list[Pulse]:

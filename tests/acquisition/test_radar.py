@@ -121,6 +121,8 @@ HALF_OPEN = """
 import socket, subprocess
 from polysight.host.radar.backends import LineServers
 from polysight.shared.errors import DeviceError
+from polysight.shared.error_codes import ErrorCode
+from tests.support.refusals import refused
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 listener = socket.create_server(("127.0.0.1", 5000))
 radars = LineServers({"RH": "127.0.0.1:5000"}, 0.5)
@@ -155,8 +157,8 @@ def with_radar(instrument: Instrument, **radar) -> dict:
     ("radar", "rule"),
     [
         ({"control": "telepathy"}, "radar.control"),
-        ({"control": "line_server"}, "needs one of radar.servers for every board"),
-        ({"servers": {"XX": "127.0.0.1:5000"}}, "names no board"),
+        ({"control": "line_server"}, "line_server"),
+        ({"servers": {"XX": "127.0.0.1:5000"}}, "XX"),
         ({"servers": {"RH": "127.0.0.1"}}, "radar.servers"),
         ({"servers": {"RH": "127.0.0.1:70000"}}, "1..65535"),
     ],

@@ -23,8 +23,10 @@ from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.acquisition.scan_loop import takes_so_far
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ScanError
 from polysight.shared.tables import to_builtins
+from tests.support.refusals import refused
 
 
 def digests(scan: ScanFolder) -> dict[str, str]:
@@ -124,9 +126,8 @@ def test_fault_of_the_pi_makes_the_row_be_taken_again(rig, tmp_path):
 def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
     for take in (1, 2, 3):
         rig.cards["RV"].drop[1, take] = {3}
-    with pytest.raises(ScanError, match="RV") as e:
+    with refused(ErrorCode.ROW_INCOMPLETE, "RV", "3 takes"):
         run_scan(rig.instrument, tmp_path / "s")
-    assert "3 takes" in e.value.what
     scan = ScanFolder.load(tmp_path / "s")
     assert list(scan.committed()) == [0]
     assert scan.facts("scan_ended")[0]["exit_status"] == "fail"
@@ -249,9 +250,8 @@ def test_on_row_runs_beside_the_scan(rig, tmp_path):
 
 def test_no_pi(make_instrument, tmp_path):
     instrument = make_instrument(command_timeout_s=0.3)
-    with pytest.raises(DeviceError, match="5601") as e:
+    with refused(ErrorCode.NO_ANSWER, 5601, "polysight-pi run"):
         run_scan(instrument, tmp_path / "s")
-    assert "polysight-pi run" in e.value.why
     assert not (tmp_path / "s").exists()
 
 
@@ -263,12 +263,10 @@ def test_mute_card_is_named(rig, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
-def test_no_data_is_told_from_a_mute_card(rig, tmp_path):
+def test_radar_without_data_is_not_a_mute_card(rig, tmp_path):
     rig.cards["RH"].silent_data = True
-    with pytest.raises(ScanError, match="RH: no data") as e:
+    with refused(ErrorCode.ROW_INCOMPLETE, "RH", "SYNC_IN", "armed"):
         run_scan(rig.instrument, tmp_path / "s")
-    assert "SYNC_IN" in e.value.why
-    assert "armed" in e.value.why
 
 
 def test_port_in_use_is_named(rig, tmp_path):
@@ -283,13 +281,13 @@ def test_port_in_use_is_named(rig, tmp_path):
 def test_existing_scan_is_not_overwritten(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
     before = digests(ScanFolder.load(tmp_path / "s"))
-    with pytest.raises(DeviceError, match="manifest"):
+    with refused(ErrorCode.FILE_EXISTS, "manifest"):
         run_scan(rig.instrument, tmp_path / "s")
     assert digests(ScanFolder.load(tmp_path / "s")) == before
 
 
 def test_full_disk_is_refused_before_the_first_row(rig, tmp_path):
     big = msgspec.structs.replace(rig.instrument.limits, free_disk_bytes=1 << 60)
-    with pytest.raises(ScanError, match="GB free"):
+    with refused(ErrorCode.DISK_FULL):
         run_scan(msgspec.structs.replace(rig.instrument, limits=big), tmp_path / "s")
     assert rig.pi.rows_run == []

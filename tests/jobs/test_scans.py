@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.host.catalogue import Notes, read_notes
 from polysight.host.cli.main import main
 from polysight.simulators.scene import load_scene, simulate
@@ -50,9 +50,21 @@ def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
     assert "2 scans" in told(capsys, "scans", root)
 
 
+def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(root, capsys):
+    judged_products(root / ("long" * 40), "good")
+    (root / "two" / "operator.json").write_text(json.dumps({"notes": "a\u202eb\x1b[31m", "tags": ["t\u200fag\x07"]}))
+    materials = root / "two" / "materials.json"
+    materials.write_text(materials.read_text().replace("PET", "P\u202eET"))
+    for words in (["scans", root], ["note", root / "two"], ["probe", root / "two", "0,0"]):
+        text = told(capsys, *words)
+        assert all(c.isprintable() or c == "\n" for c in text), ascii(text)
+    lines = told(capsys, "scans", root).splitlines()
+    assert max(len(line) for line in lines if not line.startswith("long")) < 120
+
+
 def test_a_running_scan_is_asked(root, capsys):
     stop = StopRequest()
-    with ControlDesk(root / "one", stop) as desk:
+    with ControlFolder(root / "one", stop) as desk:
         desk.open()
         wait_for((root / "one" / CONTROL / ALIVE).exists, "the first sign of life")
         assert "pause" in told(capsys, "ask", root / "one", "pause")

@@ -15,6 +15,7 @@ from polysight.host.materials import (
     Weights,
     analyse,
     estimate_permittivity,
+    expected_pixel_accuracy,
     fit_library,
     make_library,
     median_ratio,
@@ -84,8 +85,10 @@ def test_pickles_and_damaged_files_are_refused(tmp_path, library):
 
 def test_at_least_eight_of_nine_named_right(synthetic, library):
     classifier = Classifier(library)
+    shares = []
     for seed in range(5):
         result = synthetic(seed).analyse(classifier=classifier)
+        shares.append((pixel_accuracy(result), expected_pixel_accuracy(result)))
         named = [r for r in result.patches if r.verdict is not None]
         assert len(named) == 8  # the metal reference is not named by itself
         assert sum(r.verdict.name == r.truth.name for r in named) >= 7
@@ -93,6 +96,14 @@ def test_at_least_eight_of_nine_named_right(synthetic, library):
         for r in named:
             assert 0 < r.verdict.confidence <= 1
             assert sum(r.verdict.votes.values()) == pytest.approx(1)
+    right, expected = np.mean(shares, axis=0)
+    assert 0.75 < expected < right + 0.05  # six scans teach little: the classifier is rather too cautious
+
+
+def test_without_truth_or_probabilities_no_share_of_right_pixels_is_expected(synthetic, library):
+    scene = synthetic(4)
+    assert expected_pixel_accuracy(scene.analyse()) is None
+    assert expected_pixel_accuracy(scene.analyse(classifier=Classifier(library, model="knn"))) is None
 
 
 def test_polarimetry_beats_one_channel(library):

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from matplotlib.font_manager import findfont, get_font
 
-from polysight.host.report import fonts
+from polysight.host.report import style
 from polysight.host.report.context import ReportContext
-from polysight.host.report.figures import banner_png, figures
-from polysight.host.report.fonts import figure_label, font_families, is_drawable
+from polysight.host.report.figures import figures
 from polysight.host.report.report import render, write_report
+from polysight.host.report.style import figure_label, font_families, is_drawable
 
 NAMES = ["木板", "ガラス", "유리 3", "стекло", "Plexiglas®", "\U0001f9f1 brick", "tab\there", "a $b$ c_{", "زجاج"]
 PERMITTIVITY = {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]}
@@ -55,7 +55,6 @@ def test_figures_and_page_of_names_are_made_without_warnings(tmp_path, names):
         assert name in html
         if not is_drawable(name):
             assert f"patch {number}: {figure_label(name, 'x').removeprefix('x: ')}" in html
-    banner_png(tmp_path / "banner.png", context(names))
 
 
 def test_a_name_that_no_font_has_is_a_number_and_ascii():
@@ -75,15 +74,15 @@ def test_the_page_says_which_name_a_label_stands_for():
 
 def test_an_installed_font_that_has_the_glyph_draws_the_name(monkeypatch):
     """A font of mathematical signs stands in for one of CJK: both are tried after matplotlib's own."""
-    own, other = (set(get_font(findfont(f)).get_charmap()) for f in (fonts.OWN, "STIXGeneral"))
+    own, other = (set(get_font(findfont(f)).get_charmap()) for f in (style.OWN, "STIXGeneral"))
     glyph = chr(min(other - own))
     assert not is_drawable(glyph)
-    monkeypatch.setattr(fonts, "FALLBACKS", ("no such family", "STIXGeneral"))
-    caches = (fonts.font_families, fonts._glyphs)
+    monkeypatch.setattr(style, "FALLBACKS", ("no such family", "STIXGeneral"))
+    caches = (style.font_families, style._glyphs)
     try:
         for cached in caches:
             cached.cache_clear()
-        assert font_families() == (fonts.OWN, "STIXGeneral")
+        assert font_families() == (style.OWN, "STIXGeneral")
         assert figure_label(glyph, "patch 1") == glyph
         drawn = figures(context([glyph]))["materials"]
         assert drawn != figures(replace(context(["?"]), title=glyph))["materials"]

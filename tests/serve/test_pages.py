@@ -161,6 +161,20 @@ def test_every_page_fits_and_can_be_read(page, path, size, tmp_path):
     page.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
 
 
+def test_a_scan_that_is_not_there_shows_the_error_alone(page):
+    page.browser.errors.clear()
+    page.open("/scan?scan=nowhere")
+    page.browser.wait("document.getElementById('told').innerText.includes('nowhere')", "the error")
+    shown = "[...document.querySelectorAll('main section, #side')].filter(s => s.checkVisibility()).map(s => s.id)"
+    assert page.browser.value(shown) == ["head"]
+
+
+def test_a_processed_scan_is_watched_with_the_way_to_its_result(page):
+    page.open("/watch?scan=one")
+    page.browser.wait("document.getElementById('p_note')?.innerText.includes('Result')", "the note")
+    assert "yet" not in page.browser.text("p_note")
+
+
 def test_the_list_is_searched_and_two_are_compared(page):
     page.open("/")
     page.fill("#find", "tw")

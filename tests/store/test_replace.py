@@ -15,9 +15,10 @@ from polysight.host.jobs.placement import inspect_placement, replace_folder
 from polysight.host.store import ManifestWriter, ScanFolder, replace_rows
 from polysight.host.store.append_only import crc32
 from polysight.host.store.validation import validate
-from polysight.shared.errors import DataError
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.raster import plan_raster
 from tests.support.capture.records import Record, log_of, mask_of
+from tests.support.refusals import refused
 from tests.support.rigs import rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 
@@ -126,7 +127,7 @@ def test_a_damaged_file_is_told_and_never_placed(tmp_path, suffix, other):
         (scan.path / "raw/RV").rename(scan.path / "raw/RH")
         (scan.path / "raw/x").rename(scan.path / "raw/RV")
     board = "RV" if other else "RH"
-    with pytest.raises(DataError, match=r"not (those|the one) that w(ere|as) committed"):
+    with refused(ErrorCode.FILE_DAMAGED):
         inspect_placement(scan.path / f"raw/{board}/0000.bin", as_json=False)
     left = {r.board: r.damaged for r in replace_rows(scan)}
     assert left == {"RH": not other, "RV": other}
@@ -139,7 +140,7 @@ def test_batches_that_take_packets_back_are_damage(tmp_path):
     batches = np.frombuffer(tail, dtype="<i8", count=4).copy()
     batches[1] += 1 << 40
     path.write_bytes(line + b"\n" + batches.tobytes() + tail[32:])
-    with pytest.raises(DataError, match="not a readable packet log"):
+    with refused(ErrorCode.FILE_DAMAGED, path):
         read_packets(path, np.zeros(10**6, np.uint8))
 
 

@@ -18,10 +18,12 @@ from polysight.host.store.manifest import ManifestWriter, encode_line, parse
 from polysight.host.store.scan_folder import ScanFolder, new_scan_id
 from polysight.host.store.source import RawSource
 from polysight.host.store.validation import to_json, validate
-from polysight.shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import ConfigError, PolysightError
 from polysight.shared.messages import Fault, RunStarted
 from polysight.shared.raster import plan_raster
 from tests.support.acquisition.fake_rig import small_instrument
+from tests.support.refusals import refused
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -80,9 +82,9 @@ def test_every_truncation_gives_the_whole_lines_before_it(tmp_path):
 def test_two_writers_never_share_a_scan(tmp_path):
     path = tmp_path / "manifest.jsonl"
     with ManifestWriter(path, create=True):
-        with pytest.raises(DeviceError, match="another program"):
+        with refused(ErrorCode.BUSY):
             ManifestWriter(path, create=False)
-        with pytest.raises(DeviceError, match="cannot be created"):
+        with refused(ErrorCode.FILE_EXISTS):
             ManifestWriter(path, create=True)
     ManifestWriter(path, create=False).close()
 
@@ -215,19 +217,19 @@ def test_notes_damage_nothing(whole):
 def test_read_row_refuses_damage(whole):
     flip(whole / "raw/RH/0002.bin")
     scan = ScanFolder.load(whole)
-    with pytest.raises(DataError, match=r"0002\.bin"):
+    with refused(ErrorCode.FILE_DAMAGED, "0002.bin"):
         scan.read_row("RH", 2)
-    with pytest.raises(DataError, match="not committed"):
+    with refused(ErrorCode.NO_DATA):
         scan.read_row("LS", 2)
-    with pytest.raises(DataError, match="not committed"):
+    with refused(ErrorCode.NO_DATA):
         scan.read_row("RH", 17)
 
 
 def test_what_is_no_scan_is_refused(whole, tmp_path):
-    with pytest.raises(DataError, match="does not exist"):
+    with refused(ErrorCode.FILE_MISSING):
         validate(tmp_path / "nothing")
     (whole / "manifest.jsonl").write_bytes(b"")
-    with pytest.raises(DataError, match="scan_started"):
+    with refused(ErrorCode.FILE_DAMAGED, "scan_started"):
         ScanFolder.load(whole)
     (whole / "manifest.jsonl").write_bytes(encode_line({"fact": "scan_started", "instrument": {}, "plan": {}}))
     with pytest.raises(ConfigError):

@@ -25,7 +25,8 @@ function card(s) {
   const rows = s.rows ? `${s.committed} of ${s.rows} rows · ` : "";
   const facts = make("div", `${s.seconds ? day(s.seconds) : ""} · ${rows}${bytes(s.bytes)}${s.rig ? ` · ${s.rig}` : ""}`, "facts");
   const found = s.materials.length ? make("div", s.materials.map(called).join(", "), "facts") : "";
-  item.append(picture, link, choose, badges, facts, found, s.notes ? make("div", s.notes, "words") : "");
+  const reason = s.state === "failed" && s.reason ? make("div", s.reason, "facts") : "";
+  item.append(picture, link, choose, badges, facts, reason, found, s.notes ? make("div", s.notes, "words") : "");
   if (s.tags.length) item.append(nest(make("div", null, "badges"), ...s.tags.map((t) => make("span", t, "tag"))));
   item.classList.toggle("chosen", chosen.has(s.name));
   return item;

@@ -43,7 +43,7 @@ async function answer(path, given, options) {
   }
   if (!reply.ok) {
     const told = await reply.json().catch(() => ({ what: `The server answered ${reply.status}` }));
-    if (reply.status === 401 || (reply.status === 403 && told.what?.startsWith("The token"))) askForToken();
+    if (told.code === "token-wrong") askForToken();
     throw new Refused(told, reply.status);
   }
   return reply;
@@ -121,6 +121,7 @@ export const called = (name) => (name === "unknown" ? "not in the library" : nam
 export const STATES = {
   running: ["is being scanned", "wait"], paused: ["paused", "wait"], finished: ["finished", "good"], stopped: ["stopped", "warn"],
   failed: ["failed", "bad"], lost: ["interrupted", "bad"], begun: ["not begun", "warn"], products: ["products only", "good"], damaged: ["damaged", "bad"],
+  silent: ["does not answer", "bad"],
 };
 export const VERDICTS = { good: ["good", "good"], care: ["usable with care", "warn"], none: ["no result", "bad"], damaged: ["products damaged", "bad"] };
 

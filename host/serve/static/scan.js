@@ -206,6 +206,7 @@ by("copy").addEventListener("click", async () => {
 server = await begin(scanName || "Scan");
 try {
   summary = await get("scan", scan);
+  by("side").hidden = by("snippet").hidden = false;
   if (server.starts) {
     const { libraries } = await get("scans");
     by("library").append(...libraries.map((name) => make("option", name, null, { value: name })));

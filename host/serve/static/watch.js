@@ -4,7 +4,7 @@ import { plot, raster } from "./plots.js";
 
 const SILENT_MS = 7000; // the server says something every two seconds
 const SIGNS = { good: "✓", done: "✓", warn: "!", bad: "✕", wait: "…" };
-const CHANNELS = [["h", "H", "s-polarised"], ["v", "V", "p-polarised"], ["p", "P = H / V", "not referenced to metal yet"]];
+const CHANNELS = [["h", "H", "s-polarised"], ["v", "V", "p-polarised"], ["p", "P = H / V", ""]];
 const FEW = 4;
 
 let state = null, motion = {}, source = null, heardAt = 0, allNotices = false, toldNotices = "", revision = -1;
@@ -80,7 +80,7 @@ function buildChannels() {
   by("channels").replaceChildren(...CHANNELS.map(([key, name, note]) => {
     const card = make("div", undefined, "channel");
     const head = make("h3", `${name} `);
-    head.append(make("span", note));
+    head.append(make("span", note, null, { id: `${key}_note` }));
     card.append(head, ...["amplitude", "phase"].map((kind) => {
       const figure = make("figure"), view = make("div", undefined, kind === "phase" || key === "p" ? "view fades" : "view"), caption = make("figcaption");
       view.style.aspectRatio = `${wide} / ${high}`;
@@ -106,6 +106,8 @@ function showImages() {
   const waiting = p.waiting ? `, ${p.waiting} more on their way` : "";
   const early = p.rows && p.rows < state.scan.rows / 3 ? "; sharp when more rows are in" : "";
   by("images-note").textContent = `${p.rows} rows in${waiting}; ${p.width_mm} × ${p.height_mm} mm${early}`;
+  by("p_note").textContent = summary.processed ? "as received; relative to metal under Result"
+    : state.control.running ? "not referenced to metal yet" : "not referenced to metal: not processed";
   if (p.revision === revision) return;
   revision = p.revision;
   for (const [key, { low, high, unit }] of Object.entries(p.items)) {

@@ -1,0 +1,142 @@
+"""Answers of the server without a browser: errors with codes, names of scans, the icon, comparisons."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from polysight.host.serve import control, site
+from polysight.host.serve.programs import program_of
+from polysight.shared.error_codes import ErrorCode
+from tests.support.page.asking import TOKEN, ask, get, post
+from tests.support.page.live_view import Served, served_folder
+from tests.support.paths import RIG_FILE
+from tests.support.processes import wait_for
+from tests.support.products import judged_products
+
+
+@pytest.fixture
+def scans(tmp_path: Path) -> Path:
+    """A folder of two processed scans."""
+    for name in ("one", "two"):
+        judged_products(tmp_path / name / "products", "care")
+        (tmp_path / name / "program").mkdir()
+    return tmp_path
+
+
+@pytest.fixture
+def view(scans: Path) -> Iterator[Served]:
+    with served_folder(scans, TOKEN, config=RIG_FILE) as made:
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "code", "values"),
+    [
+        ("/api/start", {"nmae": "x"}, ErrorCode.KEY_UNKNOWN, ("nmae", "did you mean 'name'")),
+        ("/api/start", {"name": "x", "rows": "three"}, ErrorCode.TYPE_WRONG, ("rows", "three", "whole number")),
+        ("/api/start", {"name": "x", "rows": 0}, ErrorCode.VALUE_INVALID, ("rows", "0", "1")),
+        ("/api/train", {"scans": ["one"]}, ErrorCode.KEY_MISSING, ("name",)),
+        ("/api/notes?scan=one", {"tags": "oak"}, ErrorCode.TYPE_WRONG, ("tags", "a list")),
+        ("/api/notes?scan=one", b"{", ErrorCode.MESSAGE_INVALID, ()),
+        ("/api/notes?scan=one", b"[]", ErrorCode.TYPE_WRONG, ()),
+        ("/api/process?scan=one", {"labels": True}, ErrorCode.FILE_MISSING, ()),
+        ("/api/export?scan=one", {"formats": ["pdf"]}, ErrorCode.VALUE_INVALID, ("pdf",)),
+        ("/api/process?scan=one", {"library": "mine"}, ErrorCode.FILE_MISSING, ("mine",)),
+    ],
+)
+def test_a_wrong_request_is_refused_in_plain_words(view, path, body, code, values):
+    status, answer = post(view, path, body)
+    assert (status, answer["code"]) == (400, code), answer
+    text = " ".join(answer[part] for part in ("what", "why", "do"))
+    assert all(value in text for value in values), text
+    assert all(answer[part] for part in ("what", "why", "do"))
+    assert not any(word in text for word in ("Expected", "Object", "`", "array", "null", "$."))
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "code"),
+    [
+        ("/api/scan?scan=onee", 404, ErrorCode.FILE_MISSING),
+        ("/api/scan?scan=../one", 404, ErrorCode.PATH_OUTSIDE),
+        ("/api/scan", 400, ErrorCode.KEY_MISSING),
+        ("/api/map/nothing?scan=one", 404, ErrorCode.VALUE_INVALID),
+        ("/api/nothing", 404, ErrorCode.OTHER),
+    ],
+)
+def test_errors_carry_their_code(view, path, status, code):
+    found, body, _ = ask(view, path)
+    assert (found, json.loads(body)["code"]) == (status, code)
+
+
+def test_a_folder_inside_a_scan_is_no_scan(view, scans):
+    for path in ("scan", "result", "thumbnail", "map/h_amplitude"):
+        assert ask(view, f"/api/{path}?scan=one/products")[0] == 404, path
+    assert post(view, "/api/notes?scan=one/products", {"notes": "x"})[0] == 404
+    assert post(view, "/api/start", {"name": "one/inside"})[0] == 404
+    assert sorted(p.name for p in (scans / "one").iterdir()) == ["products", "program"]
+
+
+@pytest.mark.parametrize("page", ["/scan", "/watch", "/scan?scan="])
+def test_pages_of_a_scan_without_a_name_lead_to_the_list(view, page):
+    status, _, headers = ask(view, page)
+    assert (status, headers["location"]) == (307, "/")
+
+
+def test_the_icon_is_found_where_browsers_look(view):
+    status, body, headers = ask(view, "/favicon.ico")
+    assert (status, headers["content-type"]) == (200, "image/svg+xml")
+    assert body.startswith(b"<svg")
+
+
+def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
+    done: list[tuple[Path, Path]] = []
+    real = site.compare
+    monkeypatch.setattr(site, "compare", lambda a, b: done.append((a, b)) or real(a, b))
+    for path in ("compare", "compare/sigmas", "compare/p", "compare/loss"):
+        assert ask(view, f"/api/{path}?a=one&b=two")[0] == 200, path
+    assert len(done) == 1
+    assert ask(view, "/api/compare?a=two&b=one")[0] == 200
+    shutil.rmtree(scans / "one" / "products")
+    judged_products(scans / "one" / "products", "care")
+    assert ask(view, "/api/compare/p?a=one&b=two")[0] == 200
+    assert len(done) == 3  # other products are compared again
+
+
+def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
+    both, real = threading.Barrier(2, timeout=3.0), control._check_free
+
+    def together(site: object) -> None:
+        real(site)
+        with suppress(threading.BrokenBarrierError):
+            both.wait()  # neither sees the other's program unless checking and starting are one step
+
+    monkeypatch.setattr(control, "_check_free", together)
+    found: list[int] = []
+    threads = [
+        threading.Thread(target=lambda n=name: found.append(post(view, "/api/start", {"name": n})[0]))
+        for name in ("first", "second")
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(found) == [200, 409]
+    assert sum((scans / name).exists() for name in ("first", "second")) == 1
+
+
+def test_a_scan_that_did_not_begin_says_why(view, scans):
+    """Here no Pi answers; so it is when another program holds the port of a card."""
+    assert post(view, "/api/start", {"name": "three"})[0] == 200
+    wait_for(lambda: not program_of(scans / "three", "scan").running, "the program's end")
+    wait_for(lambda: get(view, "/api/scan?scan=three")["state"] == "failed", "the state")
+    listed = {s["name"]: s for s in get(view, "/api/scans")["scans"]}
+    assert "polysight" not in listed["three"]["reason"]
+    assert len(listed["three"]["reason"]) > 10
+    assert listed["three"]["reason"] in program_of(scans / "three", "scan").log

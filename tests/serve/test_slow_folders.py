@@ -1,0 +1,121 @@
+"""A folder that does not answer, such as a network drive that is gone, stops the reads of no other."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from polysight.host.catalogue import Scans, scans
+from polysight.host.serve import reading, site, watches
+from polysight.shared.error_codes import ErrorCode
+from tests.support.page.asking import TOKEN, ask, get, post
+from tests.support.page.live_view import Served, served_folder
+from tests.support.processes import wait_for
+from tests.support.products import judged_products
+
+LIMIT_S = 0.4
+
+
+class DeadFolder:
+    """Replaces functions by ones that do not return for folders named `dead`, as long as it is dead."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.back, self._patch = threading.Event(), monkeypatch
+
+    def stop(self, module: Any, name: str) -> None:
+        real: Callable[..., Any] = getattr(module, name)
+
+        def hang(folder: Path, *arguments: Any) -> Any:
+            if "dead" in Path(folder).parts:
+                self.back.wait(60)
+            return real(folder, *arguments)
+
+        self._patch.setattr(module, name, hang)
+
+
+@pytest.fixture
+def dead(monkeypatch: pytest.MonkeyPatch) -> Iterator[DeadFolder]:
+    monkeypatch.setattr(site, "READ_S", LIMIT_S)
+    monkeypatch.setattr(scans, "READ_S", LIMIT_S)
+    made = DeadFolder(monkeypatch)
+    yield made
+    made.back.set()
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for name in ("alive", "dead", "other"):
+        judged_products(tmp_path / name / "products", "care")
+        (tmp_path / name / "program").mkdir()
+    return tmp_path
+
+
+@pytest.fixture
+def view(root: Path) -> Iterator[Served]:
+    with served_folder(root, TOKEN) as made:
+        yield made
+
+
+def test_other_scans_are_read_while_one_folder_hangs(dead, view):
+    dead.stop(reading, "result_of")
+    answers: list[tuple[int, bytes, dict[str, str]]] = []
+    many = [threading.Thread(target=lambda: answers.append(ask(view, "/api/result?scan=dead"))) for _ in range(20)]
+    for one in many:
+        one.start()
+    began = time.monotonic()
+    assert get(view, "/api/result?scan=alive")["scan_id"]
+    assert get(view, "/api/scans")["scans"]
+    for one in many:
+        one.join(20)
+    assert {status for status, _, _ in answers} == {503}
+    assert len(answers) == 20
+    assert ErrorCode.NO_ANSWER.encode() in answers[0][1]
+    assert time.monotonic() - began < 15
+    dead.back.set()
+    wait_for(lambda: ask(view, "/api/result?scan=dead")[0] == 200, "that the folder is read again")
+
+
+def test_notes_and_names_of_a_dead_folder_hold_nobody_up(dead, view):
+    dead.stop(scans, "is_scan")
+    assert ask(view, "/api/scan?scan=dead")[0] == 503
+    assert post(view, "/api/notes?scan=dead", {"notes": "x"})[0] == 503
+    assert ask(view, "/api/thumbnail?scan=dead")[0] == 503
+    assert get(view, "/api/scan?scan=alive")["processed"]
+
+
+def test_a_list_shows_a_folder_that_does_not_answer(dead, root):
+    dead.stop(scans, "is_scan")
+    listed, threads = Scans(root), threading.active_count()
+    for _ in range(3):
+        found = {s.name: s.state for s in listed.list()}
+        assert found == {"alive": "products", "dead": "silent", "other": "products"}
+    assert threading.active_count() - threads <= 1  # of the folder that hangs, however often it is listed
+    dead.back.set()
+    wait_for(lambda: {s.state for s in listed.list()} == {"products"}, "that the folder is listed again")
+
+
+def test_a_list_keeps_what_it_knew_of_a_folder_that_does_not_answer(dead, root):
+    listed = Scans(root)
+    before = listed.list()
+    dead.stop(scans, "is_scan")
+    assert [s.name for s in listed.list()] == [s.name for s in before]
+    assert {s.name: s.state for s in listed.list()}["dead"] == "silent"
+
+
+def test_a_dead_folder_stops_no_other_live_view(dead, view):
+    dead.stop(watches, "Watch")
+    assert ask(view, "/api/state?scan=dead")[0] == 503
+    assert get(view, "/api/state?scan=alive")["scan"] is None
+
+
+def test_the_size_of_a_dead_folder_is_not_waited_for(dead, root, monkeypatch):
+    monkeypatch.setattr(site, "SIZE_S", LIMIT_S)
+    dead.stop(site, "folder_bytes")
+    sizes = site.Sizes()
+    assert sizes.of(root / "dead") is None
+    wait_for(lambda: sizes.of(root / "alive") is not None, "the size of another folder")

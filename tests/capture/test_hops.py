@@ -85,7 +85,7 @@ def row(**given) -> RowCapture:
         (row(), "the radar is not streaming"),
         (row(strangers=7), "7 packets"),
         (row(card_status=int(Status.NO_LVDS_DATA)), "the radar sends nothing over LVDS"),
-        (row(card_status=int(Status.NO_HEADER)), "without the header"),
+        (row(card_status=int(Status.NO_HEADER)), "without a header"),
     ],
 )
 def test_a_radar_that_does_not_stream(got, says):

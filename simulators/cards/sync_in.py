@@ -65,7 +65,7 @@ class SyncInput:
         self.rearmed += 1
 
     def frames(self, pulses: list[Pulse]) -> list[Pulse]:
-        """Return the pulses that start a frame; count the others in `too_soon` (a real radar would fault) or `unarmed`."""
+        """Return the pulses that start a frame; count the others as `too_soon` (a real radar faults) or `unarmed`."""
         if self._radar is not None:
             return self._native(self._radar, pulses)
         started = []

@@ -18,11 +18,11 @@ from polysight.shared.faults import PiFault
 from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS
 from polysight.shared.units import us_to_ns
 
-FASTEST_HZ, SLOWEST_HZ = 2_000_000, 500_000  # SPI clock for pulses of 0.5 .. 2 us
+MAX_HZ, MIN_HZ = 2_000_000, 500_000  # SPI clock for pulses of 0.5 .. 2 us
 LEAD_BITS = 8  # low bits before the first pulse, and at least as many after the last: MOSI keeps the last bit's level
-SHORTEST_BYTES = 96  # shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA
+MIN_BYTES = 96  # shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA
 DEFAULT_BUFSIZ = 4096
-SHORTEST_PART = 0.98  # of the nominal duration; a shorter transfer was clocked too fast, its frames too close
+MIN_PART = 0.98  # of the nominal duration; a shorter transfer was clocked too fast, its frames too close
 
 
 class Edge(NamedTuple):
@@ -89,8 +89,8 @@ class _Lines(Protocol):
         """Return at `t_ns`, never before it."""
         ...
 
-    def wait_edge(self, limit_s: float) -> Edge | None:
-        """Return the next rising edge of the trigger line, or None after a timeout of `limit_s` (wall time)."""
+    def wait_edge(self, timeout_s: float) -> Edge | None:
+        """Return the next rising edge of the trigger line, or None after a timeout of `timeout_s` (wall time)."""
         ...
 
     def close(self) -> None:
@@ -124,13 +124,13 @@ Lines = PulseLines | BitLines
 def spi_burst(spec: BurstSpec, bufsiz: int = DEFAULT_BUFSIZ) -> SpiBurst:
     """Return the SPI transfer of a burst, for a spidev buffer of `bufsiz` bytes.
 
-    One bit lasts one pulse width, with the clock within SLOWEST_HZ .. FASTEST_HZ; SLOWEST_HZ if the burst does not fit
+    One bit lasts one pulse width, with the clock within MIN_HZ .. MAX_HZ; MIN_HZ if the burst does not fit
     otherwise. Raises ConfigError, with the `bufsiz` to set, if it does not fit even then.
     """
     size = 0
-    for clock_hz in (min(max(round(1e9 / spec.width_ns), SLOWEST_HZ), FASTEST_HZ), SLOWEST_HZ):
+    for clock_hz in (min(max(round(1e9 / spec.width_ns), MIN_HZ), MAX_HZ), MIN_HZ):
         bits = tuple(LEAD_BITS + round(k * spec.period_ns * clock_hz / 1e9) for k in range(spec.pulses))
-        size = max(SHORTEST_BYTES, (bits[-1] + LEAD_BITS) // 8 + 1)
+        size = max(MIN_BYTES, (bits[-1] + LEAD_BITS) // 8 + 1)
         if size <= bufsiz:
             data = bytearray(size)
             for bit in bits:
@@ -213,7 +213,7 @@ def _send_bits(
     if spec.period_ns * burst.clock_hz % 10**9:  # pulses are up to half a bit away from their exact times
         jitter_ns += round(burst.bit_ns / 2)
     fault = 0
-    if took_ns < SHORTEST_PART * burst.duration_ns:
+    if took_ns < MIN_PART * burst.duration_ns:
         fault = int(PiFault.PERIOD_TOO_SHORT)
     elif lines.check_width and width_ns > MAX_WIDTH_NS:
         fault = int(PiFault.PULSE_TOO_LONG)

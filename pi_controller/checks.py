@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import zmq
 
 from polysight.pi_controller import AS_THE_SERVICE, system
-from polysight.pi_controller.bursts import SHORTEST_PART, BurstSpec, spi_burst
+from polysight.pi_controller.bursts import MIN_PART, BurstSpec, spi_burst
 from polysight.pi_controller.journal import Journal
 from polysight.pi_controller.lines import (
     GpiodLines,
@@ -30,7 +30,7 @@ from polysight.shared.sockets import is_loopback, publisher, replier
 
 JOURNAL_BYTES = 100 << 20  # a scan of 70,000 positions journals about 20 MB
 TRANSFERS = 5
-LONGEST_PART = 1.05  # of the nominal duration: the system call adds some 100 us to 22 ms
+MAX_PART = 1.05  # of the nominal duration: the system call adds some 100 us to 22 ms
 PAIRS, PAUSE_NS = 500, 300_000  # pairs of system calls to time, and the pause between them
 MODEL, MODULES = Path("/proc/device-tree/model"), Path("/sys/module")
 STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
@@ -196,7 +196,7 @@ def measure_clock(instrument: Instrument) -> str | Finding:
         device.close()
     bit_ns = min(took) / (8 * len(zeros))
     found = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
-    if SHORTEST_PART <= bit_ns / burst.bit_ns <= LONGEST_PART:
+    if MIN_PART <= bit_ns / burst.bit_ns <= MAX_PART:
         return found + " (SPI controller, measured now with the line low)"
     remedy = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
     return Finding("pulse width", "fail", found, remedy)

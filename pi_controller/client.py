@@ -14,14 +14,14 @@ import zmq
 
 from polysight.pi_controller import AS_THE_SERVICE
 from polysight.pi_controller.service import TAKE_OVER_KEY
-from polysight.pi_controller.stage import MOTION_LIMIT_S
+from polysight.pi_controller.stage import MOTION_TIMEOUT_S
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, os_error
 from polysight.shared.sockets import Socket, requester, subscriber
 
-CONNECT_LIMIT_S = 2.0
+CONNECT_TIMEOUT_S = 2.0
 Ask = Callable[..., Any]
 
 
@@ -60,7 +60,7 @@ def _listens(address: str) -> bool:
     """True if any program listens there. Needs no answer, which a busy machine would give late."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_LIMIT_S).close()
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_S).close()
     except (OSError, ValueError):
         return False
     return True
@@ -87,7 +87,7 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
         return None
     with _service(instrument) as ask:
         ask(m.Home())
-        deadline = time.monotonic() + MOTION_LIMIT_S
+        deadline = time.monotonic() + MOTION_TIMEOUT_S
         while time.monotonic() < deadline:
             status = ask(m.Status())
             if status.state == "fault":
@@ -117,12 +117,12 @@ def take_over(instrument: Instrument, what: str) -> str:
         return ask({"hold": m.Hold, "resume": m.Resume}[what](owner=owner)).state
 
 
-def follow_events(instrument: Instrument, limit_s: float) -> Iterator[Any]:
-    """Yield live events as plain objects. Raises DeviceError after `limit_s` without one."""
+def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
+    """Yield live events as plain objects. Raises DeviceError after `timeout_s` without one."""
     context: zmq.Context[Socket] = zmq.Context()
     try:
         listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
-        while listener.poll(round(limit_s * 1e3)):
+        while listener.poll(round(timeout_s * 1e3)):
             yield msgspec.to_builtins(m.unpack_event(listener.recv_multipart()[-1]))
         raise _no_answer(instrument.pi.event_address)
     finally:

@@ -30,7 +30,7 @@ from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, 
 from polysight.shared.stage_line import Reply
 from polysight.shared.units import us_to_ns
 
-TURN_LIMIT_S = 0.2  # the rest of the queue waits for the next turn, so that a queue that never empties is not a hang
+TURN_TIMEOUT_S = 0.2  # the rest of the queue waits for the next turn, so that a queue that never empties is not a hang
 TURN_S = 1.0  # longest turn without work
 HUNG_S = 10.0  # time without a turn after which the executor counts as hung
 COMMANDS_WAITING, REPLAYS_WAITING = 64, 4
@@ -118,10 +118,10 @@ class Executor:
         self._refresh()
         self._thread.start()
 
-    def stop(self, limit_s: float) -> None:
+    def stop(self, timeout_s: float) -> None:
         """Stop the stage, end the row as aborted, end the thread."""
         self.post(self._end)
-        self._thread.join(limit_s)
+        self._thread.join(timeout_s)
 
     # --- the thread -------------------------------------------------------------------------------------------------
 
@@ -137,12 +137,12 @@ class Executor:
         try:
             left_s = self._machine.seconds_left()
             self._handle(self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S)))
-            until_s = time.monotonic() + TURN_LIMIT_S
+            until_s = time.monotonic() + TURN_TIMEOUT_S
             while time.monotonic() < until_s:
                 self._handle(self._inbox.get_nowait())
         except queue.Empty:
             pass
-        self._machine.check_limits()
+        self._machine.check_deadlines()
         try:
             self._journal.commit()
         except JournalFullError as e:

@@ -172,10 +172,10 @@ class TriggerInput:
         while time.monotonic_ns() < t_ns:
             pass
 
-    def wait_edge(self, limit_s: float) -> Edge | None:
+    def wait_edge(self, timeout_s: float) -> Edge | None:
         """Return the next rising edge, or None after a timeout. Raises DeviceError when the line is lost."""
         try:
-            if not self._events and self._input.wait_edge_events(timedelta(seconds=limit_s)):
+            if not self._events and self._input.wait_edge_events(timedelta(seconds=timeout_s)):
                 self._events.extend(self._input.read_edge_events())
         except OSError as e:
             raise _lost(e) from None

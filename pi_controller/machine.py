@@ -82,12 +82,12 @@ RULES = (
     Rule("timeout", "done", "ending", "disarm"),
     Rule("settled", "ending", "ready idle fault", "finish_row"),
 )
-LIMITS_S: dict[State, float] = {
+TIMEOUTS_S: dict[State, float] = {
     "homing": HOMING_TIMEOUT_S,
     "stopping": 3.0,  # from STOP to standstill
     "done": 1.0,  # from the stage's `done` to the last burst
 }  # running: set for each row; all others: no limit
-END_LIMIT_S = 0.5  # from STOP to standstill when the program is being ended
+END_TIMEOUT_S = 0.5  # from STOP to standstill when the program is being ended
 HOST_MISSES = 4  # missing heartbeats after which the host is lost
 WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others have the same name
 
@@ -102,7 +102,7 @@ class Machine:
         self._post, self._clock = post, clock
         self.state: State = "idle"
         self.reason = ""  # of the first fault
-        self.row_limit_s = math.inf
+        self.row_timeout_s = math.inf
         self._deadline_s = math.inf
         self.watch_host(0)
         self._rules: dict[tuple[str, str], tuple[list[Any], Callable[..., str | None]]] = {
@@ -125,8 +125,8 @@ class Machine:
         return True
 
     def _enter(self, state: State) -> None:
-        limit_s = self.row_limit_s if state == "running" else LIMITS_S.get(state, math.inf)
-        self.state, self._deadline_s = state, self._clock() + limit_s
+        timeout_s = self.row_timeout_s if state == "running" else TIMEOUTS_S.get(state, math.inf)
+        self.state, self._deadline_s = state, self._clock() + timeout_s
         if state == "ending":  # after the bursts that are still in the queue
             self._post(partial(self.happen, "settled"))
 
@@ -158,7 +158,7 @@ class Machine:
 
     def watch_host(self, heartbeat_ms: int) -> None:
         """Expect the host's heartbeat at this interval; 0 disables the check."""
-        self._host_limit_s = HOST_MISSES * heartbeat_ms / 1e3 if heartbeat_ms else math.inf
+        self._host_timeout_s = HOST_MISSES * heartbeat_ms / 1e3 if heartbeat_ms else math.inf
         self._host_alive_s = self._clock()
 
     def note_host_alive(self) -> None:
@@ -168,21 +168,21 @@ class Machine:
     @property
     def host_lives(self) -> bool:
         """True if every heartbeat so far arrived on time; False if none is expected."""
-        return self._host_limit_s < math.inf and self._clock() < self._host_alive_s + self._host_limit_s
+        return self._host_timeout_s < math.inf and self._clock() < self._host_alive_s + self._host_timeout_s
 
     @property
     def _host_lost_s(self) -> float:
-        return self._host_alive_s + self._host_limit_s if self.state in ("running", "held") else math.inf
+        return self._host_alive_s + self._host_timeout_s if self.state in ("running", "held") else math.inf
 
     def seconds_left(self) -> float | None:
         """Return the time until the next deadline, or None."""
         at_s = min(self._deadline_s, self._host_lost_s)
         return None if at_s == math.inf else max(0.0, at_s - self._clock())
 
-    def check_limits(self) -> None:
+    def check_deadlines(self) -> None:
         """Handle deadlines that have passed."""
         if self._clock() >= self._deadline_s:
             self.happen("timeout")
         if self._clock() >= self._host_lost_s:
-            reason = f"no heartbeat of the host for {self._host_limit_s * 1e3:.0f} ms"
+            reason = f"no heartbeat of the host for {self._host_timeout_s * 1e3:.0f} ms"
             self.happen("row fault", PiFault.HOST_LOST, reason)

@@ -12,8 +12,8 @@ from functools import partial
 
 from polysight.pi_controller.bursts import BurstSpec
 from polysight.pi_controller.journal import Journal
-from polysight.pi_controller.machine import END_LIMIT_S, Machine, RefusedError
-from polysight.pi_controller.stage import MOST_MM, StageDriver
+from polysight.pi_controller.machine import END_TIMEOUT_S, Machine, RefusedError
+from polysight.pi_controller.stage import MAX_MM, StageDriver
 from polysight.pi_controller.stage_link import StageLostError, StageRefusedError
 from polysight.pi_controller.trigger import BurstSent, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight.shared import messages as m
@@ -180,7 +180,7 @@ class RowMachine(Machine):
         self.stage.at_rest()
         k = self.stage.config.steps_per_mm
         lost_x_mm, lost_y_mm = (_number(reply, key) / k for key in ("lostx", "losty"))
-        self.lost_mm = (max(-MOST_MM, min(lost_x_mm, MOST_MM)), max(-MOST_MM, min(lost_y_mm, MOST_MM)))
+        self.lost_mm = (max(-MAX_MM, min(lost_x_mm, MAX_MM)), max(-MAX_MM, min(lost_y_mm, MAX_MM)))
         self.homed = True
         return "ready" if self.in_run else "homed"
 
@@ -203,7 +203,7 @@ class RowMachine(Machine):
                 self.happen("not homed")
             raise
         self.row = RunningRow(row, take, job, sequence)
-        self.row_limit_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
+        self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
         self._rests, self._watch = 0, TriggerWatch()
         self.fault, self.reason = 0, ""
         self._journal.add(m.RowStarted, row=row, take=take)
@@ -245,7 +245,7 @@ class RowMachine(Machine):
         self._terminating = True
         self.happen("Abort", "polysight-pi was ended")
         if self.state == "stopping":
-            self._deadline_s = self._clock() + END_LIMIT_S
+            self._deadline_s = self._clock() + END_TIMEOUT_S
         return self.row is not None
 
     def _fail_row(self, number: int, reason: str) -> str | None:
@@ -273,7 +273,7 @@ class RowMachine(Machine):
         if not self._terminating:
             reasons = {
                 "homing": f"not homed after {HOMING_TIMEOUT_S} s",
-                "running": f"the row has not ended after {self.row_limit_s:.0f} s",
+                "running": f"the row has not ended after {self.row_timeout_s:.0f} s",
                 "stopping": "the stage did not stop",
             }
             self._lose_stage(PiFault.STAGE_LOST, reasons[self.state])

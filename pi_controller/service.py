@@ -21,7 +21,7 @@ from polysight.shared.config import Instrument
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 
-END_LIMIT_S = 0.8
+END_TIMEOUT_S = 0.8
 TAKE_OVER_KEY = "take-over-key"  # file beside the journals with a key that every run accepts from a person at the Pi
 
 
@@ -67,7 +67,7 @@ class Service:
         memory.start()
         self.server.run(self.executor)
         memory.stop()
-        self.executor.stop(END_LIMIT_S)
+        self.executor.stop(END_TIMEOUT_S)
         self.server.drain()
         if self.executor.crash is not None:
             what = f"the executor failed: {self.executor.crash!r}"

@@ -36,13 +36,13 @@ class WireLines:
         """Advance the wire time; return at once."""
         self._now_ns = max(self._now_ns, t_ns)
 
-    def wait_edge(self, limit_s: float) -> Edge | None:
+    def wait_edge(self, timeout_s: float) -> Edge | None:
         """Send the edges of the last burst and wait for the next rising edge of the trigger line.
 
         Raises DeviceError when the hub is lost.
         """
         self._flush()
-        deadline = time.monotonic() + limit_s
+        deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
             message = self._client.receive(left)
             if isinstance(message, WireEdge) and message.line == self._trigger and message.value:

@@ -23,10 +23,10 @@ from polysight.shared.raster import Row
 from polysight.shared.stage_line import HOMING_TIMEOUT_S, Immediate, Parameter, Reply
 
 IDLE_STATUS_S = 1.0
-STOP_LIMIT_S = 3.0  # from STOP to standstill
+STOP_TIMEOUT_S = 3.0  # from STOP to standstill
 CLEAR_RETRY_S = 0.05
-MOST_MM = 1e6  # limit of a position in the messages
-MOTION_LIMIT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
+MAX_MM = 1e6  # limit of a position in the messages
+MOTION_TIMEOUT_S = HOMING_TIMEOUT_S  # no motion takes longer than homing
 
 
 class StageDriver:
@@ -71,7 +71,7 @@ class StageDriver:
 
         Raises StageRefusedError if the cause of the alarm is still there, or the position is unknown.
         """
-        deadline = time.monotonic() + STOP_LIMIT_S
+        deadline = time.monotonic() + STOP_TIMEOUT_S
         while True:
             try:
                 self.link.request("CLEAR")
@@ -127,7 +127,7 @@ class StageDriver:
             x_mm, y_mm = (reply.integer(axis) / self.config.steps_per_mm for axis in "xy")
         except ProtocolError:
             return
-        if max(abs(x_mm), abs(y_mm)) <= MOST_MM:
+        if max(abs(x_mm), abs(y_mm)) <= MAX_MM:
             self.x_mm, self.y_mm = x_mm, y_mm
 
     def close(self) -> None:
@@ -199,15 +199,15 @@ class BenchStage:
         return self._wait(lambda reply: reply.kind == "status", 1.0, silent)
 
     def _finish(self, sequence: int) -> Position:
-        late = StageLostError(f"the motion has not ended after {MOTION_LIMIT_S:.0f} s", "the motors stall", "look")
+        late = StageLostError(f"the motion has not ended after {MOTION_TIMEOUT_S:.0f} s", "the motors stall", "look")
         try:
-            return self._wait(lambda r: r.kind == "done" and r.sequence == sequence, MOTION_LIMIT_S, late)
+            return self._wait(lambda r: r.kind == "done" and r.sequence == sequence, MOTION_TIMEOUT_S, late)
         except KeyboardInterrupt:
             self._driver.link.send_byte(Immediate.STOP)
             raise
 
-    def _wait(self, wanted: Callable[[Reply], bool], limit_s: float, timeout: StageLostError) -> Position:
-        deadline = time.monotonic() + limit_s
+    def _wait(self, wanted: Callable[[Reply], bool], timeout_s: float, timeout: StageLostError) -> Position:
+        deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
             try:
                 news = self._news.get(timeout=left)

@@ -29,8 +29,8 @@ from polysight.shared.stage_line import (
     Reply,
 )
 
-BANNER_LIMIT_S = 3.0  # the first opening of the port resets an UNO, whose boot loader takes up to 2 s
-ANSWER_LIMIT_S = 0.5  # the longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine
+BANNER_TIMEOUT_S = 3.0  # the first opening of the port resets an UNO, whose boot loader takes up to 2 s
+ANSWER_TIMEOUT_S = 0.5  # the longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine
 TRIES = 4
 RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
 STATUS_PER_HEARTBEAT = 4  # while moving
@@ -102,7 +102,7 @@ class StageLink:
         those after it), and one :class:`StageLost` when the link is lost. Must return at once.
     heartbeat_s
         The stage's heartbeat; the stage is lost if a status request is not answered within half of it.
-    banner_limit_s
+    banner_timeout_s
         Timeout for the banner of a stage that was reset by opening the port; a stage without one is greeted anyway.
     """
 
@@ -112,7 +112,7 @@ class StageLink:
         baud: int,
         news: Callable[[StageNews], None],
         heartbeat_s: float = 2.0,
-        banner_limit_s: float = BANNER_LIMIT_S,
+        banner_timeout_s: float = BANNER_TIMEOUT_S,
     ) -> None:
         self.port, self._news = port, news
         self._watch = StatusWatch(heartbeat_s, time.monotonic())
@@ -141,13 +141,13 @@ class StageLink:
         self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
         self._reader.start()
         try:
-            self._greet(banner_limit_s)
+            self._greet(banner_timeout_s)
         except DeviceError:
             self.close()
             raise
 
-    def _greet(self, banner_limit_s: float) -> None:
-        self._banner_seen.wait(banner_limit_s)
+    def _greet(self, banner_timeout_s: float) -> None:
+        self._banner_seen.wait(banner_timeout_s)
         self._write(b"\n")  # ends a partial line sent earlier
         hello = self.request("HELLO")
         fields = {**(self._banner.fields if self._banner else {}), **hello.fields}
@@ -193,7 +193,7 @@ class StageLink:
         )
 
     def _answer(self, sequence: int) -> Reply | None:
-        deadline = time.monotonic() + ANSWER_LIMIT_S
+        deadline = time.monotonic() + ANSWER_TIMEOUT_S
         while (left := deadline - time.monotonic()) > 0:
             try:
                 answer = self._answers.get(timeout=left)

@@ -18,7 +18,7 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 # preempted by other programs.
 PRIORITY, OTHERS_PRIORITY = 50, 40
 SWITCH_INTERVAL_S = 100e-6  # the default of 5 ms is three pulse periods
-MOST_BYTES = 160 << 20  # the program needs 30 to 60 MB, a subscriber that does not read up to 50
+MAX_BYTES = 160 << 20  # the program needs 30 to 60 MB, a subscriber that does not read up to 50
 SPARE_BYTES = 64 << 20  # minimum above the memory left after a cut: not all freed memory returns to the system
 LOOK_S = 0.05
 SETTLE_S = 0.5
@@ -86,7 +86,7 @@ class MemoryWatch(threading.Thread):
         self._ports, self._warn = ports, warn
         self._ended = threading.Event()
         self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)  # kept open: descriptors may run out
-        self._most_bytes = max(MOST_BYTES, self.resident_bytes() + SPARE_BYTES)
+        self._most_bytes = max(MAX_BYTES, self.resident_bytes() + SPARE_BYTES)
 
     def resident_bytes(self) -> int:
         """Return the memory in use by this process."""
@@ -103,7 +103,7 @@ class MemoryWatch(threading.Thread):
                 self._ended.wait(SETTLE_S)
                 ctypes.CDLL(None).malloc_trim(0)
                 left = self.resident_bytes()
-                self._most_bytes = max(MOST_BYTES, left + SPARE_BYTES)
+                self._most_bytes = max(MAX_BYTES, left + SPARE_BYTES)
                 self._warn(f"{held >> 20} MiB in memory: {cut} connections were cut, {left >> 20} MiB are left")
 
     def _cut_connections(self) -> int:

@@ -128,12 +128,12 @@ class TriggerLoop:
         """True while the thread runs."""
         return self._thread.is_alive()
 
-    def stop(self, limit_s: float = 0.5) -> bool:
+    def stop(self, timeout_s: float = 0.5) -> bool:
         """End the thread, set outputs low, release the lines. Return True if it ended within the limit."""
         first = not self._stop.is_set()
         self._stop.set()
         if self._thread.ident is not None:
-            self._thread.join(limit_s)
+            self._thread.join(timeout_s)
         elif first:
             self._lines.close()
         return not self._thread.is_alive()

@@ -17,7 +17,7 @@ import pytest
 
 from polysight.pi_controller import executor as executors
 from polysight.pi_controller.executor import REPLAYS_WAITING
-from polysight.pi_controller.system import MOST_BYTES
+from polysight.pi_controller.system import MAX_BYTES
 from polysight.shared import messages as m
 
 MORE, LONG, COMMAND = 1, 2, 4
@@ -77,7 +77,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     watcher = threading.Thread(target=watch)
     watcher.start()
     sent = 0
-    while highest[0] << 20 < MOST_BYTES and sent < ENOUGH_BYTES:  # ZeroMQ itself ends some of these connections
+    while highest[0] << 20 < MAX_BYTES and sent < ENOUGH_BYTES:  # ZeroMQ itself ends some of these connections
         with connected((program.ready[1], program.events[1])[which], kind) as peer, suppress(ConnectionError):
             peer.settimeout(0.1)  # a connection that was cut may stall before it is closed
             left = b""
@@ -103,7 +103,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
 
 def test_a_queue_that_never_empties_is_not_a_hang(pi, monkeypatch):
     """The executor completes turns, however much waits: the watchdog and `Alive` go by them."""
-    monkeypatch.setattr(executors, "TURN_LIMIT_S", 0.05)
+    monkeypatch.setattr(executors, "TURN_TIMEOUT_S", 0.05)
     longest = 0.0
     done = threading.Event()
     for _ in range(30):

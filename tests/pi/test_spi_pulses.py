@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from polysight.pi_controller.bursts import (
     DEFAULT_BUFSIZ,
-    FASTEST_HZ,
-    SHORTEST_BYTES,
-    SLOWEST_HZ,
+    MAX_HZ,
+    MIN_BYTES,
+    MIN_HZ,
     BurstSpec,
     SpiBurst,
     send_burst,
@@ -40,7 +40,7 @@ def ones(data: bytes) -> list[int]:
 def test_one_set_bit_a_pulse_at_its_place(burst):
     pulses, period_ns, width_ns = burst
     made = spi_burst(BurstSpec(pulses, period_ns, width_ns), ROOMY)
-    assert SLOWEST_HZ <= made.clock_hz <= FASTEST_HZ
+    assert MIN_HZ <= made.clock_hz <= MAX_HZ
     assert 500 <= made.bit_ns <= 2000
     assert MIN_WIDTH_NS <= made.bit_ns <= MAX_WIDTH_NS
     found = ones(made.data)
@@ -51,10 +51,10 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
     for a, b in itertools.pairwise(found):
         assert abs((b - a) * made.bit_ns - period_ns) <= made.bit_ns + 1
     assert made.data[0] == made.data[-1] == 0, "low before and after"
-    assert len(made.data) >= SHORTEST_BYTES
+    assert len(made.data) >= MIN_BYTES
 
 
-@given(bursts, st.integers(SHORTEST_BYTES, 65_536))
+@given(bursts, st.integers(MIN_BYTES, 65_536))
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
     needed = len(spi_burst(BurstSpec(*burst), ROOMY).data)
     slowest = len(spi_burst(BurstSpec(burst[0], burst[1], 2000), ROOMY).data)
@@ -92,7 +92,7 @@ class Controller:
     def sleep_until(self, t_ns: int) -> None:
         self.t = max(self.t, t_ns)
 
-    def wait_edge(self, limit_s: float) -> None: ...
+    def wait_edge(self, timeout_s: float) -> None: ...
     def close(self) -> None: ...
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:

@@ -44,7 +44,7 @@ def test_the_banner_is_awaited_and_greeted(dry_stage, connect):
 
 def test_a_stage_without_banner_is_greeted_after_the_limit(dry_stage, connect):
     dry_stage.banner = False
-    link, _ = connect(banner_limit_s=0.05)
+    link, _ = connect(banner_timeout_s=0.05)
     assert link.request("SET", 1, 500).kind == "ok"
 
 

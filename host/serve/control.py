@@ -20,7 +20,7 @@ from polysight.host.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
 from polysight.host.jobs.label import save_labels
 from polysight.host.materials import Labels
 from polysight.host.plan import Changes, forecast, forecast_values
-from polysight.host.products import find_labels, label_place, read_products
+from polysight.host.products import find_labels, label_folder, read_products
 from polysight.host.serve.guard import cookie_name
 from polysight.host.serve.programs import Programs, program_of
 from polysight.host.serve.site import LIBRARIES, Site
@@ -301,7 +301,7 @@ async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str,
 
     def save(folder: Path) -> dict[str, Any]:
         products = read_products(folder)
-        place = label_place(products.folder)
+        place = label_folder(products.folder)
         checked, notes = save_labels(place, products, labels)
         return {"what": "saved", "file": str(place / "labels.json"), "metal": checked.metal, "notes": notes}
 

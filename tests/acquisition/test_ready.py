@@ -60,7 +60,7 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
 def test_pi_and_host_have_the_same_homing_timeout():
     from polysight.pi_controller import machine, stage
 
-    assert machine.LIMITS_S["homing"] == stage.MOTION_LIMIT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
+    assert machine.TIMEOUTS_S["homing"] == stage.MOTION_TIMEOUT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4])

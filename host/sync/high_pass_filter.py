@@ -172,7 +172,7 @@ def fit_high_pass(
         raise DataError(
             f"no filter fits the sweep: corners of {', '.join(f'{c / 1e3:.0f}' for c in corners)} kHz",
             "the IF range does not reach down to the filter's corners, or the reflector moved",
-            "measure at mean IFs from about 250 kHz, which trigger jitter of 200 kHz spreads to half the lower corner, to"
-            " several times the upper corner (docs/how-to/calibration.md)",
+            "measure at mean IFs from about 250 kHz, which trigger jitter of 200 kHz spreads to half the lower corner,"
+            " to several times the upper corner (docs/how-to/calibration.md)",
         )
     return HighPass(tuple(float(c) for c in corners))

@@ -267,15 +267,15 @@ def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, command
 
 def test_a_refusal_just_after_a_restart_is_reported_as_a_restart(radar, board, monkeypatch):
     """The ROM answers before it reports its power-up."""
-    obey = board.cores.obey
+    execute = board.cores.execute
 
     def restarting(number, data, remaining):
         if number == 0x0082:
             board.cores.event(0x5000, struct.pack("<IQQ", 371_216, 0, 0), 0.03)
             return 6, b"", 0.0
-        return obey(number, data, remaining)
+        return execute(number, data, remaining)
 
-    monkeypatch.setattr(board.cores, "obey", restarting)
+    monkeypatch.setattr(board.cores, "execute", restarting)
     with refused(ErrorCode.RADAR_RESTARTED, "LS"):
         radar.configure()
 

@@ -47,7 +47,7 @@ def _faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
 
 @settings(deadline=None)
 @given(st.lists(_faults_of_one_command(), min_size=1, max_size=8))
-def test_whatever_is_lost_every_command_is_obeyed_in_order_and_once(faults_of_each: list[list[Fault]]):
+def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_of_each: list[list[Fault]]):
     """Twice only where the answer was lost and its repetition was then heard damaged: a NACK asks for a new number."""
     clock = VirtualClock()
     board = Simulated(lambda: clock.time, flash=make_image())
@@ -70,7 +70,7 @@ def test_whatever_is_lost_every_command_is_obeyed_in_order_and_once(faults_of_ea
 @given(st.integers(0, 900), st.integers(0, 15))
 @example(0, 0)
 @example(7, 3)
-def test_a_flipped_bit_anywhere_never_makes_another_setting(at: int, bit: int):
+def test_a_flipped_bit_never_changes_a_setting(at: int, bit: int):
     clock = VirtualClock()
     clean_board, board = (
         Simulated(lambda: clock.time, flash=make_image()),

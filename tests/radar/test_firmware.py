@@ -54,7 +54,7 @@ def test_a_file_that_is_no_image_is_refused_with_the_reason(data, why):
 
 @settings(deadline=None)
 @given(st.integers(0, 8 * len(DATA) - 1))
-def test_no_flipped_bit_passes(bit):
+def test_an_image_with_a_flipped_bit_is_refused(bit):
     data = bytearray(DATA)
     data[bit // 8] ^= 1 << bit % 8
     with pytest.raises(ConfigError):
@@ -63,19 +63,19 @@ def test_no_flipped_bit_passes(bit):
 
 @settings(deadline=None)
 @given(st.integers(0, len(DATA) - 1))
-def test_no_part_of_an_image_passes(size):
+def test_a_truncated_image_is_refused(size):
     with pytest.raises(ConfigError):
         check_image(DATA[:size], "image.bin")
 
 
-def test_an_image_tells_what_it_patches_and_to_what(tmp_path):
+def test_an_image_has_the_versions_of_rom_and_patches(tmp_path):
     (tmp_path / "a.bin").write_bytes(DATA)
     image = read_image(tmp_path / "a.bin")
     assert (image.name, image.rom, image.patches) == ("a.bin", (2, 2, 1, 7), ("2.2.2.0", "2.2.4.0"))
 
 
 @pytest.mark.parametrize("size", [1, 223, 224, 225, 456, 457, 1000])
-def test_parts_of_an_image_join_to_it(size):
+def test_the_parts_of_an_image_are_the_whole_image(size):
     image = bytes(n % 251 for n in range(size))
     parts = file_chunks(image)
     joined = b"".join(chunk.part for chunk, _ in parts)
@@ -84,7 +84,7 @@ def test_parts_of_an_image_join_to_it(size):
     assert [remaining for _, remaining in parts] == list(reversed(range(len(parts))))
 
 
-def test_ti_s_image_begins_with_the_bytes_that_a_user_sent_to_ram():
+def test_the_first_part_is_that_of_a_user_s_log():
     """TI E2E 1267477: 35 parts, the first with type 0, length 7940 and the magic."""
     first, remaining = file_chunks(DATA, TO_RAM)[0]
     assert remaining == 0x22
@@ -120,7 +120,7 @@ def new(clock) -> Simulated:
 
 
 @pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
-def test_a_new_board_works_from_ram_and_its_flash_is_left_alone(clock, fault_at):
+def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
     radar = made(board, clock, IMAGE)
     radar.configure()
@@ -140,13 +140,13 @@ def test_without_an_image_a_new_board_is_refused(new, clock):
     assert "image header" in caught.value.why  # from its boot status
 
 
-def test_a_flash_that_holds_the_image_is_not_loaded_again(board, clock):
+def test_an_image_in_the_flash_is_not_downloaded_again(board, clock):
     made(board, clock, IMAGE).configure()
     assert 0x4080 not in board.executed
 
 
 @pytest.mark.parametrize("fault_at", ["power-up", "download", "never"])
-def test_the_flash_is_written_and_verified_by_a_start_from_it(clock, fault_at):
+def test_a_flash_write_is_verified_by_a_start_from_the_flash(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
     radar = made(board, clock)
     told: list[tuple[int, int]] = []
@@ -157,7 +157,7 @@ def test_the_flash_is_written_and_verified_by_a_start_from_it(clock, fault_at):
     assert radar.state is State.CONFIGURED
 
 
-def test_the_slow_erase_is_waited_for(clock):
+def test_a_slow_erase_does_not_time_out(clock):
     board = Simulated(lambda: clock.time, erase_s=0.9 * CHUNK_TIMEOUT_S)
     made(board, clock).write_flash(IMAGE, ignored)
     assert board.cores.flash == DATA
@@ -199,7 +199,7 @@ def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, said
 
 @pytest.mark.parametrize("rom", [(1, 2, 0, 5), (2, 0, 0, 3), (2, 2, 1, 6), (6, 2, 1, 7), (0, 0, 0, 0), (255,) * 4])
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
-def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):
+def test_an_image_for_another_rom_is_not_sent(clock, rom, flash):
     board = Simulated(lambda: clock.time, flash=flash)
     board.cores.main_rom = rom
     for use in (lambda r: r.write_flash(IMAGE, ignored), lambda r: r.configure()):
@@ -245,7 +245,7 @@ def test_a_download_repairs_any_content_of_the_flash(clock, broken):
 
 
 @pytest.mark.parametrize("part", range(1, 37))
-def test_power_lost_at_any_part_is_recovered_from(clock, part):
+def test_a_power_failure_at_any_part_is_recoverable(clock, part):
     """Part 36 is the version question after the last part; the first two messages are questions too."""
     board = Simulated(lambda: clock.time, flash=make_image(4000))
     radar = made(board, clock, words=PowerCut(board, clock, part + 1))
@@ -270,7 +270,7 @@ def test_a_restart_during_a_download_ends_it_at_once(clock, part):
     assert clock.time < 5.0
 
 
-def test_a_part_that_is_refused_is_named(new, clock, monkeypatch):
+def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
     obey = new.cores._download
     seen = []
 
@@ -318,7 +318,7 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
 
 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.LOST_INTERRUPT, Fault.NACK, Fault.BAD_CHECKSUM])
-def test_a_disturbed_download_arrives_whole(new, clock, fault):
+def test_a_disturbed_download_is_complete(new, clock, fault):
     radar = made(new, clock)
     radar._words.board.inject(fault, fault)
     radar.write_flash(IMAGE, ignored)

@@ -63,7 +63,7 @@ def test_random_faults(clean, request):
 OF_THE_BOARD = ("flash", "another board", "jumpers")
 
 
-def test_whatever_failed_between_them_the_next_row_runs_once_it_is_mended():
+def test_after_a_repaired_fault_the_next_row_runs():
     """A reset and a configuration bring every board back that is sound itself."""
     for number in range(60):
         case, at = draw(random.Random(number))
@@ -75,14 +75,14 @@ def test_whatever_failed_between_them_the_next_row_runs_once_it_is_mended():
         assert found.radar.state is State.ARMED, (number, case.name, at)
 
 
-def test_the_faults_strike(clean):
+def test_most_drawn_faults_happen_within_the_run(clean):
     """Of the faults that are drawn most happen within the run: the law above is not one of faults that never come."""
     del clean
     struck = [run(*draw(random.Random(number))).struck for number in range(40)]
     assert sum(struck) > 24
 
 
-def test_a_clean_run_is_done(clean):
+def test_a_run_without_a_fault_is_done(clean):
     assert len(clean.executed) > 20
     assert clean.cores.flash == IMAGE.data
     assert clean.armings == 1

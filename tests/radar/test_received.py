@@ -60,7 +60,7 @@ def test_every_received_message_is_decoded(raw):
     assert message.kind in (Kind.RESPONSE, Kind.EVENT)
 
 
-def test_an_error_carries_message_id_0_and_names_error_and_sub_block():
+def test_an_error_has_message_id_0_error_number_and_sub_block():
     message = decode(received.AWR2243_ERROR)
     assert (message.message_id, message.sequence, message.direction) == (0, 10, Direction.RF_TO_HOST)
     assert message.error == (62, 0x0105)
@@ -72,7 +72,7 @@ def test_an_error_without_a_body_is_an_error():
     assert message.error == (None, None)
 
 
-def test_an_acknowledgement_without_a_body_is_none():
+def test_an_acknowledgement_without_a_body_is_no_error():
     assert decode(received.AWR1243_RF_UP).error is None
 
 
@@ -88,7 +88,7 @@ def test_power_up_events_of_either_length_report_no_boot_error(raw):
     assert 1000 < event.values["power_up_us"] < 5000
 
 
-def test_the_fault_during_loading_is_a_register_that_read_back_wrong():
+def test_the_fault_during_loading_is_a_register_read_back_error():
     event = decode_event(decode(received.AWR2243_FAULT).blocks[0])
     assert event.id == MAIN_CPU_FAULT
     assert "register read-back" in event.detail
@@ -125,7 +125,7 @@ def test_an_answer_without_its_last_chunk_is_no_answer():
         asked.call(GET_MAIN_VERSION)
 
 
-def test_an_acknowledgement_with_a_16_bit_crc_is_taken():
+def test_an_acknowledgement_with_a_16_bit_crc_is_accepted():
     asked, _ = link(received.AWR1243_RF_UP)
     assert asked.call(RF_POWER_UP).blocks == ()
 
@@ -170,7 +170,7 @@ def test_an_answer_with_a_missing_chunk_is_no_answer():
     ],
 )
 @pytest.mark.parametrize("number", [MAIN_POWER_UP, BOOT_STATUS])
-def test_boot_bits_are_told_by_what_they_mean(number, bits, meaning, cure):
+def test_boot_bits_have_their_meaning(number, bits, meaning, cure):
     event = decode_event(SubBlock(number, bytes(4) + bits.to_bytes(8, "little") + bytes(8)))
     assert meaning in event.detail
     assert event.values["cure"] == cure

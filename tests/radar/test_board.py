@@ -1,4 +1,4 @@
-"""A board's states: each one entered only on what the radar said, each fatal event a fault with its reason."""
+"""A board's states: each is entered only after a report of the radar; each fatal event is a fault with its reason."""
 
 from __future__ import annotations
 
@@ -190,15 +190,15 @@ def test_a_board_that_does_not_answer_is_an_error(radar, board):
 def test_the_report_has_versions_temperatures_calibration_and_every_byte_sent(radar):
     radar.configure()
     radar.arm(FRAMES)
-    told = radar.report()
-    assert (told["rf_firmware"], told["main_firmware"]) == ("2.2.1.7 patch 2.2.4.0", "2.2.1.7 patch 2.2.2.0")
-    assert told["die_id"] == "5eed0001-00000d1e-000008c3-00000001"
-    assert told["temperatures_c"]["tx2"] == 46
-    assert told["calibration"]["temperature_c"] == 41
-    assert told["sent"][0].startswith("78566587")
-    first = next(raw for raw in told["sent"] if not raw.startswith("78566587"))
+    result = radar.report()
+    assert (result["rf_firmware"], result["main_firmware"]) == ("2.2.1.7 patch 2.2.4.0", "2.2.1.7 patch 2.2.2.0")
+    assert result["die_id"] == "5eed0001-00000d1e-000008c3-00000001"
+    assert result["temperatures_c"]["tx2"] == 46
+    assert result["calibration"]["temperature_c"] == 41
+    assert result["sent"][0].startswith("78566587")
+    first = next(raw for raw in result["sent"] if not raw.startswith("78566587"))
     assert first == "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"
-    assert any("ready for triggers" in line for line in told["events"])
+    assert any("ready for triggers" in line for line in result["events"])
     assert radar.report()["sent"] == []
 
 

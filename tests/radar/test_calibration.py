@@ -91,8 +91,8 @@ OF_TX = {8: "peak", 9: "TX power", 11: "TX phase"}
 
 
 @pytest.mark.parametrize("name", ["LS", "RH"])
-@pytest.mark.parametrize(("bit", "said"), (NEEDED | OF_TX).items())
-def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp_path, name, bit, said):
+@pytest.mark.parametrize(("bit", "text"), (NEEDED | OF_TX).items())
+def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp_path, name, bit, text):
     """Bits of ICD 217; those of the transmitters are needed by the board that transmits."""
     board.cores.passes = 0x1FFE & ~(1 << bit)
     files = CalibrationFiles(tmp_path / "kept", b"settings")
@@ -100,7 +100,7 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     if name == "RH" and bit in OF_TX:
         radar.configure()
         return
-    with pytest.raises(DeviceError, match=said):
+    with pytest.raises(DeviceError, match=text):
         radar.configure()
     assert not (tmp_path / "kept").exists()
     assert 0x0100 not in board.executed

@@ -67,15 +67,15 @@ def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
 
 def test_a_sound_board_passes_every_step(rig_file, opened, capsys):
     assert run(rig_file(), "check", "RH", "--json", "--slow") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [s["step"] for s in told["steps"]] == STEPS
-    assert all(s["holds"] for s in told["steps"])
-    assert told["report"]["die_id"].startswith("5eed0001")
+    result = json.loads(capsys.readouterr().out)
+    assert [s["step"] for s in result["steps"]] == STEPS
+    assert all(s["holds"] for s in result["steps"])
+    assert result["report"]["die_id"].startswith("5eed0001")
     assert opened == [("FTRH", True)]
 
 
 @pytest.mark.parametrize(
-    ("spoil", "step", "said"),
+    ("spoil", "step", "text"),
     [
         (lambda board: setattr(board, "functional_jumpers", False), "reset", ("SOP0 set", "[ o=o ]", "5 V")),
         (lambda board: board.power(False), "reset", ("no power",)),
@@ -85,7 +85,7 @@ def test_a_sound_board_passes_every_step(rig_file, opened, capsys):
     ],
 )
 @pytest.mark.usefixtures("opened")
-def test_a_failed_step_has_the_expected_outcome_and_a_remedy(rig_file, board, capsys, spoil, step, said):
+def test_a_failed_step_has_the_expected_outcome_and_a_remedy(rig_file, board, capsys, spoil, step, text):
     spoil(board)
     assert run(rig_file(), "check", "RH") == 1
     out = capsys.readouterr().out
@@ -94,7 +94,7 @@ def test_a_failed_step_has_the_expected_outcome_and_a_remedy(rig_file, board, ca
     assert step in failed[0]
     assert "expected: " in out
     assert "do: " in out
-    assert all(w in out for w in said)
+    assert all(w in out for w in text)
 
 
 @pytest.mark.parametrize(
@@ -168,10 +168,10 @@ def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path,
     spoil(board)
     trace = str(tmp_path / "day.jsonl")
     status = run(rig_file(), "check", "RH", "--trace", trace)
-    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
+    result = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
     assert run(rig_file(), "replay", trace) == status
     again = capsys.readouterr().out.splitlines()
-    assert [line for line in again if line.startswith("RH")] == told
+    assert [line for line in again if line.startswith("RH")] == result
     assert again[0].startswith("replayed from")
 
 
@@ -196,9 +196,9 @@ def test_an_event_at_any_time_after_power_up_replays(
     words.interrupt, board.cores.boot = slow_look, booting
     trace = str(tmp_path / "day.jsonl")
     assert run(rig_file(), "check", "RH", "--trace", trace) == 0
-    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
+    result = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
     assert run(rig_file(), "replay", trace) == 0
-    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")] == told
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")] == result
 
 
 @pytest.mark.usefixtures("opened")
@@ -210,8 +210,8 @@ def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_pa
     assert [r["level"] for r in lines if r.get("line") == "NRST"] == [0, 1]
     levels = [r["level"] for r in lines if r.get("line") == "HOST_INTR"]
     assert levels == [n % 2 for n in range(len(levels))]  # each a change
-    said = "".join(r.get("in", "") for r in lines)
-    assert said.count("badccdab") == levels.count(1)
+    text = "".join(r.get("in", "") for r in lines)
+    assert text.count("badccdab") == levels.count(1)
     assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))
 
 
@@ -263,14 +263,14 @@ def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, 
     else:
         with path.open("wb") as file:
             file.truncate(3 * 2**30)
-    said = "bytes" if kind == "sparse" else "not a regular file"
+    text = "bytes" if kind == "sparse" else "not a regular file"
     with_it = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, firmware=str(path)))
     here = rig_file()
     for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):
         assert run(file, *args) == 3
-        assert said in capsys.readouterr().err
+        assert text in capsys.readouterr().err
     assert run(rig_file(with_it), "check", "RH") == 3
-    assert said in capsys.readouterr().err
+    assert text in capsys.readouterr().err
     assert opened == []
 
 

@@ -1,4 +1,4 @@
-"""Firmware that cannot brick a board: refused before a byte is sent, verified, and cut off anywhere recovered from."""
+"""Firmware downloads cannot brick a board: checked before, verified after, recoverable when interrupted anywhere."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_the_first_part_is_that_of_a_user_s_log():
 
 
 class PowerCut(BoardWords):
-    """Switches the board off when its host has written so many messages."""
+    """Switch the board off after `after` messages of its host."""
 
     def __init__(self, board, clock, after: int) -> None:
         super().__init__(board, clock)
@@ -115,7 +115,7 @@ def ignored(sent: int, of: int) -> None: ...
 
 @pytest.fixture
 def new(clock) -> Simulated:
-    """A board on its first day: its flash is empty, and it reports the harmless fault."""
+    """A new board: its flash is empty, and it reports the harmless fault."""
     return Simulated(lambda: clock.time)
 
 
@@ -149,10 +149,10 @@ def test_an_image_in_the_flash_is_not_downloaded_again(board, clock):
 def test_a_flash_write_is_verified_by_a_start_from_the_flash(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
     radar = made(board, clock)
-    told: list[tuple[int, int]] = []
-    assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: told.append((sent, of)))
+    result: list[tuple[int, int]] = []
+    assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: result.append((sent, of)))
     assert board.cores.flash == DATA
-    assert told[-1] == (35, 35)
+    assert result[-1] == (35, 35)
     radar.configure()
     assert radar.state is State.CONFIGURED
 
@@ -187,13 +187,13 @@ def test_the_rf_part_of_another_board_is_not_configured(clock, use):
     assert 0x0080 not in board.executed
 
 
-@pytest.mark.parametrize(("tests", "said"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
-def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, said):
+@pytest.mark.parametrize(("tests", "text"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
+def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, text):
     board.cores.rf_tests = tests
     radar = made(board, clock)
-    told = []
-    radar.configure(lambda step, came: told.append(came) if step.name == "RF power-up" else None)
-    assert (said in told[0]) if said else told == ["RF core is up"]
+    result = []
+    radar.configure(lambda step, came: result.append(came) if step.name == "RF power-up" else None)
+    assert (text in result[0]) if text else result == ["RF core is up"]
     assert radar.facts["rf_tests_passed"] == tests
 
 
@@ -211,15 +211,15 @@ def test_an_image_for_another_rom_is_not_sent(clock, rom, flash):
 
 @pytest.mark.parametrize("core", ["main_rom", "rf_rom"])
 @pytest.mark.parametrize(
-    ("rom", "said"),
+    ("rom", "text"),
     [((1, 2, 0, 5), "AWR1243"), ((6, 2, 0, 13), "57..64 GHz"), ((255,) * 4, "generation 255"), ((0,) * 4, "0.0.0.0")],
 )
 @pytest.mark.parametrize("image", [None, IMAGE])
-def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, rom, said, image):
+def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, rom, text, image):
     """The same codes would be other frequencies on it."""
     board = Simulated(lambda: clock.time, flash=DATA)
     setattr(board.cores, core, rom)
-    with refused(ErrorCode.MISMATCH, said):
+    with refused(ErrorCode.MISMATCH, text):
         made(board, clock, image).configure()
     assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
 
@@ -232,9 +232,9 @@ def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
     monkeypatch.setattr(board.cores, "_effect", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d))
     radar = made(board, clock, IMAGE)
     radar.configure()
-    (told,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
-    assert "2.2.4.0" in told
-    assert ("--flash" in told) is bool(flash)
+    (result,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
+    assert "2.2.4.0" in result
+    assert ("--flash" in result) is bool(flash)
 
 
 @pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])
@@ -253,7 +253,7 @@ def test_a_power_failure_at_any_part_is_recoverable(clock, part):
         radar.write_flash(IMAGE, ignored)
     board.power(True)
     rescued = made(board, clock, IMAGE)
-    rescued.configure()  # from RAM, whatever the flash holds
+    rescued.configure()  # from RAM, with any content of the flash
     assert rescued.state is State.CONFIGURED
     made(board, clock).write_flash(IMAGE, ignored)
     made(board, clock).configure()
@@ -287,9 +287,9 @@ def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
     obey = new.cores._download
 
     def forget(data, remaining):
-        told = obey(data, remaining)
+        result = obey(data, remaining)
         new.cores.flash = new.cores.flash[:-1] + b"\xff"
-        return told
+        return result
 
     monkeypatch.setattr(new.cores, "_download", forget)
     with pytest.raises(DeviceError):
@@ -302,8 +302,8 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
     effect = new.cores._effect
 
     def answer(number, data):
-        told = effect(number, data)
-        return told[:10] + bytes(reported) if number == 0x40E0 and any(told[10:]) else told
+        result = effect(number, data)
+        return result[:10] + bytes(reported) if number == 0x40E0 and any(result[10:]) else result
 
     monkeypatch.setattr(new.cores, "_effect", answer)
     radar = made(new, clock, IMAGE)

@@ -57,7 +57,7 @@ def test_a_stream_may_be_split_anywhere(words, data):
 
 @pytest.mark.parametrize("byte", [0, 1, 3, 4, 8])
 def test_an_invalid_stream_is_detected(chip, byte):
-    """The stand-in refuses what would not be this SPI: its silence above means something."""
+    """The simulated chip detects violations of the SPI protocol, so that its silence above counts."""
     stream = bytearray(write_words([0x1234, 0x5678]))
     stream[byte] ^= 0x09
     chip.take("A", bytes(stream))

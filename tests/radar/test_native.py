@@ -163,14 +163,17 @@ def test_after_a_fault_the_next_row_resets_only_that_board(radars, usb):
 
 def test_the_report_fits_the_manifest_and_is_returned_once(radars):
     radars.arm(FRAMES)
-    told = radars.report()
-    assert decode_line(encode_line({"fact": "radars", **told})) == {"fact": "radars", **json.loads(json.dumps(told))}
-    assert set(told["boards"]) == {"LS", "RH", "RV"}
-    assert told["boards"]["RV"]["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
-    assert set(told["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
-    assert len(told["boards"]["RV"]["sent"]) > 40
-    assert 0.9e6 < told["direct_if_hz"]["RH"] < 1.05e6
-    assert any(c.startswith("IF budget of RV") for c in told["constraints"])
+    result = radars.report()
+    assert decode_line(encode_line({"fact": "radars", **result})) == {
+        "fact": "radars",
+        **json.loads(json.dumps(result)),
+    }
+    assert set(result["boards"]) == {"LS", "RH", "RV"}
+    assert result["boards"]["RV"]["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
+    assert set(result["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
+    assert len(result["boards"]["RV"]["sent"]) > 40
+    assert 0.9e6 < result["direct_if_hz"]["RH"] < 1.05e6
+    assert any(c.startswith("IF budget of RV") for c in result["constraints"])
     again = radars.report()
     assert again["boards"]["RV"]["sent"] == []
     assert "constraints" not in again
@@ -242,9 +245,9 @@ def run_row(radars, usb) -> dict[str, RadarState]:
 
 
 def traces(radars) -> list[dict[str, str]]:
-    told = radars.report()["traces"]
-    assert isinstance(told, list)
-    return told
+    result = radars.report()["traces"]
+    assert isinstance(result, list)
+    return result
 
 
 ALL_DONE = dict.fromkeys(("LS", "RH", "RV"), RadarState.DONE)
@@ -263,9 +266,9 @@ def test_a_lost_link_is_reopened(radars, usb, for_s):
 def test_a_link_that_cannot_be_reopened_is_a_fault_of_that_board_only(radars, usb):
     usb.unplug(for_s=20.0)
     radars.arm(FRAMES)
-    told = radars.states()
-    assert (told["RH"].state, told["RV"].state) == (RadarState.FAULT, RadarState.ARMED)
-    assert "USB" in told["RH"].detail
+    result = radars.states()
+    assert (result["RH"].state, result["RV"].state) == (RadarState.FAULT, RadarState.ARMED)
+    assert "USB" in result["RH"].detail
     usb.clock.sleep(20.0)
     assert run_row(radars, usb) == ALL_DONE
 
@@ -276,9 +279,9 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
         assert run_row(radars, usb) == ALL_DONE
         usb.unplug(0.0)
         assert run_row(radars, usb) == ALL_DONE
-        told = traces(radars)
+        result = traces(radars)
     files = sorted((tmp_path / "traces").iterdir())
-    assert sorted(t["file"] for t in told) == [str(f) for f in files]
+    assert sorted(t["file"] for t in result) == [str(f) for f in files]
     assert [read_trace(f)[0]["board"] for f in files] == ["LS", "RH", "RH", "RV"]
     assert any("error" in record for record in read_trace(files[1])[1] + read_trace(files[2])[1])
     # The first link's trace replays the bring-up without the board.
@@ -293,9 +296,9 @@ def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypa
     kept = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, trace_dir=str(tmp_path)))
     with NativeRadars(kept, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE
-        told = traces(radars)
-    assert len(told) == 3
-    assert all("No space" in t["ended"] for t in told)
+        result = traces(radars)
+    assert len(result) == 3
+    assert all("No space" in t["ended"] for t in result)
 
 
 def test_a_fatal_event_during_arming_is_retried(radars, usb, monkeypatch):

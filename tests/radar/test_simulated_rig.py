@@ -37,15 +37,15 @@ def test_the_derived_rig_keeps_all_constraints_and_has_every_address(tmp_path: P
 
 
 def test_offsets_give_the_same_signals_from_scene_rig_file_and_program(tmp_path: Path):
-    """The same start frequencies, told by the scene, by the rig file or programmed: the same samples."""
-    told = derive(published_rig(), EMPTY, tmp_path)
+    """The same start frequencies, from the scene, the rig file or native control, give the same samples."""
+    result = derive(published_rig(), EMPTY, tmp_path)
     native = derive(published_rig(), EMPTY, tmp_path, native=True)
     at = np.zeros(2)
     a = SimulatedRig(published_rig(), EMPTY, 5).signals("RH", at, at)
-    b = SimulatedRig(told, without_offset(EMPTY), 5).signals("RH", at, at)
+    b = SimulatedRig(result, without_offset(EMPTY), 5).signals("RH", at, at)
     np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(a, SimulatedRig(native, EMPTY, 5).signals("RH", at, at))
-    assert {b.start_offset_hz for b in told.recorded} == {EMPTY.disturbances.if_offset_hz}
+    assert {b.start_offset_hz for b in result.recorded} == {EMPTY.disturbances.if_offset_hz}
     moved = tuple(
         msgspec.structs.replace(x, start_offset_hz=x.start_offset_hz + 1e5) if x.name == "RH" else x
         for x in native.boards

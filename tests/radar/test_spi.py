@@ -15,7 +15,7 @@ from tests.support.refusals import refused
 
 
 def ignored(_):
-    """An event that nobody keeps."""
+    """Discard an event."""
 
 
 @pytest.fixture

@@ -80,7 +80,7 @@ def test_slow_mode_is_one_word_a_transfer(plugged):
 
 
 def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged):
-    """pyftdi takes any of the chips when it is given a bus address alone, by the chance of a set's order."""
+    """pyftdi opens any of the chips when given a bus address alone, in the order of a set."""
     others = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
     for other in others:
         bus.plug(other)
@@ -117,7 +117,7 @@ def test_a_missing_chip_is_an_error_with_its_serial_number():
 
 
 def test_a_chip_that_is_plugged_in_later_is_found(bus, board):
-    """pyftdi remembers an empty bus, too."""
+    """pyftdi caches an empty bus, too."""
     with pytest.raises(DeviceError):
         open_usb("FT7")
     bus.plug(chip(board, "FT7"))

@@ -82,11 +82,11 @@ def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name
     assert name in broken(wrong)
     with pytest.raises(ConfigError) as caught:
         require(wrong, FRAMES)
-    told = next(c for c in constraints(wrong, FRAMES) if c.name == name and not c.holds)
-    assert str(told) in str(caught.value)
-    assert told.formula in str(told)
-    assert f"{told.value:.12g}" in str(told)
-    assert told.remedy in str(caught.value)
+    result = next(c for c in constraints(wrong, FRAMES) if c.name == name and not c.holds)
+    assert str(result) in str(caught.value)
+    assert result.formula in str(result)
+    assert f"{result.value:.12g}" in str(result)
+    assert result.remedy in str(caught.value)
 
 
 def test_76_ghz_is_inside_the_band_to_the_code(rig):
@@ -157,12 +157,12 @@ def test_the_shortest_burst_period_leaves_300_us_after_the_chirps(rig):
 
 @pytest.mark.parametrize(("chirp_us", "holds"), [(228.51, True), (228.5, False), (300.0, False)])
 def test_the_chirp_spacing_must_be_that_of_the_radar(rig, chirp_us, holds):
-    """idle + ramp + 10 ns is what the radar makes of its profile; the host must know the same."""
+    """The radar's spacing is idle + ramp + 10 ns; the rig file must have the same."""
     burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=chirp_us, period_us=6000.0)
     many = msgspec.structs.replace(rig, burst=burst)
     assert ("chirp spacing" not in broken(many)) is holds
-    told = next(c for c in constraints(many, FRAMES) if c.name == "chirp spacing")
-    idle = float(told.remedy.split()[3].strip(","))
+    result = next(c for c in constraints(many, FRAMES) if c.name == "chirp spacing")
+    idle = float(result.remedy.split()[3].strip(","))
     mended = msgspec.structs.replace(many, radar=msgspec.structs.replace(rig.radar, idle_us=idle))
     assert "chirp spacing" not in broken(mended)
 
@@ -210,8 +210,8 @@ def test_if_budget(rig, mode, offset, holds):
 
 def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):
     wrong = of_receiver(rig, start_offset_hz=0.0)
-    told = next(c for c in constraints(wrong, FRAMES) if c.name == "IF budget of RH")
-    offset = float(re.findall(r"[\d.]+", told.remedy)[-1])
+    result = next(c for c in constraints(wrong, FRAMES) if c.name == "IF budget of RH")
+    offset = float(re.findall(r"[\d.]+", result.remedy)[-1])
     mended = of_receiver(rig, start_offset_hz=offset)
     assert direct_if_hz(mended, mended.by_name("RH")) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
 

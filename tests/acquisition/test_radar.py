@@ -59,7 +59,7 @@ def test_each_row_sends_the_line_once_over_one_connection(server):
             radars.arm(48)
             assert client.recv(100) == b"Retrigger\n"
             assert radars.states()["RH"].state is RadarState.UNKNOWN
-            assert "never answers" in radars.states()["RH"].detail
+            assert "never replies" in radars.states()["RH"].detail
     assert client.recv(1) == b""
 
 
@@ -135,7 +135,7 @@ def test_half_open_connection_is_noticed():
     done = subprocess.run(
         ["unshare", "-rn", sys.executable, "-c", HALF_OPEN], capture_output=True, text=True, check=True, timeout=60
     )
-    assert "has not taken the line within 0.5 s" in done.stdout
+    assert "did not acknowledge the line within 0.5 s" in done.stdout
     assert "half-open" in done.stdout
 
 

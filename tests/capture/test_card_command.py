@@ -62,7 +62,7 @@ def test_every_hop_of_every_card(cards, card):
             assert (receiver["verdict"], receiver["why"] != "") == ("warning", True)
             assert "limits.d" in receiver["remedy"]
     text = card().stdout
-    for part in ("RH (receive_h)", "not recorded", "answers, FPGA 2.8", "bytes granted", "polysight doctor", "core"):
+    for part in ("RH (receive_h)", "not recorded", "replies, FPGA 2.8", "bytes granted", "polysight doctor", "core"):
         assert part in text
 
 

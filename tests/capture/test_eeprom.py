@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from polysight.host.capture.card import CardClient, EepromSettings, program_eeprom
 from polysight.host.capture.dca1000 import Code, Status, decode_request, encode_reply
-from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.error_codes import ErrorCode
 from polysight.simulators.cards import Network
+from tests.support.refusals import refused
 
 
 def test_the_bytes_are_reversed():
@@ -55,7 +56,7 @@ def test_the_card_reads_what_was_meant(net, ends, mac, ports):
 def test_a_card_that_could_not_be_reached_is_refused(given):
     good = {"host_address": "192.168.33.30", "card_address": "192.168.33.180"}
     EepromSettings(**good)
-    with pytest.raises(ConfigError, match="EEPROM settings refused"):
+    with refused(ErrorCode.VALUE_INVALID):
         EepromSettings(**(good | given))
 
 
@@ -105,19 +106,23 @@ def test_written_once_confirmed(card):
 @pytest.mark.parametrize("confirmed", ["", "yes", "192.168.33.180"])
 def test_nothing_is_sent_unconfirmed(card, confirmed):
     client, seen, _ = card
-    with pytest.raises(ConfigError, match="not written"):
+    with refused(ErrorCode.VALUE_INVALID, client.board.card_address):
         program_eeprom(client, settings_of(client), confirmed)
     assert seen == []
 
 
 @pytest.mark.parametrize(
-    ("status", "reply", "says"),
-    [(Status.EEPROM_FAILURE, 0, "EEPROM failure"), (0, 1, "refused"), (0, None, "asked once")],
+    ("status", "reply", "code"),
+    [
+        (Status.EEPROM_FAILURE, 0, ErrorCode.REFUSED_BY_PEER),
+        (0, 1, ErrorCode.REFUSED_BY_PEER),
+        (0, None, ErrorCode.NO_ANSWER),
+    ],
 )
-def test_a_card_that_could_not_write_it(card, status, reply, says):
+def test_a_card_that_could_not_write_it(card, status, reply, code):
     client, seen, answers = card
     answers["status"], answers["reply"] = status, reply
     settings = settings_of(client)
-    with pytest.raises(DeviceError, match=says):
+    with refused(code):
         program_eeprom(client, settings, settings.confirmation)
     assert [code for code, _ in seen].count(Code.CONFIGURE_EEPROM) == 1

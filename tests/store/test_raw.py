@@ -108,7 +108,7 @@ def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, 
     capsys.readouterr()
     with pytest.raises(DataError, match="nothing can be dropped"):
         drop_raw(scan, None, yes=True)
-    assert capsys.readouterr().out.count("not the bytes the products were made from") == ROWS * BOARDS
+    assert capsys.readouterr().out.count("differs from the data of the products") == ROWS * BOARDS
     quality.write_text("{}")
     with pytest.raises(DataError, match="does not say what it was made from"):
         drop_raw(scan, None, yes=True)

@@ -80,7 +80,7 @@ class Client:
 
 
 def free_subnet() -> str:
-    """Loopback addresses 127.x.y.* that nobody else uses."""
+    """A free loopback subnet 127.x.y.*."""
     return on_free_subnet(load_instrument(REPO / "instrument.toml")).boards[0].card_address.rpartition(".")[0]
 
 

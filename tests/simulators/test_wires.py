@@ -65,7 +65,7 @@ def take(client: WireClient, n: int) -> list[WireMessage]:
     return got
 
 
-def test_ten_thousand_edges_of_two_senders_reach_the_listener_in_each_senders_order(serve: Serve, join: Join) -> None:
+def test_edges_arrive_in_the_order_of_each_sender(serve: Serve, join: Join) -> None:
     path = serve()
     listener, stage, pi = join(path, (22, 26), motion=True), join(path), join(path)
     n = 5000
@@ -87,7 +87,7 @@ def test_ten_thousand_edges_of_two_senders_reach_the_listener_in_each_senders_or
     assert listener.receive(0.05) is None
 
 
-def test_only_what_was_asked_for_arrives_and_never_ones_own(serve: Serve, join: Join) -> None:
+def test_a_client_gets_its_subscriptions_and_never_its_own_lines(serve: Serve, join: Join) -> None:
     path = serve()
     pi = join(path, (26,))
     cards = join(path, (22,), motion=True)
@@ -101,7 +101,7 @@ def test_only_what_was_asked_for_arrives_and_never_ones_own(serve: Serve, join: 
     assert cards.receive(0.05) is None
 
 
-def test_who_joins_late_learns_where_the_stage_stands(serve: Serve, join: Join) -> None:
+def test_a_late_client_gets_the_stage_s_position(serve: Serve, join: Join) -> None:
     path = serve()
     stage, early = join(path), join(path, motion=True)
     stage.send(WireMotion(1, 10, 20, 0), WireMotion(2, 30, 40, 50))

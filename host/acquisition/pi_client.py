@@ -53,7 +53,7 @@ from polysight.shared.messages import (
     unpack_event,
     unpack_reply,
 )
-from polysight.shared.sockets import Refusals, requester, subscriber
+from polysight.shared.sockets import HandshakeMonitor, requester, subscriber
 
 ATTEMPTS = 3  # to send a command
 REAL_TIME = 1  # real-time priority of the heartbeat: below the receiver processes
@@ -131,7 +131,7 @@ class PiClient:
         keys = Path(instrument.pi.key_dir)
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
-        self._refusals = Refusals(self._commands)
+        self._handshake = HandshakeMonitor(self._commands)
         self._owner = secrets.token_hex(16)  # identifies the runs that this client begins
         self._scan_id = ""
         self._last_seq = 0
@@ -263,7 +263,7 @@ class PiClient:
         return reply
 
     def _no_answer(self, command: str) -> DeviceError:
-        if self._refusals.seen():
+        if self._handshake.refused():
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",
                 "the key was revoked or never allowed, or pi.key here is another Pi's",
@@ -339,7 +339,7 @@ class PiClient:
         """Stop the heartbeat and close the sockets."""
         self._stop_heartbeat()
         self._events.close()
-        self._refusals.close()
+        self._handshake.close()
         self._commands.close()
 
     def _stop_heartbeat(self) -> None:

@@ -20,9 +20,9 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import HelloReply, StatusReply
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
 
-_HOMING_TIMEOUT_S = HOMING_LIMIT_S + 30.0  # longer than the Pi's own, which reports the exact reason
+_HOMING_TIMEOUT_S = HOMING_TIMEOUT_S + 30.0  # longer than the Pi's own, which reports the exact reason
 STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # a person must look and home: `polysight-pi home`
 STAGE_NOT_REPORTED = (
     "the Pi does not report its [stage], so it cannot be compared with the rig file's: install this release on the Pi"
@@ -151,7 +151,7 @@ def pi_fact(hello: HelloReply) -> Fact:
 
 def stage_differences(stage: Stage, hello: HelloReply) -> list[str]:
     """List the keys of `[stage]` that place rows and differ on the Pi, with both values; [] if it reports none."""
-    own = stage.placing
+    own = stage.placement_settings
     return [
         f"stage.{key} is {own[key]:.10g} here and {hello.stage[key]:.10g} on the Pi"
         for key in own

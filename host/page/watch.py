@@ -26,7 +26,7 @@ from polysight.host.page.story import Story
 from polysight.host.page.verdict import Signs
 from polysight.host.store import EVENTS, MANIFEST, Fact, Manifest, manifest
 from polysight.shared.errors import PolysightError, ProtocolError
-from polysight.shared.messages import AnyEvent, unpack_kept
+from polysight.shared.messages import AnyEvent, unpack_with_crc
 
 _HEAD = 256
 _TURN_S = 0.2
@@ -108,7 +108,7 @@ class EventTail:
         try:
             while True:
                 unpacker.skip()
-                events.append(unpack_kept(raw[end : unpacker.tell()]))
+                events.append(unpack_with_crc(raw[end : unpacker.tell()]))
                 end = unpacker.tell()
         except (msgpack.OutOfData, msgpack.UnpackException, ValueError, ProtocolError):
             self.file.take(end)

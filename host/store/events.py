@@ -16,7 +16,7 @@ import msgpack
 from polysight.host.store.append_only import AppendFile
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError, ProtocolError
-from polysight.shared.messages import AnyEvent, pack_kept, unpack_kept
+from polysight.shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
 
 DAMAGED = ".damaged"  # suffix of the copy of a damaged file
 
@@ -37,7 +37,7 @@ def read_events(path: Path) -> EventLog:
     log = EventLog([], 0)
     try:
         for end in _ends(raw):
-            log.events.append(unpack_kept(raw[log.length : end]))
+            log.events.append(unpack_with_crc(raw[log.length : end]))
             log.length = end
     except ProtocolError as e:
         log.damage = f"event {len(log.events) + 1} is damaged: {e.what}"
@@ -115,7 +115,7 @@ class EventWriter:
 
     def append(self, event: AnyEvent) -> None:
         """Add one event; :meth:`sync` writes it."""
-        self._batch.append(pack_kept(event))
+        self._batch.append(pack_with_crc(event))
         self.last_seq = event.seq
 
     def sync(self) -> None:

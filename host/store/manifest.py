@@ -17,7 +17,7 @@ from typing import Any
 from polysight.host.store.append_only import AppendFile
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError, PolysightError, no_such
-from polysight.shared.files import MOST_JSON_BYTES, read_bounded
+from polysight.shared.files import MAX_JSON_BYTES, read_bounded
 
 Fact = dict[str, Any]
 
@@ -135,7 +135,7 @@ def _compare(link: tuple[int, str], found: Manifest, due: int, number: int) -> N
 def read(path: Path) -> Manifest:
     """Read a manifest. Raises DataError if the file is absent or unreadable."""
     try:
-        return parse(read_bounded(path, MOST_JSON_BYTES))
+        return parse(read_bounded(path, MAX_JSON_BYTES))
     except OSError as e:
         if not path.parent.exists():
             raise no_such(path.parent) from None

@@ -15,7 +15,7 @@ from tests.support.refusals import refused
 
 @pytest.mark.parametrize("key", ["steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2"])
 def test_a_pi_that_places_rows_elsewhere_is_refused_before_a_folder_is_made(rig, tmp_path, key):
-    own = rig.instrument.stage.placing[key]
+    own = rig.instrument.stage.placement_settings[key]
     rig.pi.stage = {**rig.pi.stage, key: own + 0.5}
     with refused(ErrorCode.STAGE_DIFFERS, key, f"{own:g}", f"{own + 0.5:g}"):
         run_scan(rig.instrument, tmp_path / "s")
@@ -27,7 +27,7 @@ def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_ol
     stop, right = StopRequest(), rig.pi.stage
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
     scan = ScanFolder.load(tmp_path / "s")
-    assert scan.facts("scan_started")[0]["pi"]["stage"] == right == rig.instrument.stage.placing
+    assert scan.facts("scan_started")[0]["pi"]["stage"] == right == rig.instrument.stage.placement_settings
     rows, facts = list(scan.rows()), len(scan.content.facts)
     assert not scan.complete
     rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
@@ -52,7 +52,7 @@ def test_a_pi_that_does_not_report_its_stage_is_a_warning(rig, tmp_path):
 def test_what_does_not_place_rows_may_differ(rig):
     stage = rig.instrument.stage
     same = msgspec.structs.replace(stage, port="elsewhere", speed_mm_s=stage.speed_mm_s / 2, heartbeat_ms=2000)
-    assert same.placing == stage.placing
+    assert same.placement_settings == stage.placement_settings
 
 
 def test_a_scan_begun_when_nobody_compared_goes_on_with_its_pi_and_says_so(rig, tmp_path):

@@ -157,8 +157,8 @@ def with_radar(instrument: Instrument, **radar) -> dict:
     ("radar", "rule"),
     [
         ({"control": "telepathy"}, "radar.control"),
-        ({"control": "line_server"}, "needs one of radar.servers for every board"),
-        ({"servers": {"XX": "127.0.0.1:5000"}}, "names no board"),
+        ({"control": "line_server"}, "line_server"),
+        ({"servers": {"XX": "127.0.0.1:5000"}}, "XX"),
         ({"servers": {"RH": "127.0.0.1"}}, "radar.servers"),
         ({"servers": {"RH": "127.0.0.1:70000"}}, "1..65535"),
     ],

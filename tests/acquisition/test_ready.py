@@ -15,7 +15,7 @@ from polysight.host.doctor.check_host import check_time
 from polysight.host.plan.forecast import forecast
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.faults import PiFault
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
 from tests.support.refusals import refused
 
 
@@ -49,7 +49,7 @@ class HomingPi:
         return []
 
 
-@pytest.mark.parametrize(("limit_s", "reason"), [(HOMING_LIMIT_S, "not homed after"), (1e9, "'homing'")])
+@pytest.mark.parametrize(("limit_s", "reason"), [(HOMING_TIMEOUT_S, "not homed after"), (1e9, "'homing'")])
 def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeypatch, limit_s, reason):
     pi: Any = HomingPi(limit_s)
     monkeypatch.setattr(ready, "time", pi)
@@ -60,7 +60,7 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
 def test_pi_and_host_have_the_same_homing_timeout():
     from polysight.pi_controller import machine, stage
 
-    assert machine.LIMITS_S["homing"] == stage.MOTION_LIMIT_S == HOMING_LIMIT_S < ready._HOMING_TIMEOUT_S
+    assert machine.TIMEOUTS_S["homing"] == stage.MOTION_TIMEOUT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4])

@@ -46,7 +46,7 @@ def shown(page: str, *labels: str) -> bytes:
 
 READERS = {
     "event": messages.unpack_event, "command": messages.unpack_command, "reply": messages.unpack_reply,
-    "kept": messages.unpack_kept,
+    "kept": messages.unpack_with_crc,
 }  # fmt: skip
 
 

@@ -261,7 +261,7 @@ def test_what_is_no_file_of_a_sane_size_is_refused_unread(rig, rig_file, capsys,
     else:
         with path.open("wb") as file:
             file.truncate(3 * 2**30)
-    said = "bytes" if kind == "sparse" else "no regular file"
+    said = "bytes" if kind == "sparse" else "not a regular file"
     with_it = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, firmware=str(path)))
     here = rig_file()
     for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from polysight.host.cli.options import Add, add_action, add_json_option, count, number
+from polysight.host.cli.options import Add, CommandParser, add_action, add_json_option, count, number
 
 
 def _direct_path(args: argparse.Namespace) -> int:
@@ -45,25 +45,7 @@ def add_commands(add: Add) -> None:
     )
     actions = sub.add_subparsers(dest="action", required=True, metavar="ACTION")
 
-    sub = add_action(
-        actions,
-        "direct-path",
-        _direct_path,
-        "fit the places of receivers and object plane to a scan of points at known places",
-        "polysight calibrate direct-path scans/points --target points.toml",
-    )
-    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan of the target")
-    sub.add_argument(
-        "--target", type=Path, required=True, metavar="FILE", help="3 points or more: [[points]] position_mm = [x, y]"
-    )
-    sub.add_argument(
-        "--prior",
-        type=_millimetres,
-        default=5.0,
-        metavar="MM",
-        help="standard deviation of the places measured by hand (default: 5 mm)",
-    )
-    _add_outputs(sub, "; direct-path: refine its places instead of the scan's")
+    _add_direct_path(actions)
     sub = add_action(
         actions,
         "hpf",
@@ -99,6 +81,28 @@ def add_commands(add: Add) -> None:
     sub.add_argument("scan", type=Path, metavar="SCAN", help="any scan")
     _add_outputs(sub)
     _add_leakage(add)
+
+
+def _add_direct_path(actions: argparse._SubParsersAction[CommandParser]) -> None:
+    sub = add_action(
+        actions,
+        "direct-path",
+        _direct_path,
+        "fit the places of receivers and object plane to a scan of points at known places",
+        "polysight calibrate direct-path scans/points --target points.toml",
+    )
+    sub.add_argument("scan", type=Path, metavar="SCAN", help="scan of the target")
+    sub.add_argument(
+        "--target", type=Path, required=True, metavar="FILE", help="3 points or more: [[points]] position_mm = [x, y]"
+    )
+    sub.add_argument(
+        "--prior",
+        type=_millimetres,
+        default=5.0,
+        metavar="MM",
+        help="standard deviation of the places measured by hand (default: 5 mm)",
+    )
+    _add_outputs(sub, "; direct-path: refine its places instead of the scan's")
 
 
 def _add_outputs(sub: argparse.ArgumentParser, more: str = "") -> None:

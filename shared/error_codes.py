@@ -54,3 +54,7 @@ class ErrorCode(StrEnum):
     ROW_INCOMPLETE = "row-incomplete"  # all retakes of a row are used up
     STAGE_NOT_READY = "stage-not-ready"  # not homed, in a fault, or another host's
     STAGE_DIFFERS = "stage-differs"  # the Pi's [stage] places rows elsewhere
+
+    # Radar
+    RADAR_RESTARTED = "radar-restarted"
+    RADAR_NO_FIRMWARE = "radar-no-firmware"

@@ -87,9 +87,9 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
                 if path.stat().st_size == board.bytes and f"{crc32(path.read_bytes()):08x}" == board.crc32:
                     files.setdefault(row.row, {})[name] = path
                 else:
-                    kept.append(f"{board.file}: not the bytes that were committed")
+                    kept.append(f"{board.file}: differs from the committed data")
             elif board.file not in dropped_files(scan):
-                why = "not processed" if digest is None else "not the bytes the products were made from"
+                why = "not processed" if digest is None else "differs from the data of the products"
                 kept.append(f"{board.file}: {why}")
     there = [path for boards in files.values() for path in boards.values()]
     return Droppable(files, sum(path.stat().st_size for path in there), kept)

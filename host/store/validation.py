@@ -135,7 +135,7 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     if size != board.bytes:
         found.append(Finding("error", where, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
-        found.append(Finding("error", where, "not the bytes that were committed (CRC)", _COPY))
+        found.append(Finding("error", where, "differs from the committed data (CRC)", _COPY))
     index = path.with_suffix(".idx")
     found += _packets(scan, board, path.with_suffix(PACKETS))
     where = str(index.relative_to(scan.path))
@@ -147,7 +147,7 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     except OSError as e:
         return [*found, _not_read(where, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
-        return [*found, Finding("error", where, "not the bytes that were committed (CRC)", _COPY)]
+        return [*found, Finding("error", where, "differs from the committed data (CRC)", _COPY)]
     try:
         facts, _ = read_index(index)
         gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
@@ -172,7 +172,7 @@ def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
     except OSError as e:
         return [_not_read(where, e)]
     right = f"{crc:08x}" == board.packets_crc32
-    return [] if right else [Finding("error", where, "not the bytes that were committed (CRC)", _COPY)]
+    return [] if right else [Finding("error", where, "differs from the committed data (CRC)", _COPY)]
 
 
 def _not_read(where: str, e: OSError) -> Finding:

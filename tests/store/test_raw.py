@@ -17,12 +17,13 @@ from polysight.host.process.request import ProcessRequest
 from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validation import damaged_rows, validate
+from polysight.host.store.validation import damaged_rows
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, ScanError
 from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.refusals import refused
 from tests.support.scenes import small_scene
+from tests.support.store.plain_scan import errors
 
 ROWS, BOARDS = 4, 2
 SCENE = small_scene(8, ROWS, metal=False)
@@ -53,10 +54,6 @@ def scan(processed, tmp_path) -> Path:
 
 def payloads(scan: Path) -> set[Path]:
     return set(scan.glob("raw/*/*.bin"))
-
-
-def errors(scan: Path) -> list[str]:
-    return [str(f) for f in validate(scan) if f.severity == "error"]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -108,7 +105,7 @@ def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, 
     capsys.readouterr()
     with pytest.raises(DataError, match="nothing can be dropped"):
         drop_raw(scan, None, yes=True)
-    assert capsys.readouterr().out.count("not the bytes the products were made from") == ROWS * BOARDS
+    assert capsys.readouterr().out.count("differs from the data of the products") == ROWS * BOARDS
     quality.write_text("{}")
     with pytest.raises(DataError, match="does not say what it was made from"):
         drop_raw(scan, None, yes=True)

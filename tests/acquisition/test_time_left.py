@@ -10,8 +10,8 @@ from polysight.host.acquisition import scan_loop as running
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.progress import time_left, typical_row_s
 from polysight.host.acquisition.scan import run_scan
+from polysight.host.page.history import ScanHistory, seconds
 from polysight.host.page.snapshot import remaining
-from polysight.host.page.story import Story, seconds
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
 
@@ -76,7 +76,7 @@ def test_the_page_says_the_same(rig, tmp_path):
     story: Story | None = None
     for fact in running.ScanFolder.load(tmp_path / "s").content.facts:
         if story is None:
-            story = Story(fact | {"started_utc": utc.format(1, 0)})
+            story = ScanHistory(fact | {"started_utc": utc.format(1, 0)})
         elif fact["fact"] == "row_committed" and fact["row"] < 3:
             story.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
     assert story is not None

@@ -73,14 +73,14 @@ def test_the_page_says_the_same(rig, tmp_path):
     """The facts of a scan with times of our own: rows a minute apart, a pause of a day before the last."""
     run_scan(rig.instrument, tmp_path / "s")
     utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
-    story: Story | None = None
+    history: ScanHistory | None = None
     for fact in running.ScanFolder.load(tmp_path / "s").content.facts:
-        if story is None:
-            story = ScanHistory(fact | {"started_utc": utc.format(1, 0)})
+        if history is None:
+            history = ScanHistory(fact | {"started_utc": utc.format(1, 0)})
         elif fact["fact"] == "row_committed" and fact["row"] < 3:
-            story.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
-    assert story is not None
-    story.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
-    story.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
-    left, _ = remaining(story, seconds(utc.format(2, 3)) + 20)
+            history.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
+    assert history is not None
+    history.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
+    history.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
+    left, _ = remaining(history, seconds(utc.format(2, 3)) + 20)
     assert left == pytest.approx(time_left(1, 60.0, 20.0))

@@ -90,7 +90,7 @@ def test_a_reset_is_a_fault_until_the_next_line(server):
         assert radars.states()["RH"].state is RadarState.UNKNOWN
 
 
-def test_refused_connection_says_what_to_do(server):
+def test_refused_connection_is_an_error_with_a_remedy(server):
     server.close()
     with pytest.raises(DeviceError, match=r"RH: .*127\.0\.0\.1:\d+: connection refused") as e:
         LineServers({"RH": server.address}, 5.0)
@@ -259,7 +259,7 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
 # --- the simulated server ---
 
 
-def test_simulated_server_arms_once_a_line_and_fails_as_told():
+def test_simulated_server_arms_once_a_line_and_has_its_faults():
     armed = []
     made = LineServer("127.0.0.1:0", lambda: armed.append(1), Faults(retrigger_fails=(1,), retrigger_resets=(3,)))
     address = f"127.0.0.1:{made._listener.getsockname()[1]}"

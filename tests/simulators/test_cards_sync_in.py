@@ -45,7 +45,7 @@ def test_a_burst_of_the_rig_file_starts_a_frame_each_and_a_pulse_too_soon_does_n
     assert sync.too_soon == 1
 
 
-def test_a_wire_clock_that_starts_anew_does_not_silence_the_radar() -> None:
+def test_a_restarted_wire_clock_does_not_silence_the_radar() -> None:
     sync = SyncInput(RIG)
     assert len(sync.frames(pulses([10**12, 0, 1_500_000]))) == 3
 
@@ -65,7 +65,7 @@ def test_an_unknown_stage_stands_in_the_middle_of_the_grid() -> None:
     assert (x[0], y[0]) == (0.0, 0.0)
 
 
-def test_motion_lines_are_kept_long_enough_and_not_for_ever() -> None:
+def test_motion_lines_are_kept_long_enough_and_not_forever() -> None:
     track = StageTrack(RIG)
     for k in range(20_000):
         track.add(WireMotion(k * 1000, k, 250_000, 0))

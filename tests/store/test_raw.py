@@ -60,7 +60,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
 
 
-def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
+def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     products, digests = contents(scan / "products"), processed_digests(scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
     done = polysight("drop-raw", scan, typed="drop\n")
@@ -89,7 +89,7 @@ def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
     assert "dropped already" in capsys.readouterr().out
 
 
-def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
+def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
     before = payloads(scan)
     for typed in ("", "yes\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))

@@ -169,13 +169,13 @@ def test_links_within_a_scan_and_of_its_products_folder_are_allowed(scan, tmp_pa
     assert ScanFolder.load(scan.path).committed()
 
 
-def test_a_pipe_in_a_scan_keeps_nobody_waiting(scan):
+def test_a_pipe_in_a_scan_is_refused(scan):
     os.mkfifo(scan.path / "raw" / "pipe")
     with refused(ErrorCode.FILE_FOREIGN, "raw/pipe"):
         ScanFolder.load(scan.path)
 
 
-def test_what_a_link_leads_to_is_not_emptied_for_new_products(tmp_path):
+def test_the_target_of_a_link_is_not_emptied_for_new_products(tmp_path):
     victim, out = tmp_path / "victim", tmp_path / "products"
     (victim / "folder").mkdir(parents=True)
     (tmp_path / ".products.new").symlink_to(victim)

@@ -278,8 +278,9 @@ def test_processing_that_fails_does_not_hide_that_every_row_is_there(rig, tmp_pa
         raise error
 
     monkeypatch.setattr(live, "Pipeline", broken)
-    with pytest.raises(PolysightError, match=r"oops|no images") as e:
+    with pytest.raises(PolysightError) as e:
         live.scan(config, request(tmp_path / "s"), None, False, True)
+    assert str(error.args[0]) in e.value.what
     assert "every row is committed" in capsys.readouterr().out
     assert f"polysight process {tmp_path / 's'}" in e.value.remedy
 

@@ -93,7 +93,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     before = payloads(scan)
     for typed in ("", "yes\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
-        with pytest.raises(ConfigError, match="nothing dropped"):
+        with pytest.raises(ConfigError):
             drop_raw(scan, None, yes=False)
     with refused(ErrorCode.FILE_MISSING):
         drop_raw(scan, tmp_path / "none", yes=True)
@@ -103,14 +103,14 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
         board["raw_crc32"] = dict.fromkeys(board["raw_crc32"], "00000000")  # of another scan
     quality.write_text(json.dumps(said))
     capsys.readouterr()
-    with pytest.raises(DataError, match="nothing can be dropped"):
+    with pytest.raises(DataError):
         drop_raw(scan, None, yes=True)
     assert capsys.readouterr().out.count("differs from the data of the products") == ROWS * BOARDS
     quality.write_text("{}")
-    with pytest.raises(DataError, match="does not say what it was made from"):
+    with pytest.raises(DataError):
         drop_raw(scan, None, yes=True)
     (scan / "products" / "image.npz").write_bytes(b"half of it")
-    with pytest.raises(DataError, match="not an image product"):
+    with refused(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
     assert payloads(scan) == before
     assert not ScanFolder.load(scan).facts("raw_dropped")

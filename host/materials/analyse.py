@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, features_of
-from polysight.host.materials.explain import explained
+from polysight.host.materials.explain import add_explanation
 from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
 from polysight.host.materials.inversion import Inversion, invert
 from polysight.host.materials.measure import (
@@ -18,10 +18,10 @@ from polysight.host.materials.measure import (
     BELOW_AIR,
     LEAST_STD,
     Refused,
-    all_refused,
     background,
+    check_patches,
+    measure_patch,
     reference_std,
-    seen,
 )
 from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box, no_metal
 from polysight.host.materials.metal_evidence import metal_evidence
@@ -77,13 +77,13 @@ def analyse(
     reference = _reference(images, metal, found)
     raw = to_metal(images.h, images.v, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
-    refused = all_refused(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
+    refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
     std = reference_std(reference_spread(rh, rv, reference, plane))
     common, local = (std, 0.0) if plane is None else (LEAST_STD, std)
     prior = optics.prior(common)
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    measured = [seen(p, rh, rv, _angle(theta, p), local) for p in judged]
+    measured = [measure_patch(p, rh, rv, _angle(theta, p), local) for p in judged]
     if plane is None:
         channel = _channel_ratio(images, reference) if optics.channel_ratio_known else None
         reference = replace(reference, evidence=metal_evidence(measured, prior, channel))
@@ -133,7 +133,8 @@ def _names(
         features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
     named = classifier.scan(features, errors)
     told = (
-        explained(n, e.permittivity, e.covariance, classifier) for n, e in zip(named, inversion.patches, strict=True)
+        add_explanation(n, e.permittivity, e.covariance, classifier)
+        for n, e in zip(named, inversion.patches, strict=True)
     )
     return dict(zip((patch.label for patch in judged), told, strict=True))
 

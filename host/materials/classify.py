@@ -44,14 +44,14 @@ LIKELY = 0.005
 """Runners-up of less probability are not listed."""
 
 
-class Learnt(Model):
+class SklearnModel(Model):
     """An estimator of scikit-learn on the columns of its channels; unknown is what lies far in the discriminant."""
 
     def __init__(self, estimator: Any, channels: str) -> None:
         self.estimator, self.channels = estimator, channels
         self.distributions = ErrorDiscriminant()
 
-    def fit(self, samples: Samples) -> Learnt:
+    def fit(self, samples: Samples) -> SklearnModel:
         """Learn from labelled pixels."""
         self.estimator.fit(self._columns(samples.x), samples.names)
         self.distributions.fit(samples)
@@ -77,7 +77,7 @@ def log_features(x: Real) -> Real:
     return np.concatenate(logs, axis=1)
 
 
-def _sklearn(channels: str, *names: str) -> Learnt:
+def _sklearn(channels: str, *names: str) -> SklearnModel:
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
     from sklearn.neighbors import KNeighborsClassifier, NeighborhoodComponentsAnalysis
     from sklearn.pipeline import make_pipeline
@@ -91,7 +91,7 @@ def _sklearn(channels: str, *names: str) -> Learnt:
         "nca": lambda: NeighborhoodComponentsAnalysis(random_state=0, max_iter=60),
         "knn": lambda: KNeighborsClassifier(15),
     }
-    return Learnt(make_pipeline(*(parts[n]() for n in names)), channels)
+    return SklearnModel(make_pipeline(*(parts[n]() for n in names)), channels)
 
 
 MODELS: dict[str, Callable[[str], Model]] = {

@@ -11,7 +11,7 @@ from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch
 from polysight.host.materials.permittivity import format_permittivity
 
 
-def explained(
+def add_explanation(
     named: NamedPatch, permittivity: complex | None, covariance: npt.NDArray[np.float64] | None, classifier: Classifier
 ) -> NamedPatch:
     """The same patch with the reason of its name.

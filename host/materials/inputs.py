@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages, Illumination
-from polysight.host.materials.inversion import Uncertain
+from polysight.host.materials.inversion import RigPrior
 from polysight.host.materials.segment import Box, Segmentation, SegmentSettings
 from polysight.host.materials.truth import TruthPlate
 from polysight.host.polarimetry import IncidenceChoice, PlaneReference
@@ -105,9 +105,9 @@ class Optics:
         least = max(float(std), LEAST_LEAKAGE_STD)
         return cls(angles.used_rad, leakage, p.smooth_px, theta_std_rad, least, measured, channel_ratio_known)
 
-    def prior(self, reference_std: float) -> Uncertain:
+    def prior(self, reference_std: float) -> RigPrior:
         """What is known beforehand of the rig, for the joint inversion."""
-        return Uncertain(
+        return RigPrior(
             self.theta_std_rad,
             self.leakage,
             self.leakage_std,

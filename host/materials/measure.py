@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.host.materials.inversion import Seen
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.materials.segment import Mask, Patch, Segmentation
 
@@ -67,7 +66,7 @@ def background(h: Image, v: Image, found: Segmentation, usable: Mask) -> tuple[f
     return levels[0], levels[1]
 
 
-def refused(patch: Patch, h: Image, v: Image, dark: tuple[float, float], uneven: float) -> Refused | None:
+def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], uneven: float) -> Refused | None:
     """Why a patch is no plate; None when it may be one.
 
     Parameters
@@ -127,7 +126,7 @@ def halves_apart(h: Image, v: Image, at: Mask) -> float:
     return largest
 
 
-def seen(patch: Patch, h: Image, v: Image, theta_rad: float, local_std: float = 0.0) -> Seen:
+def measure_patch(patch: Patch, h: Image, v: Image, theta_rad: float, local_std: float = 0.0) -> PatchMeasurement:
     """A patch's ratio, its standard deviation, and its brightness.
 
     `local_std` is the relative error of a metal reference that differs from place to place; 0 where it is one number.
@@ -140,7 +139,7 @@ def seen(patch: Patch, h: Image, v: Image, theta_rad: float, local_std: float = 
     level = level[np.isfinite(level)]
     parts = (SPREAD_SHARE * spread, LEAST_STD, TILT_STD * _phase_spread(h[at]), local_std * abs(inverse))
     std = float(np.sqrt(np.sum(np.square(parts)))) if np.isfinite(spread) else float("inf")
-    return Seen(inverse, std, theta_rad, float(np.median(level)) if level.size else None)
+    return PatchMeasurement(inverse, std, theta_rad, float(np.median(level)) if level.size else None)
 
 
 def _phase_spread(h: Image) -> float:
@@ -155,10 +154,12 @@ def reference_std(spread: float) -> float:
     return float(np.hypot(SPREAD_SHARE * spread, LEAST_STD)) if np.isfinite(spread) else LEAST_STD
 
 
-def all_refused(found: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask) -> dict[int, Refused]:
+def check_patches(
+    found: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask
+) -> dict[int, Refused]:
     """Patch number to why it is no plate, for those that are none. `metal` is the inside of the metal reference."""
     uneven = halves_apart(h, v, metal)
-    why = ((p.label, refused(p, h, v, dark, uneven)) for p in found.patches)
+    why = ((p.label, check_patch(p, h, v, dark, uneven)) for p in found.patches)
     return {label: reason for label, reason in why if reason is not None}
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.host.materials.inversion import BRIGHTNESS_STD, OUTLIER, Seen, Uncertain, forward_differences
+from polysight.host.materials.inversion import BRIGHTNESS_STD, OUTLIER, PatchMeasurement, RigPrior, forward_differences
 from polysight.host.polarimetry import fresnel, permittivity_from_ratio, ratio_from_permittivity
 
 Complex = npt.NDArray[np.complex128]
@@ -84,7 +84,7 @@ class MetalEvidence:
         return self.score >= self.needed
 
 
-def metal_evidence(seen: list[Seen], prior: Uncertain, channel_ratio: complex | None) -> MetalEvidence:
+def metal_evidence(seen: list[PatchMeasurement], prior: RigPrior, channel_ratio: complex | None) -> MetalEvidence:
     """Compare both explanations.
 
     Parameters
@@ -118,7 +118,7 @@ def _best(model: _Explanation, start: Real) -> float:
 class _Explanation:
     """Residuals of the other patches when the judged one is metal (8 parameters), or has a permittivity (2 more)."""
 
-    def __init__(self, seen: list[Seen], prior: Uncertain, level_db: float | None) -> None:
+    def __init__(self, seen: list[PatchMeasurement], prior: RigPrior, level_db: float | None) -> None:
         self.prior, self.level_db = prior, level_db
         self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
         levels = np.array([np.nan if s.brightness is None else s.brightness for s in seen], np.float64)

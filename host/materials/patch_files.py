@@ -35,7 +35,7 @@ _BUDGET = ("own", "design", "covariance")  # of `SceneErrors`
 
 
 @dataclass(frozen=True)
-class SeenPatch:
+class ScanPatch:
     """A patch in one scan: its middle (mm from the image centre), the places of its pixels and their features.
 
     `places_mm` float64 [n, 2], `features` float64 [n, 4] of its interior, after the Gaussian filter.
@@ -49,12 +49,12 @@ class SeenPatch:
 
 
 @dataclass(frozen=True)
-class SeenPatches:
+class ScanPatches:
     """The patches of one scan; `errors`: what its error budget leaves uncertain of those numbered `judged`."""
 
     angle_deg: float
     simulated: bool
-    patches: tuple[SeenPatch, ...]
+    patches: tuple[ScanPatch, ...]
     judged: tuple[int, ...] = ()
     errors: SceneErrors | None = None
 
@@ -102,7 +102,7 @@ def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike,
     return out.getvalue()
 
 
-def read_patches(path: Path) -> SeenPatches:
+def read_patches(path: Path) -> ScanPatches:
     """Read `patches.npz` (no pickle). Raises DataError."""
     try:
         with open_npz(path) as z:
@@ -121,7 +121,7 @@ def read_patches(path: Path) -> SeenPatches:
         errors = SceneErrors(*budget) if budget else None
         if errors is not None and (len(errors.own), len(errors.design)) != (len(judged), len(judged)):
             raise ValueError(f"an error budget of {len(errors.own)} patches for {len(judged)}")
-        return SeenPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, judged, errors)
+        return ScanPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, judged, errors)
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(
             f"{path}: the patches cannot be read: {type(e).__name__}: {e}",
@@ -129,12 +129,12 @@ def read_patches(path: Path) -> SeenPatches:
         ) from None  # fmt: skip
 
 
-def _seen(row: Mapping[str, Any], places: Real, features: Real) -> SeenPatch:
+def _seen(row: Mapping[str, Any], places: Real, features: Real) -> ScanPatch:
     x, y = row["centre_mm"]
-    return SeenPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)
+    return ScanPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)
 
 
-def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
+def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     """Patches that every scan shows in the same place, pixel by pixel.
 
     A patch belongs to the one whose middle is nearest, when each is the other's nearest. Pixels are compared by their
@@ -156,9 +156,9 @@ def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
     return out
 
 
-def _partner(patch: SeenPatch, here: SeenPatches, there: SeenPatches) -> SeenPatch | None:
-    def nearest(to: SeenPatch, among: SeenPatches) -> SeenPatch | None:
-        def apart(p: SeenPatch) -> float:
+def _partner(patch: ScanPatch, here: ScanPatches, there: ScanPatches) -> ScanPatch | None:
+    def nearest(to: ScanPatch, among: ScanPatches) -> ScanPatch | None:
+        def apart(p: ScanPatch) -> float:
             return float(np.hypot(p.centre_mm[0] - to.centre_mm[0], p.centre_mm[1] - to.centre_mm[1]))
 
         best = min(among.patches, key=apart, default=None)

@@ -31,7 +31,7 @@ from polysight.shared.files import read_bounded, read_json
 Image = npt.NDArray[np.complexfloating]
 PIXELS = 120
 """Of a box, at even intervals: the paper's "about 80 to 120" for each material."""
-TURNS = {
+ORIENTATIONS = {
     "x to the right, y along the rows": lambda a: a,
     "y from the last row": lambda a: a[::-1],
     "x and y swapped": lambda a: a.T,
@@ -89,9 +89,9 @@ class LabelledScan:
             )
         return mask
 
-    def turned(self, how: str) -> LabelledScan:
-        """The same with the images read another way, a key of `TURNS`."""
-        turn = TURNS[how]
+    def oriented(self, how: str) -> LabelledScan:
+        """The same with the images read another way, a key of `ORIENTATIONS`."""
+        turn = ORIENTATIONS[how]
         return LabelledScan(self.scan, self.description, turn(self.h), turn(self.v), self.boxes, self.simulated)
 
     @property
@@ -132,7 +132,7 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
     return LabelledScan(folder.name, description, images[0], images[1], boxes, "simulated" in description.lower())
 
 
-def explained(scan: LabelledScan) -> float:
+def explained_variance(scan: LabelledScan) -> float:
     """Share of the brightness' variance (in dB) between pixels that is explained by the box they lie in, 0 to 1."""
     level = np.log(np.maximum(np.abs(scan.h) * np.abs(scan.v), 1e-30)).astype(np.float64)
     label = np.zeros(level.shape, int)
@@ -142,15 +142,15 @@ def explained(scan: LabelledScan) -> float:
     return 1 - within / max(float(((level - level.mean()) ** 2).sum()), 1e-30)
 
 
-def reading_of(scans: Sequence[LabelledScan]) -> str:
-    """How a data set's images are to be read, a key of `TURNS`: the first, unless another explains clearly more."""
+def image_orientation(scans: Sequence[LabelledScan]) -> str:
+    """How a data set's images are to be read, a key of `ORIENTATIONS`: the first, unless another explains clearly more."""
     shares = {}
-    for how in TURNS:
+    for how in ORIENTATIONS:
         try:
-            shares[how] = float(np.mean([explained(s.turned(how)) for s in scans]))
+            shares[how] = float(np.mean([explained_variance(s.oriented(how)) for s in scans]))
         except DataError:  # a box outside the image
             shares[how] = -1.0
-    first, best = next(iter(TURNS)), max(shares, key=lambda h: shares[h])
+    first, best = next(iter(ORIENTATIONS)), max(shares, key=lambda h: shares[h])
     return best if shares[best] > shares[first] + _CLEARLY else first
 
 
@@ -206,7 +206,7 @@ def label_folders(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.is_dir() and any(p.glob("*.json"))) if folder.is_dir() else []
 
 
-def told_angle(texts: Iterable[str]) -> float | None:
+def angle_in_text(texts: Iterable[str]) -> float | None:
     """An incidence angle told in words, as in "60 deg" or "scan_55degrees"; None when there is none."""
     for text in texts:
         found = re.search(r"(\d{2}(?:\.\d+)?)\s*(?:°|deg)", text.lower())

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.materials.classify import NamedPatch, PatchName
-from polysight.host.materials.inversion import Inversion, Uncertain, ratio_error
+from polysight.host.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.host.materials.measure import Refused, background, ratio_sigma
 from polysight.host.materials.metal import MetalReference
 from polysight.host.materials.permittivity import NOTHING, Permittivity
@@ -114,7 +114,7 @@ class MaterialsResult:
     patches: tuple[PatchResult, ...]
     theta_rad: npt.NDArray[np.float64]
     inversion: Inversion
-    prior: Uncertain
+    prior: RigPrior
     bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
     boxes: dict[int, str] = field(default_factory=dict)
     library: tuple[str, ...] = ()

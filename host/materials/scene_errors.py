@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.inversion import Inversion, Seen, Uncertain
+from polysight.host.materials.inversion import Inversion, PatchMeasurement, RigPrior
 from polysight.host.materials.samples import SceneErrors
 from polysight.host.materials.specimens import features, relative, softened
 
@@ -16,7 +16,7 @@ REFERENCE_BRIGHTNESS_STD = 0.1
 """Of ln|H| and ln|V| of all patches: a stated prior for a metal plate that lies high or askew; not measured."""
 
 
-def scene_errors(found: Inversion, prior: Uncertain, seen: Sequence[Seen]) -> SceneErrors:
+def scene_errors(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> SceneErrors:
     """What the budget leaves uncertain of ln|H|, ln|V| and arg P of the patches, for naming them together.
 
     In common are leakage of p into H (da) and of s into V (db), the metal reference (rho) and the angle, as the
@@ -43,7 +43,7 @@ def scene_errors(found: Inversion, prior: Uncertain, seen: Sequence[Seen]) -> Sc
     return SceneErrors(own_h + noise[:, None, None] ** 2 * np.diag([0.0, 1.0, 1.0]), design, covariance)
 
 
-def _by_angle(found: Inversion, prior: Uncertain, seen: Sequence[Seen]) -> Real:
+def _by_angle(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> Real:
     """What one standard deviation of the angle's error changes in the features, at fixed permittivity, [patch, 3]."""
     out = np.zeros((len(seen), 3))
     for i, (patch, one) in enumerate(zip(found.patches, seen, strict=True)):

@@ -203,7 +203,7 @@ def best_model(samples: Samples) -> tuple[str, tuple[Score, ...]]:
     return max(scores, key=lambda s: s.pixels + s.patches).model, scores
 
 
-def strangers(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str, float]:
+def score_unseen_materials(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str, float]:
     """Share of each material's patches that are called unknown when no patch of that material was ever learnt.
 
     The other materials are learnt from other scans than the one that is judged, as always.

@@ -67,7 +67,7 @@ def read_truth(path: Path) -> tuple[TruthPlate, ...]:
         raise DataError(f"{path}: cannot be read as truth: {e}", "another program's file, or damaged", remedy) from None
 
 
-def drawn_specimens(path: Path) -> int | None:
+def specimen_seed(path: Path) -> int | None:
     """The seed by which a truth.json's scene drew its plates' permittivities (`specimen_spread`); None: it did not.
 
     Raises DataError.
@@ -78,7 +78,7 @@ def drawn_specimens(path: Path) -> int | None:
     return scene.get("seed") if isinstance(scene, dict) and isinstance(spread, list) and any(spread) else None
 
 
-def truth_beside(folder: Path) -> tuple[Plates, str]:
+def find_truth(folder: Path) -> tuple[Plates, str]:
     """Plates of a scan folder's truth.json, for results that do without.
 
     Returns

@@ -67,8 +67,14 @@ from polysight.host.materials.layer_rows import LAYER_FORMS, fit_row, incidence_
 from polysight.host.materials.layers import METAL, Layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
 from polysight.host.materials.measure import NOT_PASSIVE, Refused
-from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
-from polysight.host.materials.metal_evidence import MetalEvidence, metal_evidence
+from polysight.host.materials.metal import (
+    MetalEvidence,
+    MetalReference,
+    find_metal,
+    metal_by_label,
+    metal_evidence,
+    metal_in_box,
+)
 from polysight.host.materials.patch_files import (
     PATCHES,
     MatchedPatch,
@@ -120,7 +126,6 @@ from polysight.host.materials.truth import (
     match_truth,
     read_truth,
     specimen_seed,
-    truth_labels,
     truth_plates,
 )
 
@@ -249,7 +254,6 @@ __all__ = [
     "score_unseen_materials",
     "segment",
     "specimen_seed",
-    "truth_labels",
     "truth_plates",
     "with_bands",
 ]

@@ -17,13 +17,12 @@ import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages, SubBand
 from polysight.host.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
-from polysight.host.materials.inputs import ImagePair, Optics
+from polysight.host.materials.inputs import ImagePair, Optics, level
 from polysight.host.materials.inversion import ratio_slopes
 from polysight.host.materials.layers import Bands, Spectrum
 from polysight.host.materials.measure import measure_patch
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.materials.result import MaterialsResult
-from polysight.host.materials.tilts import level
 from polysight.host.polarimetry import PlaneReference
 from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polysight.host.materials.inversion import PatchMeasurement, RigPrior
-from polysight.host.materials.metal_evidence import metal_evidence
+from polysight.host.materials.metal import metal_evidence
 
 THETA = np.radians(55.0)
 EPS = [

@@ -5,13 +5,13 @@
 enum StageError : uint8_t {
   ERROR_NONE = 0,
   ERROR_BAD_CRC = 1,  // the line's checksum is wrong
-  ERROR_MALFORMED = 2,  // the line is not of the protocol's form
+  ERROR_MALFORMED = 2,  // the line does not follow the protocol
   ERROR_LINE_TOO_LONG = 3,  // the line is longer than the stage accepts
   ERROR_UNKNOWN_COMMAND = 4,  // the stage does not know this command
   ERROR_ARGUMENT_COUNT = 5,  // wrong number of arguments
   ERROR_OUT_OF_RANGE = 6,  // an argument is out of range
   ERROR_BUSY = 7,  // the stage is moving
-  ERROR_NOT_HOMED = 8,  // the stage does not know where it is
+  ERROR_NOT_HOMED = 8,  // the stage is not homed
   ERROR_SOFT_LIMIT = 9,  // the target is outside the travel
   ERROR_IN_ALARM = 10,  // an alarm is latched
   ERROR_HEARTBEAT_LOST = 11,  // the Pi was silent while the stage moved
@@ -19,7 +19,7 @@ enum StageError : uint8_t {
   ERROR_HOMING_FAILED = 13,  // homing did not find the switch
   ERROR_EMERGENCY_STOP = 14,  // the emergency stop is pressed
   ERROR_STOPPED = 15,  // the stage was stopped by command
-  ERROR_TOO_FAST = 16,  // the speed is above what the firmware can step
+  ERROR_TOO_FAST = 16,  // the speed exceeds the firmware's step rate
   ERROR_NO_RUN_UP = 17,  // no room to accelerate before the first point
   ERROR_SEQUENCE = 18,  // the sequence number is not the next one
   ERROR_DISABLED = 19,  // the motors are switched off

@@ -1,8 +1,8 @@
-"""Bursts: the SYNC_IN pulses of one position, made one by one or clocked out as the bits of one SPI transfer.
+"""Bursts: the SYNC_IN pulses of one position, sent one by one or as the bits of one SPI transfer.
 
-The radar starts one frame on each rising edge. It takes pulses of 25 ns .. 4 us, and frames at least 300 us apart; an
-early pulse is a fatal fault of its RF core (TI mmWave Radar Interface Control, frame configuration). So the spacing is
-checked before a pulse is made, and the width after.
+The radar starts one frame on each rising edge. It accepts pulses of 25 ns .. 4 us and needs at least 300 us between
+frames; an early pulse is a fatal fault of its RF core (TI mmWave Radar Interface Control, frame configuration).
+So the spacing is checked before each pulse, and the width after it.
 """
 
 from __future__ import annotations
@@ -12,27 +12,28 @@ from functools import lru_cache
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from polysight.shared.config import Burst
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS
 from polysight.shared.units import us_to_ns
 
-FASTEST_HZ, SLOWEST_HZ = 2_000_000, 500_000  # SPI clock for pulses of 0.5 .. 2 us
-LEAD_BITS = 8  # low bits before the first pulse, and at least so many behind the last: the line idles as the last bit
-SHORTEST_BYTES = 96  # below it spi-bcm2835 writes byte by byte, with gaps; from it on it uses DMA
+MAX_HZ, MIN_HZ = 2_000_000, 500_000  # SPI clock for pulses of 0.5 .. 2 us
+LEAD_BITS = 8  # low bits before the first pulse, and at least as many after the last: MOSI keeps the last bit's level
+MIN_BYTES = 96  # shorter transfers have gaps: spi-bcm2835 writes them byte by byte, longer ones by DMA
 DEFAULT_BUFSIZ = 4096
-SHORTEST_PART = 0.98  # a transfer that is over sooner was clocked too fast: the frames came too soon
+MIN_PART = 0.98  # of the nominal duration; a shorter transfer was clocked too fast, its frames too close
 
 
 class Edge(NamedTuple):
-    """A rising edge of the trigger line. A `seqno` that is not the last one + 1 is a lost edge."""
+    """A rising edge of the trigger line; a gap in `seqno` means lost edges."""
 
     t_ns: int  # on the clock of the lines
     seqno: int
 
 
 class BurstSpec(NamedTuple):
-    """Pulses of a position."""
+    """Number, period and width of the pulses at one position."""
 
     pulses: int
     period_ns: int
@@ -40,79 +41,79 @@ class BurstSpec(NamedTuple):
 
     @staticmethod
     def of(burst: Burst) -> BurstSpec:
-        """From the rig file."""
+        """Return the burst of the rig file."""
         return BurstSpec(burst.pulses, us_to_ns(burst.period_us), us_to_ns(burst.width_us))
 
 
 class SpiBurst(NamedTuple):
-    """One burst as one SPI transfer: MOSI is SYNC_IN, one set bit a pulse, within half a bit of its place."""
+    """A burst as one SPI transfer on MOSI: each pulse is one set bit, within half a bit of its exact time."""
 
     data: bytes  # most significant bit first
     clock_hz: int
-    bits: tuple[int, ...]  # place of each pulse
+    bits: tuple[int, ...]  # index of each set bit
 
     @property
     def bit_ns(self) -> float:
-        """Length of a bit, and of a pulse."""
+        """Duration of a bit, which is the pulse width."""
         return 1e9 / self.clock_hz
 
     @property
     def duration_ns(self) -> float:
-        """Length of the transfer."""
+        """Duration of the transfer."""
         return 8 * len(self.data) * self.bit_ns
 
 
 class BurstRecord(NamedTuple):
-    """What was sent."""
+    """Result of sending a burst."""
 
     pulses: int
-    first_ns: int  # rising edge of the first pulse: the time read just before the line was set
+    first_ns: int  # rising edge of the first pulse: the clock just before the line was set
     last_ns: int
-    end_ns: int  # when the last pulse was over
+    end_ns: int  # end of the last pulse
     width_max_ns: int = 0  # upper bound: from before the line was set until after it was cleared
-    jitter_ns: int = 0  # largest lateness of a rising edge against its deadline
-    fault: int = 0  # number of what went wrong
+    jitter_ns: int = 0  # largest delay of a rising edge after its deadline
+    fault: int = 0  # PiFault; 0: none
 
 
 class _Lines(Protocol):
-    """Trigger input and SYNC_IN (lines.py, sim_lines.py). Methods raise DeviceError when the lines are gone."""
+    """Trigger input and SYNC_IN output (lines.py, sim_lines.py). Methods raise DeviceError when the lines are lost."""
 
     name: str
-    check_width: bool  # a pulse that may have been too long is a fault: no hardware one-shot makes the width
+    check_width: bool  # True without a hardware one-shot: a pulse that may have been too long is a fault
 
     def now_ns(self) -> int:
-        """The time base of edges and pulses, nanoseconds."""
+        """Return the time on the clock of edges and pulses, nanoseconds."""
         ...
 
     def sleep_until(self, t_ns: int) -> None:
         """Return at `t_ns`, never before it."""
         ...
 
-    def wait_edge(self, limit_s: float) -> Edge | None:
-        """The next rising edge of the trigger line, or None when none came within `limit_s` of wall time."""
+    def wait_edge(self, timeout_s: float) -> Edge | None:
+        """Return the next rising edge of the trigger line, or None after a timeout of `timeout_s` (wall time)."""
         ...
 
     def close(self) -> None:
-        """SYNC_IN low, lines released."""
+        """Set SYNC_IN low and release the lines."""
         ...
 
 
 class PulseLines(_Lines, Protocol):
-    """Lines whose pulses this program makes, one by one."""
+    """Lines whose pulses are timed by this program, one by one."""
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
-        """Set SYNC_IN and clear it, `width_ns` later or as soon as can be; the times before and after."""
+        """Set SYNC_IN, clear it after `width_ns` or as soon as possible; return the times before and after."""
         ...
 
 
 @runtime_checkable
 class BitLines(_Lines, Protocol):
-    """Lines whose bursts an SPI controller clocks out, each in one piece of at most `bufsiz` bytes."""
+    """Lines whose bursts are SPI transfers of at most `bufsiz` bytes."""
 
     bufsiz: int
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
-        """Send a burst; the times before and after."""
+        """Send a burst; return the times before and after."""
         ...
 
 
@@ -121,19 +122,15 @@ Lines = PulseLines | BitLines
 
 @lru_cache(maxsize=16)
 def spi_burst(spec: BurstSpec, bufsiz: int = DEFAULT_BUFSIZ) -> SpiBurst:
-    """The transfer that is a burst, for a spidev that takes `bufsiz` bytes.
+    """Return the SPI transfer of a burst, for a spidev buffer of `bufsiz` bytes.
 
-    The clock is one bit a width, within SLOWEST_HZ .. FASTEST_HZ; SLOWEST_HZ where the burst would not fit otherwise.
-
-    Raises
-    ------
-    ConfigError
-        when it does not fit even then, with the bufsiz that it needs and where to set it.
+    One bit lasts one pulse width, with the clock within MIN_HZ .. MAX_HZ; MIN_HZ if the burst does not fit
+    otherwise. Raises ConfigError, with the `bufsiz` to set, if it does not fit even then.
     """
     size = 0
-    for clock_hz in (min(max(round(1e9 / spec.width_ns), SLOWEST_HZ), FASTEST_HZ), SLOWEST_HZ):
+    for clock_hz in (min(max(round(1e9 / spec.width_ns), MIN_HZ), MAX_HZ), MIN_HZ):
         bits = tuple(LEAD_BITS + round(k * spec.period_ns * clock_hz / 1e9) for k in range(spec.pulses))
-        size = max(SHORTEST_BYTES, (bits[-1] + LEAD_BITS) // 8 + 1)
+        size = max(MIN_BYTES, (bits[-1] + LEAD_BITS) // 8 + 1)
         if size <= bufsiz:
             data = bytearray(size)
             for bit in bits:
@@ -141,11 +138,12 @@ def spi_burst(spec: BurstSpec, bufsiz: int = DEFAULT_BUFSIZ) -> SpiBurst:
             return SpiBurst(bytes(data), clock_hz, bits)
     room = max(4096, 1 << (size - 1).bit_length())
     raise ConfigError(
-        f"a burst of {spec.pulses} pulses every {spec.period_ns / 1e3:g} us takes an SPI transfer of {size} bytes,"
-        f" spidev {bufsiz}",
-        "its buffer is 4096 bytes unless it is told otherwise",
+        f"a burst of {spec.pulses} pulses every {spec.period_ns / 1e3:g} us needs an SPI transfer of {size} bytes,"
+        f" spidev allows {bufsiz}",
+        "spidev's buffer has 4096 bytes by default",
         f"write `options spidev bufsiz={room}` into /etc/modprobe.d/spidev.conf (a kernel with spidev built in:"
-        f" `spidev.bufsiz={room}` in /boot/firmware/cmdline.txt), and start the Pi again; or fewer pulses",
+        f" `spidev.bufsiz={room}` in /boot/firmware/cmdline.txt) and reboot the Pi; or use fewer pulses",
+        code=ErrorCode.VALUES_CONFLICT,
     )
 
 
@@ -158,12 +156,12 @@ def send_burst(
 ) -> BurstRecord:
     """Send the pulses at `start_ns + k * period`, k = 0 .. pulses - 1.
 
-    When `start_ns` has passed already, all deadlines move with the first pulse: the period matters, not the phase. They
-    are computed from the first, so that lateness of one pulse never shifts the next.
+    If `start_ns` has passed, all deadlines shift with the first pulse: the period matters, not the phase. All deadlines
+    are computed from the first, so a late pulse never shifts the next one.
 
-    `previous_rise_ns` is the last rising edge before this burst; `stop` is asked before each pulse, or transfer, and
-    ends the burst early. The record's fault is PERIOD_TOO_SHORT when a pulse was left out that would have come too
-    early for the radar, PULSE_TOO_LONG when one may have been longer than 4 us.
+    `previous_rise_ns` is the last rising edge before this burst. `stop` is called before each pulse, or transfer; True
+    ends the burst. The record's fault is PERIOD_TOO_SHORT if a pulse was skipped because it would have come too early
+    for the radar, PULSE_TOO_LONG if one may have been longer than 4 us.
     """
     if isinstance(lines, BitLines):
         return _send_bits(lines, spec, start_ns, previous_rise_ns, stop)
@@ -192,10 +190,10 @@ def send_burst(
 def _send_bits(
     lines: BitLines, spec: BurstSpec, start_ns: int, previous_rise_ns: int | None, stop: Callable[[], bool]
 ) -> BurstRecord:
-    """Send the burst as one transfer; once begun it goes to its end.
+    """Send the burst as one SPI transfer, which cannot be interrupted once it has begun.
 
-    The clock is measured by each transfer: a bit lasts at most the time that the system call took, by the number of its
-    bits. A clock that is not the one asked for (a Pi whose core clock changes) is a fault before it spoils a scan.
+    The duration of the system call gives an upper bound of the bit length, so every transfer checks the SPI clock: a
+    wrong clock (a Pi whose core clock changes) is a fault before it spoils a scan.
     """
     burst = spi_burst(spec, lines.bufsiz)
     lead_ns = round(burst.bits[0] * burst.bit_ns)
@@ -207,15 +205,15 @@ def _send_bits(
         return BurstRecord(0, start_ns, start_ns, start_ns)
     before_ns, after_ns = lines.transfer(burst)
     took_ns = after_ns - before_ns
-    spare_ns = max(0, took_ns - round(burst.duration_ns))  # somewhere in it the controller began
+    spare_ns = max(0, took_ns - round(burst.duration_ns))  # the controller began at an unknown moment within it
     first_ns = before_ns + spare_ns // 2 + lead_ns
     last_ns = first_ns + round((burst.bits[-1] - burst.bits[0]) * burst.bit_ns)
     width_ns = round(max(burst.bit_ns, took_ns / (8 * len(burst.data))))
     jitter_ns = before_ns - begin_ns + (spare_ns + 1) // 2
-    if spec.period_ns * burst.clock_hz % 10**9:  # pulses lie up to half a bit beside their places
+    if spec.period_ns * burst.clock_hz % 10**9:  # pulses are up to half a bit away from their exact times
         jitter_ns += round(burst.bit_ns / 2)
     fault = 0
-    if took_ns < SHORTEST_PART * burst.duration_ns:
+    if took_ns < MIN_PART * burst.duration_ns:
         fault = int(PiFault.PERIOD_TOO_SHORT)
     elif lines.check_width and width_ns > MAX_WIDTH_NS:
         fault = int(PiFault.PULSE_TOO_LONG)
@@ -225,9 +223,9 @@ def _send_bits(
 def send_bench(
     lines: Lines, spec: BurstSpec, start_ns: int, previous_rise_ns: int | None, stop: Callable[[], bool]
 ) -> BurstRecord:
-    """The same for pulses that no edge asks for: as many transfers as the lines' buffer makes of them.
+    """Send a burst without a trigger edge, in several transfers if the SPI buffer is too small for one.
 
-    The pause between two transfers is at least a period; how exact it is the record's jitter does not say.
+    The pause between two transfers is at least one period; the record's jitter does not cover it.
     """
     part = spec
     while isinstance(lines, BitLines) and part.pulses > 1:
@@ -247,11 +245,3 @@ def send_bench(
             width_max_ns=max(total.width_max_ns, more.width_max_ns), jitter_ns=max(total.jitter_ns, more.jitter_ns),
         )  # fmt: skip
     return total
-
-
-def send_bursts(lines: Lines, spec: BurstSpec, bursts: int, pause_ns: int) -> list[BurstRecord]:
-    """Send bursts without a stage, `pause_ns` after one another."""
-    sent: list[BurstRecord] = []
-    for _ in range(bursts):
-        sent.append(send_burst(lines, spec, (sent[-1].end_ns if sent else lines.now_ns()) + pause_ns))
-    return sent

@@ -1,4 +1,4 @@
-"""`polysight-pi check`: every line, right, port, key and disk, with what to do. Moves nothing, sends no pulse."""
+"""`polysight-pi check`: tests lines, permissions, ports, keys and disk. Moves nothing, sends no pulse."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import zmq
 
 from polysight.pi_controller import AS_THE_SERVICE, system
-from polysight.pi_controller.bursts import SHORTEST_PART, BurstSpec, spi_burst
+from polysight.pi_controller.bursts import MIN_PART, BurstSpec, spi_burst
 from polysight.pi_controller.journal import Journal
 from polysight.pi_controller.lines import (
     GpiodLines,
@@ -21,22 +21,23 @@ from polysight.pi_controller.lines import (
     open_lines,
     request_output,
 )
-from polysight.pi_controller.stage import bench_stage
+from polysight.pi_controller.stage import BenchStage
 from polysight.shared.config import Instrument, Pi
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, PolysightError, os_error
 from polysight.shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
 from polysight.shared.sockets import is_loopback, publisher, replier
 
 JOURNAL_BYTES = 100 << 20  # a scan of 70,000 positions journals about 20 MB
 TRANSFERS = 5
-LONGEST_PART = 1.05  # of the time asked for: a system call takes some 100 us of the 22 ms
-PAIRS, PAUSE_NS = 500, 300_000  # of system calls that are timed
+MAX_PART = 1.05  # of the nominal duration: the system call adds some 100 us to 22 ms
+PAIRS, PAUSE_NS = 500, 300_000  # pairs of system calls to time, and the pause between them
 MODEL, MODULES = Path("/proc/device-tree/model"), Path("/sys/module")
-STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and start the Pi again"
+STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
 
 
 class Finding(NamedTuple):
-    """One check: its name, how it went, what was found, and what to do when it is not ok."""
+    """Result of one check; `remedy` says what to do if the verdict is not ok."""
 
     name: str
     verdict: Literal["ok", "warn", "fail"]
@@ -45,7 +46,7 @@ class Finding(NamedTuple):
 
 
 def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
-    """Run a check: ok with what it returns, its own finding, or fail with the error it raises."""
+    """Run a check. Text it returns becomes an ok finding, an error it raises a failed one."""
     try:
         found = check(*args)
     except PolysightError as e:
@@ -56,7 +57,7 @@ def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Fi
 
 
 def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
-    """Run every check, in the order in which a rig comes to life."""
+    """Run every check, in the order of bring-up."""
     pi, keys = instrument.pi, Path(instrument.pi.key_dir)
     yield attempt("plan", _plan, instrument)
     if wires is not None:
@@ -83,20 +84,18 @@ def _wires(instrument: Instrument, wires: Path) -> str:
 
 
 def _real_time() -> Finding:
-    """Ask for what the service asks for: the widths are measured with the same rights."""
+    """Request the same real-time rights as the service, so that pulse widths are measured with them."""
     refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
     if refused:
-        remedy = "the unit gives both rights (LimitRTPRIO, LimitMEMLOCK); a shell lacks them"
+        remedy = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"
         return Finding("real time", "warn", "; ".join(refused), remedy)
     return Finding("real time", "ok", "SCHED_FIFO and locked memory are permitted")
 
 
 def _stage(instrument: Instrument) -> str:
-    with bench_stage(instrument.stage) as stage:
-        here = stage.position()
-        return (
-            f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {here.x_mm:.2f}, {here.y_mm:.2f} mm"
-        )
+    with BenchStage(instrument.stage) as stage:
+        x_mm, y_mm = stage.position()
+        return f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {x_mm:.2f}, {y_mm:.2f} mm"
 
 
 def _journal(path: Path, needed: int) -> str:
@@ -104,7 +103,7 @@ def _journal(path: Path, needed: int) -> str:
     free = shutil.disk_usage(path).free
     if free < needed:
         wanted = f"{path}: {free >> 20} MiB free, {needed >> 20} MiB wanted"
-        raise DeviceError(wanted, "the disk fills", "remove old journals there")
+        raise DeviceError(wanted, "the disk fills", "remove old journals there", code=ErrorCode.DISK_FULL)
     return f"{path} can be written, {free >> 20} MiB are free"
 
 
@@ -113,7 +112,7 @@ def _keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
         return "not needed: both addresses are loopback"
     secret = folder / "pi.key_secret"
     if not secret.is_file():
-        raise DeviceError(f"{secret} is not there", "keys were not made yet", "polysight-pi keys")
+        raise DeviceError(f"{secret} is missing", "keys were not made yet", "polysight-pi keys")
     if secret.stat().st_mode & 0o077:
         found = f"{secret} can be read by others than its owner"
         return Finding("keys", "warn", found, f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`")
@@ -133,53 +132,49 @@ def _address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path
 
 
 def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MODULES) -> Iterator[Finding]:
-    """Check every line of [pi], and measure the widths that this computer makes, with SYNC_IN low all the time.
+    """Check every line of [pi] and measure the pulse width on this computer; SYNC_IN stays low.
 
-    `model` is the file with what the computer calls itself, `modules` where the kernel shows its modules' parameters.
+    `model` is the device tree's file with the computer's name, `modules` the folder of the kernel modules' parameters.
     """
     pi = instrument.pi
     chip = attempt("GPIO chip", _chip, pi)
     yield chip
     if chip.verdict == "ok":
-        path = chip.found.partition(" is ")[0]
-        yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi, path)
-        yield attempt(f"SYNC_IN line {pi.sync_out[0]}", _spi if pi.wiring == "spi" else _output, pi, path)
-        yield attempt("pulse width", _width, instrument, path)
+        yield attempt(f"trigger line {pi.trigger_in}", _trigger, pi)
+        yield attempt(f"SYNC_IN line {pi.sync_out[0]}", _spi if pi.wiring == "spi" else _output, pi)
+        yield attempt("pulse width", measure_clock if pi.wiring == "spi" else measure_width, instrument)
     if pi.wiring != "spi" and model.exists() and model.read_bytes().startswith(b"Raspberry Pi"):
         yield _release(modules)
 
 
 def _chip(pi: Pi) -> str:
-    gpiod = load_gpiod()
-    path = find_chip(pi.gpio_chip, gpiod)
+    path = find_chip(pi.gpio_chip)
     try:
-        with gpiod.Chip(path) as c:
+        with load_gpiod().Chip(path) as c:
             return f"{path} is {c.get_info().label!r}"
     except OSError as e:
         raise DeviceError(f"{path}: {e.strerror}", "no such device, or no right", "set pi.gpio_chip; group gpio") from e
 
 
-def _trigger(pi: Pi, path: str) -> str:
-    TriggerInput(pi, load_gpiod(), path).close()
+def _trigger(pi: Pi) -> str:
+    TriggerInput(pi).close()
     return f"rising edges with time stamps, {pi.trigger_bias}, debounced by {pi.trigger_debounce_us} us"
 
 
-def _output(pi: Pi, path: str) -> str:
-    request_output(load_gpiod(), path, pi.sync_out[0]).release()
-    return "can be had, and is low"
+def _output(pi: Pi) -> str:
+    request_output(pi).release()
+    return "is available, and is low"
 
 
-def _spi(pi: Pi, _: str) -> str:
+def _spi(pi: Pi) -> str:
     device = SpiDevice(pi.spi_device)
     device.close()
-    return f"MOSI of {pi.spi_device}, low; it takes transfers of {device.bufsiz} bytes"
+    return f"MOSI of {pi.spi_device}, low; it accepts transfers of {device.bufsiz} bytes"
 
 
-def _width(instrument: Instrument, path: str) -> str | Finding:
-    """Measure the width of pulses without sending one: the same calls, and SYNC_IN stays low."""
-    if instrument.pi.wiring == "spi":
-        return measure_clock(instrument)
-    lines = GpiodLines(instrument.pi, load_gpiod(), path)
+def measure_width(instrument: Instrument) -> str | Finding:
+    """Time the system calls of a pulse, with SYNC_IN low. Raises DeviceError."""
+    lines = GpiodLines(instrument.pi)
     widths_ns: list[int] = []
     try:
         for _ in range(PAIRS):
@@ -191,7 +186,7 @@ def _width(instrument: Instrument, path: str) -> str | Finding:
 
 
 def measure_clock(instrument: Instrument) -> str | Finding:
-    """Clock out a burst's length of zeros, a few times; the shortest one tells the bit clock. Raises DeviceError."""
+    """Time transfers of zeros as long as a burst; the shortest gives the SPI clock. Raises DeviceError."""
     device = SpiDevice(instrument.pi.spi_device)
     try:
         burst = spi_burst(BurstSpec.of(instrument.burst), device.bufsiz)
@@ -200,33 +195,33 @@ def measure_clock(instrument: Instrument) -> str | Finding:
     finally:
         device.close()
     bit_ns = min(took) / (8 * len(zeros))
-    found = f"a bit lasts {bit_ns / 1e3:.3f} us, asked for {burst.bit_ns / 1e3:.3f} us; spaced by the same clock"
-    if SHORTEST_PART <= bit_ns / burst.bit_ns <= LONGEST_PART:
+    found = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
+    if MIN_PART <= bit_ns / burst.bit_ns <= MAX_PART:
         return found + " (SPI controller, measured now with the line low)"
     remedy = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
     return Finding("pulse width", "fail", found, remedy)
 
 
 def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
-    """A row needs thousands of pulses below 4 us: a hundredth above it is too much."""
+    """Judge measured widths: a row needs thousands of pulses below 4 us, so 1 % above it is too much."""
     widths_ns = sorted(widths_ns)
     middle, high = widths_ns[len(widths_ns) // 2], widths_ns[len(widths_ns) * 99 // 100]
-    found = f"two calls take {middle / 1e3:.1f} us in the middle, one in a hundred {high / 1e3:.1f} us or more"
+    found = f"two system calls take {middle / 1e3:.1f} us (median), {high / 1e3:.1f} us (99th percentile)"
     if one_shot:
-        return f"{found}; a one-shot makes the width"
+        return f"{found}; a one-shot sets the width"
     if high <= MAX_WIDTH_NS:
         return f"{found} (measured now with the line low)"
-    found += f": the radar takes at most {WIDTH_TEXT}; rows would end in fault 105"
+    found += f": the radar accepts {WIDTH_TEXT}; rows would end with fault 105"
     remedy = 'wire SYNC_IN to MOSI and set wiring = "spi", or fit a one-shot and set one_shot = true'
     return Finding("pulse width", "fail", found, f"{remedy} (docs/how-to/wiring.md)")
 
 
 def _release(modules: Path) -> Finding:
-    found = "this kernel does not say what becomes of outputs when their program dies"
+    found = "this kernel does not say if outputs are released when their program dies"
     for module in ("pinctrl_bcm2835", "pinctrl_rp1"):
         parameter = modules / module / "parameters" / "persist_gpio_outputs"
         if parameter.exists():
             if parameter.read_text().strip() != "Y":
                 return Finding("line release", "ok", "lines become inputs again when their program ends")
-            found = f"{module} keeps outputs as they were: a program killed inside a pulse leaves them high"
+            found = f"{module} keeps outputs as they were: a program killed during a pulse leaves them high"
     return Finding("line release", "warn", found, STRICT)

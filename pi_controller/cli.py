@@ -8,7 +8,6 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,10 @@ from polysight.shared.errors import PolysightError, os_error
 from polysight.shared.faults import explain
 from polysight.shared.raster import WIDTH_TEXT
 
-# Commands import what they need when they are called: `--help` needs nothing.
-Command = Callable[[argparse.Namespace, Instrument], int]
+# Commands import their modules when they are called, so `--help` needs no other package.
+
+
+PAUSE_NS = 10_000_000  # between the bursts of `pulse`
 
 
 def _write(text: str) -> None:
@@ -53,7 +54,7 @@ def _check(args: argparse.Namespace, instrument: Instrument) -> int:
 
 def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller import system
-    from polysight.pi_controller.bursts import BurstSpec, send_bursts
+    from polysight.pi_controller.bursts import BurstSpec, send_burst
     from polysight.pi_controller.client import refuse_beside_service
     from polysight.pi_controller.lines import open_lines
     from polysight.pi_controller.service import log
@@ -64,8 +65,11 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
         if args.wires is None:
             for sentence in dict.fromkeys(system.prepare_process() + system.prepare_thread()):  # each once
                 log(sentence)
-        lines.check_width = False  # it is told below
-        records = send_bursts(lines, BurstSpec.of(instrument.burst), args.count, round(args.pause_ms * 1e6))
+        lines.check_width = False  # the width is printed below
+        spec, end_ns, records = BurstSpec.of(instrument.burst), lines.now_ns(), []
+        for _ in range(args.count):
+            records.append(send_burst(lines, spec, end_ns + PAUSE_NS))
+            end_ns = records[-1].end_ns
     finally:
         lines.close()
     width, jitter = max(r.width_max_ns for r in records), max(r.jitter_ns for r in records)
@@ -73,8 +77,8 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
         _write(json.dumps([r._asdict() for r in records]))
     else:
         _write(f"{sum(r.pulses for r in records)} pulses in {len(records)} bursts on SYNC_IN {instrument.pi.sync_out}")
-        _write(f"longest pulse at most {width / 1e3:.2f} us (the radar takes {WIDTH_TEXT})")
-        _write(f"latest rising edge {jitter / 1e3:.2f} us behind its deadline")
+        _write(f"longest pulse at most {width / 1e3:.2f} us (the radar accepts {WIDTH_TEXT})")
+        _write(f"latest rising edge {jitter / 1e3:.2f} us after its deadline")
     faults = [r.fault for r in records if r.fault]
     for number in sorted(set(faults)):
         e = explain(number)
@@ -85,29 +89,29 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
 
 def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import refuse_beside_service
-    from polysight.pi_controller.stage import bench_stage
+    from polysight.pi_controller.stage import BenchStage
 
     refuse_beside_service(instrument)
-    with bench_stage(instrument.stage) as stage:
+    with BenchStage(instrument.stage) as stage:
         speed_mm_s = instrument.stage.travel_speed_mm_s if args.speed is None else args.speed
-        return _tell_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
+        return _print_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
 
 
 def _home(args: argparse.Namespace, instrument: Instrument) -> int:
     from polysight.pi_controller.client import home_by_service
-    from polysight.pi_controller.stage import bench_stage
+    from polysight.pi_controller.stage import BenchStage
 
     status = home_by_service(instrument)
     if status is None:
-        with bench_stage(instrument.stage) as stage:
-            return _tell_position(args, stage.home())
+        with BenchStage(instrument.stage) as stage:
+            return _print_position(args, stage.home())
     if status.lost_x_mm or status.lost_y_mm:
         lost = f"{status.lost_x_mm:.3f} mm in x, {status.lost_y_mm:.3f} mm in y"
-        sys.stderr.write(f"polysight-pi: steps were lost since the homing before: {lost}; look at the drive\n")
-    return _tell_position(args, status)
+        sys.stderr.write(f"polysight-pi: steps were lost since the previous homing: {lost}; check the drive\n")
+    return _print_position(args, status)
 
 
-def _tell_position(args: argparse.Namespace, at: Any) -> int:
+def _print_position(args: argparse.Namespace, at: Any) -> int:
     where = {"x_mm": at.x_mm, "y_mm": at.y_mm}
     _write(json.dumps(where) if args.json else f"stage at x {at.x_mm:.3f} mm, y {at.y_mm:.3f} mm")
     return 0
@@ -173,7 +177,7 @@ def _option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
 
 
 def _rig(args: argparse.Namespace) -> Instrument:
-    """The rig file, with what the command line replaces in it."""
+    """Load the rig file, with the values given on the command line."""
     rig, given = load_instrument(args.config), {k: v for k, v in vars(args).items() if v is not None}
     replaced = {k: given[k] for k in ("journal_dir", "command_address", "event_address") if k in given}
     stage = {"port": given["stage_port"]} if "stage_port" in given else {}
@@ -182,9 +186,9 @@ def _rig(args: argparse.Namespace) -> Instrument:
 
 
 WIRES = _option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
-STAGE_PORT = _option("--stage-port", metavar="TTY", help="serial port of the stage, instead of stage.port")
+STAGE_PORT = _option("--stage-port", metavar="TTY", help="serial port of the stage; replaces stage.port")
 JOURNAL = _option(
-    "--journal", dest="journal_dir", metavar="DIR", help="folder of the journals, instead of pi.journal_dir"
+    "--journal", dest="journal_dir", metavar="DIR", help="folder of the journals; replaces pi.journal_dir"
 )
 JSON = _option("--json", action="store_true", help="print JSON, for programs")
 COUNT = {"type": _positive, "metavar": "N"}
@@ -193,40 +197,38 @@ MM = {"type": float, "default": 0.0, "metavar": "MM"}
 COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
     ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
         WIRES, STAGE_PORT, JOURNAL,
-        _option("--command-address", metavar="tcp://HOST:PORT", help="instead of pi.command_address"),
-        _option("--event-address", metavar="tcp://HOST:PORT", help="instead of pi.event_address"),
+        _option("--command-address", metavar="tcp://HOST:PORT", help="replaces pi.command_address"),
+        _option("--event-address", metavar="tcp://HOST:PORT", help="replaces pi.event_address"),
     )),
-    ("check", _check, "check every line, port, permission, key and disk; nothing moves", "--config instrument.toml", (
+    ("check", _check, "check lines, ports, permissions, keys and disk; nothing moves", "--config instrument.toml", (
         WIRES, STAGE_PORT, JOURNAL, JSON,
     )),
-    ("pulse", _pulse, "send bursts on SYNC_IN and tell their width and jitter", "--count 100", (
-        WIRES, JSON, _option("--count", **COUNT, default=10, help="how many bursts (%(default)s)"),
-        _option("--pause-ms", type=float, default=10.0, metavar="MS", help="pause between bursts (%(default)s)"),
+    ("pulse", _pulse, "send bursts on SYNC_IN and print their width and jitter", "--count 100", (
+        WIRES, JSON, _option("--count", **COUNT, default=10, help="number of bursts (%(default)s)"),
     )),
     ("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5", (
         STAGE_PORT, JSON, _option("--dx", **MM, help="along x, millimetres (0)"),
         _option("--dy", **MM, help="along y, millimetres (0)"),
         _option("--speed", type=_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)"),
     )),
-    ("home", _home, "home the stage, through the running service if there is one", "--config instrument.toml", (
+    ("home", _home, "home the stage, through the service if it runs", "--config instrument.toml", (
         STAGE_PORT, JSON,
     )),
     ("events", _events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1", (
-        _option("--scan-id", metavar="ID", help="replay this scan from the journal instead of following live events"),
-        _option("--from-seq", **COUNT, default=1, help="first event of a replay (%(default)s)"),
-        _option("--count", **COUNT, help="stop after so many"),
-        _option("--limit-s", type=float, default=10.0, metavar="S",
-                help="give up after so long without an event (%(default)s)"),
+        _option("--scan-id", metavar="ID", help="print the journal of this scan instead of live events"),
+        _option("--from-seq", **COUNT, default=1, help="first event from the journal (%(default)s)"),
+        _option("--count", **COUNT, help="stop after this number of events"),
+        _option("--limit-s", type=float, default=10.0, metavar="S", help="timeout without an event (%(default)s)"),
     )),
     ("keys", _keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys", (
-        _option("--dir", type=Path, metavar="DIR", help="folder, instead of pi.key_dir"),
-        _option("--replace", action="store_true", help="replace keys that are there already"),
-        _option("--client", metavar="NAME", help="make keys for one more client, and allow it"),
-        _option("--revoke", metavar="NAME", help="allow this client no more, at once"),
-        _option("--list", action="store_true", help="list the clients that are allowed"),
+        _option("--dir", type=Path, metavar="DIR", help="folder of the keys; replaces pi.key_dir"),
+        _option("--replace", action="store_true", help="replace existing keys"),
+        _option("--client", metavar="NAME", help="make keys for one more client and allow it"),
+        _option("--revoke", metavar="NAME", help="remove this client from the list, at once"),
+        _option("--list", action="store_true", help="list the allowed clients"),
     )),
-    ("take-over", _take_over, "command a run that another program began, as a person at the Pi", "abort", (
-        _option("what", choices=("hold", "resume", "abort", "end"), help="what to do with it"), JOURNAL,
+    ("take-over", _take_over, "control the run of another program, as a person at the Pi", "abort", (
+        _option("what", choices=("hold", "resume", "abort", "end"), help="action on the run"), JOURNAL,
     )),
 )  # fmt: skip
 
@@ -234,8 +236,8 @@ COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str,
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="polysight-pi",
-        description="The Raspberry Pi half of the instrument: drives the stage, answers its triggers with SYNC_IN "
-        "pulses, and tells the host.",
+        description="The Raspberry Pi half of the instrument: controls the stage, answers its triggers with SYNC_IN "
+        "pulses, and reports to the host.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog="examples:\n  polysight-pi check\n  polysight-pi run --config instrument.toml",
     )
@@ -259,7 +261,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point. Exit status 0 only when it worked; an error is one message on stderr, without a trace."""
+    """Entry point. Returns 0 on success; an error is one message on stderr, without a trace."""
     args = _parser().parse_args(argv)
     try:
         return args.action(args) if args.action is _keys else args.action(args, _rig(args))
@@ -269,14 +271,10 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except BrokenPipeError:
-        # Whoever read our output has enough; nothing must be flushed to it at exit.
+        # The reader has closed the pipe; nothing must be flushed to it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as e:
         error = os_error(e, "a path is wrong, the disk is full, or it belongs to another user", AS_THE_SERVICE)
         sys.stderr.write(f"error: {error}\n")
         return error.exit_status
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""A small client of the running service, for `home`, `take-over` and `events`. The host has its own."""
+"""Client of the running service, for the commands `home`, `take-over` and `events`. The host has its own."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ import zmq
 
 from polysight.pi_controller import AS_THE_SERVICE
 from polysight.pi_controller.service import TAKE_OVER_KEY
-from polysight.pi_controller.stage import MOTION_LIMIT_S
+from polysight.pi_controller.stage import MOTION_TIMEOUT_S
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, os_error
 from polysight.shared.sockets import Socket, requester, subscriber
 
-CONNECT_LIMIT_S = 2.0
+CONNECT_TIMEOUT_S = 2.0
 Ask = Callable[..., Any]
 
 
-def _silent(address: str) -> DeviceError:
-    return DeviceError(f"nobody answers at {address}", "polysight-pi run is not running here", "start it")
+def _no_answer(address: str) -> DeviceError:
+    why = "polysight-pi run is not running here"
+    return DeviceError(f"no answer from {address}", why, "start it", code=ErrorCode.NO_ANSWER)
 
 
 @contextmanager
 def _service(instrument: Instrument) -> Iterator[Ask]:
-    """A function that asks the service and returns its reply. It raises DeviceError for silence and for a refusal."""
+    """Connect; the value sends a command and returns its reply. It raises DeviceError for silence and refusals."""
     context: zmq.Context[Socket] = zmq.Context()
     address = instrument.pi.command_address
     try:
@@ -39,13 +41,14 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
         def ask(command: m.AnyCommand) -> m.AnyReply:
             try:
                 client.send(m.pack(command))
-            except zmq.Again:  # nobody to send to
-                raise _silent(address) from None
+            except zmq.Again:  # not connected
+                raise _no_answer(address) from None
             if not client.poll(round(instrument.limits.command_timeout_s * 1e3)):
-                raise _silent(address)
+                raise _no_answer(address)
             reply = m.unpack_reply(client.recv())
             if isinstance(reply, m.Refused):
-                raise DeviceError(f"{type(command).__name__} was refused: {reply.what}", reply.why, reply.remedy)
+                what = f"{type(command).__name__} was refused: {reply.what}"
+                raise DeviceError(what, reply.why, reply.remedy, code=ErrorCode.REFUSED_BY_PEER)
             return reply
 
         yield ask
@@ -54,50 +57,51 @@ def _service(instrument: Instrument) -> Iterator[Ask]:
 
 
 def _listens(address: str) -> bool:
-    """Whether a program listens there, whatever it is: known at once, also of a machine that is slow to answer."""
+    """True if any program listens there. Needs no answer, which a busy machine would give late."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_LIMIT_S).close()
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_S).close()
     except (OSError, ValueError):
         return False
     return True
 
 
 def refuse_beside_service(instrument: Instrument) -> None:
-    """Refuse what needs lines, stage and ports for itself. Raises DeviceError when the service of this rig runs."""
+    """Raise DeviceError if the service of this rig runs: it holds lines, stage and ports."""
     if _listens(instrument.pi.command_address):
         raise DeviceError(
             f"polysight-pi run serves at {instrument.pi.command_address}",
             "it holds the lines, the stage and the ports",
-            "`polysight doctor` on the host tries them through it; or `sudo systemctl stop polysight-pi`, this, and"
+            "use `polysight doctor` on the host, or `sudo systemctl stop polysight-pi`, this command, and"
             " `sudo systemctl start polysight-pi`",
+            code=ErrorCode.BUSY,
         )
 
 
 def home_by_service(instrument: Instrument) -> m.StatusReply | None:
-    """Home through the running service, and wait for it. None when no service runs.
+    """Home through the running service and wait for the end; return None if no service runs.
 
-    Raises DeviceError when the service refuses, or homing fails.
+    Raises DeviceError if the service refuses or homing fails.
     """
     if not _listens(instrument.pi.command_address):
         return None
     with _service(instrument) as ask:
         ask(m.Home())
-        deadline = time.monotonic() + MOTION_LIMIT_S
+        deadline = time.monotonic() + MOTION_TIMEOUT_S
         while time.monotonic() < deadline:
             status = ask(m.Status())
             if status.state == "fault":
                 raise DeviceError(f"homing failed: {status.reason}", "see the fault", "remove its cause, home again")
             if status.state != "homing":
                 return status
-            time.sleep(0.1)  # between questions
+            time.sleep(0.1)
         raise DeviceError("homing has not ended", "the motors stall", "look at the stage")
 
 
 def take_over(instrument: Instrument, what: str) -> str:
-    """Hold, resume, abort or end the run that is begun, whoever began it; returns the state after it.
+    """Hold, resume, abort or end the active run of any client; return the state after it.
 
-    Raises DeviceError when the service refuses or is silent, or the key of the person at the Pi cannot be read.
+    Raises DeviceError if the service refuses or does not answer, or if the take-over key cannot be read.
     """
     try:
         owner = (Path(instrument.pi.journal_dir) / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
@@ -113,28 +117,27 @@ def take_over(instrument: Instrument, what: str) -> str:
         return ask({"hold": m.Hold, "resume": m.Resume}[what](owner=owner)).state
 
 
-def follow_events(instrument: Instrument, limit_s: float) -> Iterator[Any]:
-    """Live events as plain objects. Raises DeviceError when none comes for `limit_s`."""
+def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
+    """Yield live events as plain objects. Raises DeviceError after `timeout_s` without one."""
     context: zmq.Context[Socket] = zmq.Context()
     try:
         listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
-        while listener.poll(round(limit_s * 1e3)):
+        while listener.poll(round(timeout_s * 1e3)):
             yield msgspec.to_builtins(m.unpack_event(listener.recv_multipart()[-1]))
-        raise _silent(instrument.pi.event_address)
+        raise _no_answer(instrument.pi.event_address)
     finally:
         context.destroy(linger=0)
 
 
 def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterator[Any]:
-    """Journalled events of a scan as plain objects. Raises DeviceError when nobody answers, or there are none."""
+    """Yield a scan's journalled events as plain objects. Raises DeviceError without an answer or a journal."""
     with _service(instrument) as ask:
         while True:
             reply = ask(m.Replay(scan_id=scan_id, from_seq=from_seq))
             if reply.last_seq == 0:
-                raise DeviceError(
-                    f"the Pi has no journal of scan {scan_id!r}", "another name", "see its journal folder"
-                )
+                what = f"the Pi has no journal of scan {scan_id!r}"
+                raise DeviceError(what, "another name", "see its journal folder", code=ErrorCode.FILE_MISSING)
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)
-            from_seq = reply.events[-1].seq + 1  # not one by one: a lost journal leaves a jump
+            from_seq = reply.events[-1].seq + 1  # a lost journal leaves a gap in the numbers

@@ -1,7 +1,7 @@
-"""The row executor: one thread that takes commands, stage news and bursts from one queue, in order.
+"""The executor: one thread that processes commands, replies of the stage and bursts from one queue, in order.
 
-It answers the host's commands and keeps the run; what stage and row do is in machine.py and row_machine.py.
-docs/spec/wire.md says what each command does.
+It executes the host's commands and manages the run; machine.py and row_machine.py control stage and row.
+docs/spec/wire.md describes each command.
 """
 
 from __future__ import annotations
@@ -30,27 +30,26 @@ from polysight.shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_PERIOD_US, 
 from polysight.shared.stage_line import Reply
 from polysight.shared.units import us_to_ns
 
-TURN_LIMIT_S = 0.2  # what still waits then is for the next turn: a queue that never empties is no executor that hangs
-TURN_S = 1.0  # the executor turns at least so often: whoever sees it stand still for HUNG_S knows that it hangs
-HUNG_S = 10.0
+TURN_TIMEOUT_S = 0.2  # the rest of the queue waits for the next turn, so that a queue that never empties is not a hang
+TURN_S = 1.0  # longest turn without work
+HUNG_S = 10.0  # time without a turn after which the executor counts as hung
 COMMANDS_WAITING, REPLAYS_WAITING = 64, 4
-LINES_WAITING = 64  # of the stage: one that talks without end keeps nobody waiting and fills no memory
-REPLAYED_AT_REST = 1000  # events a reply: half a second of a Pi
-REPLAYED_IN_A_ROW = 20  # events a reply while a row runs: many are long calls that keep the trigger thread waiting
-OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # name the run: its host lives
-OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # refused to whom the run does not belong
+LINES_WAITING = 64  # of the stage: further lines are dropped, so that an endless flood cannot fill the memory
+REPLAYED_AT_REST = 1000  # events per reply: half a second on a Pi
+REPLAYED_IN_A_ROW = 20  # events per reply during a row: packing more would delay the trigger thread
+OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)  # commands that count as a heartbeat of the run's host
+OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # commands that only the run's owner may send
 
 
 class Request(NamedTuple):
-    """A command, where its reply goes, and whose room it takes while it waits."""
+    """A command and the callback for its reply."""
 
     command: m.AnyCommand
     answer: Callable[[m.AnyReply], None]
-    room: threading.Semaphore | None = None
 
 
 def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
-    """A refusal in words of bounded length; what is not said is the table's."""
+    """Return a refusal, with texts of limited length; missing ones are those of shared/faults.py."""
     table = explain(number)
     return m.Refused(
         number=int(number), what=what[:1000], why=(why or table.why)[:1000], remedy=(remedy or table.remedy)[:1000]
@@ -58,16 +57,16 @@ def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refuse
 
 
 class Executor:
-    """Runs in a thread of its own; :meth:`submit`, :meth:`post`, `status` and `hello` are for all threads.
+    """Runs in its own thread; all threads may use :meth:`submit`, :meth:`post`, `status` and `hello`.
 
-    `turned` is called with every turn, once a second at least: it feeds the watchdog.
+    `turned` is called after every turn, at least once a second: it feeds the watchdog.
     """
 
     def __init__(
         self, stage: StageDriver, loop: TriggerLoop, journal: Journal, turned: Callable[[], None] = lambda: None
     ) -> None:
         self._loop, self._journal, self._turned = loop, journal, turned
-        self.take_over_key = secrets.token_hex(16)  # an owner that every run obeys: of the person at the Pi
+        self.take_over_key = secrets.token_hex(16)  # accepted as the owner of every run: a person at the Pi
         self._turned_s = time.monotonic()
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._room, self._replay_room = map(threading.Semaphore, (COMMANDS_WAITING, REPLAYS_WAITING))
@@ -84,27 +83,32 @@ class Executor:
 
     # --- for other threads ------------------------------------------------------------------------------------------
 
-    def post(self, item: Request | StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
-        """Hand something over; returns at once. Lines of the stage that find too many waiting are lost."""
+    def post(self, item: StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
+        """Append an item to the queue; return at once. Replies of the stage are dropped if too many wait."""
         if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
-            return  # what a row or homing waits for is asked again
+            return  # the end of a row or of homing is requested again
         self._inbox.put(item)
 
     def submit(self, command: m.AnyCommand, answer: Callable[[m.AnyReply], None]) -> bool:
-        """Queue a command; its reply goes to `answer`. False when too many wait already: it is not taken."""
+        """Queue a command whose reply is passed to `answer`. Return False, without queueing, if too many wait."""
         room = self._replay_room if isinstance(command, m.Replay) else self._room
         if not room.acquire(blocking=False):
             return False
-        self._inbox.put(Request(command, answer, room))
+
+        def execute() -> None:
+            room.release()
+            self._execute(Request(command, answer))
+
+        self._inbox.put(execute)
         return True
 
     @property
     def unresponsive_s(self) -> float:
-        """For how long the executor has not turned; below :data:`HUNG_S` unless it hangs."""
+        """Time since the last turn; below :data:`HUNG_S` unless the executor hangs."""
         return time.monotonic() - self._turned_s
 
     def host_alive(self, scan_id: str, owner: str) -> m.Accepted | m.Refused:
-        """The host of this run was heard. Answers at once, whatever the executor does."""
+        """Answer `Alive`, a heartbeat of the run's host. From any thread; does not wait for the executor."""
         run = self._run
         if run is None or run.scan_id != scan_id:
             return refused(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
@@ -114,14 +118,14 @@ class Executor:
         return m.Accepted(state=self.status.state)
 
     def start(self) -> None:
-        """Start the thread. The stage is connected by now."""
+        """Start the thread. The stage has to be connected."""
         self._refresh()
         self._thread.start()
 
-    def stop(self, limit_s: float) -> None:
+    def stop(self, timeout_s: float) -> None:
         """Stop the stage, end the row as aborted, end the thread."""
         self.post(self._end)
-        self._thread.join(limit_s)
+        self._thread.join(timeout_s)
 
     # --- the thread -------------------------------------------------------------------------------------------------
 
@@ -136,13 +140,13 @@ class Executor:
     def _turn(self) -> None:
         try:
             left_s = self._machine.seconds_left()
-            self._take(self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S)))
-            until_s = time.monotonic() + TURN_LIMIT_S
+            self._handle(self._inbox.get(timeout=TURN_S if left_s is None else min(left_s, TURN_S)))
+            until_s = time.monotonic() + TURN_TIMEOUT_S
             while time.monotonic() < until_s:
-                self._take(self._inbox.get_nowait())
+                self._handle(self._inbox.get_nowait())
         except queue.Empty:
             pass
-        self._machine.check_limits()
+        self._machine.check_deadlines()
         try:
             self._journal.commit()
         except JournalFullError as e:
@@ -151,18 +155,18 @@ class Executor:
         self._refresh()
         replies, self._replies = self._replies, []
         for request, reply in replies:
-            self._hear(request.command)
+            self._count_as_heartbeat(request.command)
             request.answer(reply)
         self._turned_s = time.monotonic()
         self._turned()
 
-    def _hear(self, command: m.AnyCommand) -> None:
-        """A command of this run's host is being answered: until its reply is out, no `Alive` can come."""
+    def _count_as_heartbeat(self, command: m.AnyCommand) -> None:
+        """Count a command of the run's host as its heartbeat: it sends no `Alive` while it waits for the reply."""
         run = self._run
         if run and isinstance(command, OF_THE_RUN) and (command.scan_id, command.owner) == (run.scan_id, run.owner):
             self._machine.note_host_alive()
 
-    def _take(self, item: Any) -> None:
+    def _handle(self, item: Any) -> None:
         machine, row = self._machine, self._machine.row
         if isinstance(item, BurstSent):
             machine.on_burst(item)
@@ -170,11 +174,7 @@ class Executor:
             self._answer_pulses(item)
         elif isinstance(item, LoopFault):
             machine.on_loop_fault(item)
-            self._answer_pulses(refused(item.number, item.detail))  # every request gets a reply
-        elif isinstance(item, Request):
-            if item.room is not None:
-                item.room.release()
-            self._execute(item._replace(room=None))
+            self._answer_pulses(refused(item.number, item.detail))
         elif isinstance(item, Reply):
             machine.on_stage(item)
         elif isinstance(item, StageLost):
@@ -191,22 +191,24 @@ class Executor:
     # --- commands ---------------------------------------------------------------------------------------------------
 
     def _execute(self, request: Request) -> None:
-        """Whatever a command leads to, it ends in a reply: no message ends this program."""
+        """Execute a command. Every error becomes a refusal; no message can end the program."""
         try:
             reply = self._on_command(request)
         except PolysightError as e:
             reply = refused(getattr(e, "number", PiFault.BAD_REQUEST), e.what, e.why, e.remedy)
         except OSError as e:
-            reply = refused(PiFault.BAD_REQUEST, os_error(e).what, "the system refuses it", "look at the Pi's disk")
-        except Exception as e:  # noqa: BLE001 - told to the client, and in the log
+            reply = refused(
+                PiFault.BAD_REQUEST, os_error(e).what, "the operating system refused it", "check the Pi's disk"
+            )
+        except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
             reply = refused(PiFault.PROGRAM, f"{type(request.command).__name__}: {e!r}")
-        self._hear(request.command)  # before the limits are looked at: it may have taken long
+        self._count_as_heartbeat(request.command)  # before the deadlines are checked: it may have taken long
         if reply is not None:
             self._replies.append((request, reply))
 
     def _on_command(self, request: Request) -> m.AnyReply | None:
-        """The reply; None when it comes later."""
+        """Return the reply, or None if it follows later."""
         command, run = request.command, self._run
         if isinstance(command, m.Replay):
             return self._replay(command)
@@ -216,13 +218,13 @@ class Executor:
             raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
         match command:
             case m.BeginRun():
-                return None if self._begins_later(request, command) else self._begin(command)
+                return None if self._postpone(request, command) else self._begin(command)
             case m.EndRun():
                 return self._end_run(command)
             case m.RunRow():
                 return self._run_row(command)
             case m.Abort():
-                return self._accept("Abort", command.reason or "asked for by the host")
+                return self._accept("Abort", command.reason or "requested by the host")
             case m.Pulse():
                 return self._pulse(request, command)
             case _:  # Home, Hold, Resume
@@ -231,25 +233,25 @@ class Executor:
     def _replay(self, command: m.Replay) -> m.ReplayReply:
         limit = min(command.limit, REPLAYED_AT_REST)
         if self._machine.row is not None:
-            if command.scan_id != self._journal.scan_id:  # its whole file is read, however few events are wanted
+            if command.scan_id != self._journal.scan_id:  # its whole file would be read
                 raise RefusedError(
                     PiFault.NOT_READY,
                     f"a row of scan {self._journal.scan_id} runs",
-                    "reading another scan's journal would hold up its pulses",
-                    "ask again when the row has ended",
+                    "reading another scan's journal would delay its pulses",
+                    "retry when the row has ended",
                 )
             limit = min(limit, REPLAYED_IN_A_ROW)
         found, last = self._journal.read(command.scan_id, command.from_seq, limit)
         return m.ReplayReply(events=[m.unpack_event(raw) for raw in found], last_seq=last)
 
     def _accept(self, event: str = "", *args: Any) -> m.Accepted:
-        """Carry out a command of the state machine. Raises RefusedError."""
+        """Execute a command of the state machine. Raises RefusedError."""
         if event:
             self._machine.command(event, *args)
         return m.Accepted(state=self._machine.wire_state)
 
     def _pulse(self, request: Request, command: m.Pulse) -> None:
-        """Hand a burst to the trigger loop; its reply follows when it has been sent."""
+        """Pass a burst to the trigger loop; the reply follows when it has been sent."""
         if self._run is not None:
             begun = f"run {self._run.scan_id} is begun"
             raise RefusedError(PiFault.NOT_READY, begun, "pulses would belong to no point", "wait for the scan's end")
@@ -257,14 +259,14 @@ class Executor:
         if not self._loop.alive:
             raise RefusedError(PiFault.TRIGGER_LINE_LOST, self._machine.reason or "the trigger loop has ended")
         spec = burst_of(command)
-        if spec.pulses * spec.period_ns > m.MOST_PULSES_S * 1e9:
-            lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MOST_PULSES_S:g} s"
+        if spec.pulses * spec.period_ns > m.MAX_PULSES_AT_REST_S * 1e9:
+            lasts = f"{spec.pulses} pulses every {command.period_us:g} us last longer than {m.MAX_PULSES_AT_REST_S:g} s"
             raise RefusedError(PiFault.NOT_READY, lasts, "the lines are busy meanwhile", "ask for fewer pulses")
         self._pulsing.append(request)
         self._loop.send(spec)
 
-    def _begins_later(self, request: Request, run: m.BeginRun) -> bool:
-        """Check a run. If a row runs, it is ended first, and the request is taken again then. Raises RefusedError."""
+    def _postpone(self, request: Request, run: m.BeginRun) -> bool:
+        """Check a run; return True if a row has to be aborted before it can begin. Raises RefusedError."""
         check_run(run, self._machine.stage.config)
         self._loop.check(burst_of(run))
         begun = self._run
@@ -272,21 +274,21 @@ class Executor:
         if begun is not None and other and self._machine.host_lives:
             raise RefusedError(
                 PiFault.NOT_READY,
-                f"run {begun.scan_id} is begun, and its host lives",
+                f"run {begun.scan_id} is active, and its host is alive",
                 "another program, perhaps on another machine, scans with this Pi",
                 "wait for that scan's end, or stop it there",
             )
         if self._machine.row is not None:
-            # The host that asked for the running row is gone; what it would have recorded is not committed.
+            # The host that started the row is gone, so nothing of the row is committed.
             self._after_row = request
-            self._machine.happen("Abort", f"run {run.scan_id} was begun anew")
+            self._machine.happen("Abort", f"run {run.scan_id} was begun again")
         return self._machine.row is not None
 
     def _begin(self, run: m.BeginRun) -> m.Accepted:
         resumed, lost = self._journal.open(run.scan_id, run.plan, run.last_seq)
-        self._run, self._last_row = None, None  # whichever was begun: the journal is this scan's now
+        self._run, self._last_row = None, None
         self._machine.happen("EndRun")
-        self._keep(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
+        self._add_synced(m.RunStarted, plan=run.plan, resumed=resumed, lost=lost)
         self._run = run
         return self._accept("BeginRun", run.heartbeat_ms)
 
@@ -295,13 +297,13 @@ class Executor:
             return self._accept()  # a repeated request
         self._need_run(command.scan_id)
         self._machine.require("EndRun")
-        self._keep(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
+        self._add_synced(m.RunStopped, exit_status=command.exit_status, reason=command.reason)
         self._run = None
         return self._accept("EndRun")
 
-    def _keep(self, kind: type[m.RunStarted | m.RunStopped], **fields: Any) -> None:
-        """Write an event whose command is accepted only when it is on the disk. Raises JournalFullError."""
-        self._journal.broken = False  # there may be room again
+    def _add_synced(self, kind: type[m.RunStarted | m.RunStopped], **fields: Any) -> None:
+        """Write an event that has to be on the disk before its command is accepted. Raises JournalFullError."""
+        self._journal.broken = False  # there may be space again
         self._journal.add(kind, **fields)
         try:
             self._journal.commit()
@@ -312,23 +314,23 @@ class Executor:
     def _need_run(self, scan_id: str) -> m.BeginRun:
         if self._run is None or self._run.scan_id != scan_id:
             now = f"run {self._run.scan_id} is" if self._run else "no run is"
-            raise RefusedError(PiFault.NOT_READY, f"{now} begun, not {scan_id}", "the Pi was started anew", "BeginRun")
+            raise RefusedError(PiFault.NOT_READY, f"{now} active, not {scan_id}", "the Pi was restarted", "BeginRun")
         return self._run
 
     def _run_row(self, command: m.RunRow) -> m.Accepted:
         run, current = self._need_run(command.scan_id), self._machine.row
         wanted = (command.row_index, command.take)
         if wanted in (current and (current.row.index, current.take), self._last_row):
-            return self._accept()  # a repeated request: the row runs, or has run
+            return self._accept()  # a repeated request
         self._machine.require("RunRow")
-        _require(command.row_index < run.plan.rows, f"row {command.row_index} is not of the plan's {run.plan.rows}")
+        _require(command.row_index < run.plan.rows, f"row {command.row_index} is not in the plan of {run.plan.rows}")
         return self._accept("RunRow", run.plan.row(command.row_index), command.take, burst_of(run), run.speed_mm_s)
 
     def _row_ended(self, row: tuple[int, int]) -> None:
         self._last_row = row
         begins, self._after_row = self._after_row, None
         if begins is not None:
-            self._take(begins)
+            self._execute(begins)
         self._ended = self._ending
 
     def _end(self) -> None:
@@ -336,7 +338,7 @@ class Executor:
         self._ended = not self._machine.terminate()
 
     def _refresh(self) -> None:
-        """What Hello, Status and heartbeats tell; replaced as a whole, so that other threads may read it."""
+        """Update the replies to Hello and Status; they are replaced as a whole, so other threads may read them."""
         machine, stage, row, counts = self._machine, self._machine.stage, self._machine.row, self._loop.counts
         scan_id, last_seq = self._journal.scan_id, self._journal.last_seq
         self.status = m.StatusReply(
@@ -347,15 +349,15 @@ class Executor:
         )  # fmt: skip
         self.hello = m.HelloReply(
             pi_release=__version__, firmware=stage.firmware, backend=self._loop.backend, state=machine.wire_state,
-            scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placing,
+            scan_id=scan_id, last_seq=last_seq, in_run=self._run is not None, stage=stage.config.placement_settings,
         )  # fmt: skip
 
 
-# --- what a run asks for, and what this rig can do --------------------------------------------------------------------
+# --- limits of this rig and the radars --------------------------------------------------------------------------------
 
 
 def burst_of(asked: m.BeginRun | m.Pulse) -> BurstSpec:
-    """The burst, where the radars take it. Raises RefusedError PERIOD_TOO_SHORT or PULSE_TOO_LONG."""
+    """Return the requested burst. Raises RefusedError (PERIOD_TOO_SHORT, PULSE_TOO_LONG) if radars cannot accept it."""
     spec = BurstSpec(asked.pulses, us_to_ns(asked.period_us), us_to_ns(asked.width_us))
     if spec.period_ns < MIN_PERIOD_NS:
         raise RefusedError(PiFault.PERIOD_TOO_SHORT, f"period of {asked.period_us} us is below {MIN_PERIOD_US} us")
@@ -365,7 +367,7 @@ def burst_of(asked: m.BeginRun | m.Pulse) -> BurstSpec:
 
 
 def check_run(run: m.BeginRun, stage: Stage) -> None:
-    """Compare a run with this rig. Raises RefusedError with the values that do not go together."""
+    """Check that this rig can execute a run. Raises RefusedError with the conflicting values."""
     plan, spec = run.plan, burst_of(run)
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")

@@ -1,9 +1,9 @@
-"""The journal: every event of a scan on disk before it is published, so that a lost message can be replayed.
+"""The journal: every event of a scan is on disk before it is published, so that lost messages can be replayed.
 
-One file a scan, append-only: 8 bytes of magic, then records of `<length, sequence, crc32(sequence + payload)>` (three
-little-endian u32) and the packed event. Sequence numbers count up from 1; they jump only where a lost journal was begun
-anew behind what the host has. A torn or damaged tail, as a power cut leaves it, is cut off at the last good record when
-the file is opened. Specification: docs/spec/wire.md. Used by the executor's thread alone.
+One append-only file per scan: 8 bytes of magic, then records of `<length, sequence, crc32(sequence + payload)>` (three
+little-endian u32) and the packed event. Sequence numbers count from 1, without gaps unless a journal was lost and
+continues after the host's last event. A torn or damaged tail, as after a power cut, is cut off at the last good record
+when the file is opened. Specification: docs/spec/wire.md. Used by the executor's thread only.
 """
 
 from __future__ import annotations
@@ -24,27 +24,29 @@ from typing import Any, BinaryIO
 import msgspec
 
 from polysight.shared import messages as m
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, DeviceError, ProtocolError
 from polysight.shared.faults import PiFault
 from polysight.shared.raster import RasterPlan
 
 MAGIC = b"PSJRNL1\n"
 MAX_RECORD_BYTES = 1 << 20
-CAPTURE_BYTES = 320  # a position's record takes less
-SPARE_BYTES = 4 << 20  # faults, rows taken again
-SEARCHED_BYTES = 1 << 20  # behind damage, for a good record
-DAMAGED = ".damaged"  # suffix of the copy that is kept of a damaged journal
+CAPTURE_BYTES = 320  # upper limit of a position's record
+SPARE_BYTES = 4 << 20  # for faults and retakes
+SEARCHED_BYTES = 1 << 20  # length of the search for a good record after damage
+DAMAGED = ".damaged"  # suffix of the copy of a damaged journal
 _HEAD = struct.Struct("<III")
 
 
 class JournalFullError(DeviceError):
-    """The journal cannot be written. Nothing of the failed write is in it."""
+    """The journal cannot be written; it contains nothing of the failed write."""
 
     number = PiFault.JOURNAL_FULL
 
     def __init__(self, path: Path, e: OSError) -> None:
         why = "the disk is full" if e.errno in (errno.ENOSPC, errno.EDQUOT) else "the disk is read-only or broken"
-        super().__init__(f"journal {path} cannot be written: {e.strerror}", why, "free space on the Pi")
+        what = f"journal {path} cannot be written: {e.strerror}"
+        super().__init__(what, why, "free space on the Pi", code=ErrorCode.DISK_FULL)
 
 
 def _crc(seq: int, payload: bytes) -> int:
@@ -52,16 +54,17 @@ def _crc(seq: int, payload: bytes) -> int:
 
 
 def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
-    """Good records of an open journal from its beginning: (offset, sequence, payload). Ends at the first bad one.
+    """Yield (offset, sequence, payload) of the records up to the first bad one.
 
-    Raises DataError when the file is no journal at all.
+    Raises DataError if the file is not a journal.
     """
     magic = file.read(len(MAGIC))
     if magic != MAGIC:
         if MAGIC.startswith(magic.rstrip(b"\0")):
-            return  # made, and the power was cut before its first bytes were on the disk
-        name = getattr(file, "name", "journal")
-        raise DataError(f"{name}: not a journal", "another program wrote it", "move it out of the journal folder")
+            return  # the power was cut before the first bytes were on the disk
+        what = f"{getattr(file, 'name', 'journal')}: not a journal"
+        remedy = "move it out of the journal folder"
+        raise DataError(what, "another program wrote it", remedy, code=ErrorCode.FILE_FOREIGN)
     offset, last = len(MAGIC), 0
     while len(head := file.read(_HEAD.size)) == _HEAD.size:
         length, seq, crc = _HEAD.unpack(head)
@@ -75,7 +78,7 @@ def records(file: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _holds_records(tail: bytes) -> bool:
-    """Whether a good record lies behind the damage: a power cut leaves a torn one, or zeros, and nothing behind it."""
+    """True if a good record follows the damage; after a power cut only a torn record or zeros follow."""
     for offset in range(1, min(len(tail) - _HEAD.size, SEARCHED_BYTES)):
         length, seq, crc = _HEAD.unpack_from(tail, offset)
         payload = tail[offset + _HEAD.size : offset + _HEAD.size + length] if 0 < length <= MAX_RECORD_BYTES else b""
@@ -85,16 +88,15 @@ def _holds_records(tail: bytes) -> bool:
 
 
 class JournalFile:
-    """The journal of one scan, open for appending: made when absent, cut at its last good record otherwise.
+    """The journal of one scan, open for appending: created if missing, cut at its last good record if damaged.
 
-    `damage` says what was cut off, when that was more than the torn record of a power cut: a copy is kept then.
-
-    Raises DataError when the file exists and is no journal, JournalFullError when it cannot be made or written.
+    `damage` describes what was cut off if that was more than the torn record of a power cut; a copy is kept then.
+    Raises DataError if the file is not a journal, JournalFullError if it cannot be created or written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.damage = path, ""
-        self.last_seq = 0  # of the newest record, or of the host's newest event
+        self.last_seq = 0  # of the newest record, or of the host's newest event if that is later
         self._places: list[tuple[int, int]] = []  # sequence number and offset of each record
         self._synced = True
         try:
@@ -120,8 +122,8 @@ class JournalFile:
             copy = next(name for name in names if not name.exists())
             shutil.copyfile(self.path, copy)
             self.damage = (
-                f"{self.path}: damaged behind event {self.last_seq}, {len(tail)} bytes that followed are cut off;"
-                f" the file as it was is {copy}; the disk or card fails: replace it"
+                f"{self.path}: damaged after event {self.last_seq}, the following {len(tail)} bytes were cut off;"
+                f" the original is kept as {copy}; the disk or card fails: replace it"
             )
         if not self._places:
             os.pwrite(self._fd, MAGIC, 0)
@@ -134,15 +136,15 @@ class JournalFile:
             os.close(folder)
 
     def number_behind(self, seq: int) -> int:
-        """Number the next record behind `seq`. Returns how many numbers this skips, which others have used."""
+        """Continue numbering after `seq`, the host's newest event. Return the number of skipped (lost) events."""
         lost = max(0, seq - self.last_seq)
         self.last_seq += lost
         return lost
 
     def write(self, payloads: Sequence[bytes], sync: bool = False) -> None:
-        """Append records, all or none; with `sync`, wait until everything is on the disk.
+        """Append all records or none; with `sync`, wait until everything is on the disk.
 
-        Raises JournalFullError when the disk is full or broken. The file is then as before.
+        Raises JournalFullError if the disk is full or broken; the file is then unchanged.
         """
         places, data = [], bytearray()
         for seq, payload in enumerate(payloads, self.last_seq + 1):
@@ -155,7 +157,7 @@ class JournalFile:
             if sync and (data or not self._synced):
                 os.fsync(self._fd)
         except OSError as e:
-            with suppress(OSError):  # what is left is overwritten, or cut off when the file is next opened
+            with suppress(OSError):  # the rest is overwritten, or cut off when the file is next opened
                 os.ftruncate(self._fd, self._end)
             raise JournalFullError(self.path, e) from None
         self._end += len(data)
@@ -164,18 +166,19 @@ class JournalFile:
         self._synced = sync or (self._synced and not data)
 
     def read(self, from_seq: int, limit: int) -> list[bytes]:
-        """Payloads from `from_seq` on, at most `limit` of them. Raises DataError for a damaged one."""
+        """Return at most `limit` payloads, starting at `from_seq`. Raises DataError for a damaged record."""
         first, found = bisect_left(self._places, (from_seq, 0)), []
         for seq, offset in self._places[first : first + limit]:
             length, _, crc = _HEAD.unpack(os.pread(self._fd, _HEAD.size, offset))
             payload = os.pread(self._fd, length, offset + _HEAD.size)
             if _crc(seq, payload) != crc:
-                raise DataError(f"{self.path}: record {seq} is damaged", "the disk or card fails", "replace it")
+                what = f"{self.path}: record {seq} is damaged"
+                raise DataError(what, "the disk or card fails", "replace it", code=ErrorCode.FILE_DAMAGED)
             found.append(payload)
         return found
 
     def close(self) -> None:
-        """Wait until everything is on the disk, and close. Raises JournalFullError."""
+        """Close the file once everything is on the disk. Raises JournalFullError."""
         try:
             self.write((), sync=True)
         finally:
@@ -183,11 +186,10 @@ class JournalFile:
 
 
 class Journal:
-    """Events in order: numbered, written to the file of the current scan, then published. One process a folder.
+    """Numbers events, writes them to the file of the current scan, then publishes them. One process per folder.
 
-    `publish` takes packed events once they are in the file, `warn` sentences.
-
-    Raises ConfigError when the folder cannot be made or written, DeviceError when another process holds it.
+    `publish` is called with packed events once they are in the file, `warn` with sentences for the log.
+    Raises ConfigError if the folder cannot be created or written, DeviceError if another process uses it.
     """
 
     def __init__(
@@ -199,7 +201,7 @@ class Journal:
         self.folder, self._publish, self._warn = folder, publish, warn
         self._file: JournalFile | None = None
         self._batch: list[tuple[m.AnyEvent, bytes]] = []
-        self._pending = 0  # events of the batch that belong into the file
+        self._pending = 0  # events of the batch that are to be written
         self.broken = False
         self.scan_id = ""
         try:
@@ -208,15 +210,16 @@ class Journal:
         except OSError as e:
             raise ConfigError(
                 f"journal folder {folder}: {e.strerror}",
-                "it does not exist and cannot be made, or this user may not write there",
-                "make it, or choose another with --journal or pi.journal_dir",
+                "it does not exist and cannot be created, or this user may not write there",
+                "create it, or choose another with --journal or pi.journal_dir",
+                code=ErrorCode.FILE_UNREADABLE,
             ) from None
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
             busy = f"journal folder {folder} is in use", "another polysight-pi runs"
-            raise DeviceError(*busy, "stop it, or give another --journal") from None
+            raise DeviceError(*busy, "stop it, or give another --journal", code=ErrorCode.BUSY) from None
 
     @property
     def last_seq(self) -> int:
@@ -224,20 +227,25 @@ class Journal:
         return self._file.last_seq + self._pending if self._file else 0
 
     def path_of(self, scan_id: str) -> Path:
-        """The journal file of a scan."""
+        """Return the path of a scan's journal file."""
         return self.folder / f"{scan_id}.journal"
 
     def open(self, scan_id: str, plan: RasterPlan, host_seq: int) -> tuple[bool, int]:
-        """Make `scan_id` the current scan. The next event is numbered behind `host_seq`, the newest the host has.
+        """Make `scan_id` the current scan. The next event is numbered after `host_seq`, the newest of the host.
 
-        Returns whether the scan was begun before, and how many of the host's events the journal has lost.
+        Returns
+        -------
+        resumed
+            True if the scan was begun before.
+        lost
+            Number of the host's events that are missing in the journal.
 
         Raises
         ------
         JournalFullError
-            when the journal cannot be had, or there is no room for this plan's.
+            if the journal cannot be opened, or there is no space for this plan's events.
         DataError
-            when it is no journal, or the scan was begun with another plan. In both cases nothing has changed.
+            if the file is not a journal, or the scan was begun with another plan. Nothing is changed then.
         """
         self.broken = False
         self.commit()
@@ -254,6 +262,7 @@ class Journal:
                     f"scan {scan_id} was begun with another plan: {begun}",
                     "the scan's name was used before, with another grid",
                     "resume that scan with its own plan, or give the new one another name",
+                    code=ErrorCode.NAME_TAKEN,
                 )
         except (DataError, ProtocolError):
             if file is not self._file:
@@ -266,7 +275,7 @@ class Journal:
         return begun is not None or host_seq > 0, file.number_behind(host_seq)
 
     def check_room(self, scan_id: str, positions: int) -> None:
-        """Refuse a scan for whose journal, or the rest of it, the disk has no room. Raises JournalFullError."""
+        """Raise JournalFullError if the disk has no space for the rest of the scan's journal."""
         path = self.path_of(scan_id)
         try:
             there = path.stat().st_size if path.exists() else 0
@@ -279,20 +288,20 @@ class Journal:
             raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
 
     def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
-        """Number an event and add it to the batch; words are cut to what a reader takes.
+        """Number an event and add it to the batch; long texts are shortened to the limit of the messages.
 
-        An event that does not go into the file carries the last number.
+        An event that is not journalled has the number of the last one that is.
         """
         self._pending += issubclass(kind, m.JOURNALLED) and self._file is not None and not self.broken
-        fields = {k: v[: m.MOST_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
+        fields = {k: v[: m.MAX_TEXT] if isinstance(v, str) else v for k, v in fields.items()}
         event = kind(scan_id=self.scan_id, seq=self.last_seq, t_mono_ns=time.monotonic_ns(), **fields)
         self._batch.append((event, m.pack(event)))
 
     def commit(self) -> None:
         """Write the batch to the file, then publish it.
 
-        Raises JournalFullError when it cannot be written. From then on events are published with the last good number
-        and not kept, until the scan is opened again; of this batch, only what ends a row or names a fault is published.
+        Raises JournalFullError if it cannot be written. Until the scan is opened again, events are then published with
+        the last good number and not stored; of this batch only statuses, faults and the end of a row are published.
         """
         batch, self._batch, self._pending = self._batch, [], 0
         if self._file is not None:
@@ -310,7 +319,7 @@ class Journal:
             self._publish([raw for _, raw in batch])
 
     def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
-        """Packed events of any scan from `from_seq` on, and its newest sequence number; ([], 0) if there is none."""
+        """Return packed events of any scan from `from_seq` on and its newest number; ([], 0) without a journal."""
         if self._file is not None and scan_id == self.scan_id:
             return self._file.read(from_seq, limit), self.last_seq
         found, last = [], 0
@@ -321,7 +330,7 @@ class Journal:
         return found, last
 
     def close(self) -> None:
-        """Close the current file, and let another process have the folder. Raises JournalFullError."""
+        """Close the current file and unlock the folder. Raises JournalFullError."""
         file, self._file = self._file, None
         try:
             if file is not None:
@@ -331,7 +340,7 @@ class Journal:
 
 
 def _plan_of(file: JournalFile) -> RasterPlan | None:
-    """The plan of the first event; None when there is no event yet."""
+    """Return the plan of the first event, or None if there is no event yet."""
     first = file.read(1, 1)
     event = m.unpack_event(first[0]) if first else None
     return event.plan if isinstance(event, m.RunStarted) else None

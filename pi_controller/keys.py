@@ -1,7 +1,7 @@
-"""CURVE keys for addresses that are not loopback: the Pi's and its clients', and which clients are allowed.
+"""CURVE keys for addresses that are not loopback, and the list of allowed clients.
 
-`allowed_clients` in the key folder has a line for each client that may connect: its public key (40 characters) and its
-name. Without that file `host.key` alone is allowed, as before there was one. It is read anew when it has changed.
+`allowed_clients` in the key folder has one line per client that may connect: its public key (40 characters) and its
+name. Without that file only `host.key` is allowed, as in earlier releases. A changed file is read again.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 import zmq.utils.z85
 from zmq.auth import create_certificates, load_certificate
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.sockets import HOST_KEYS
 
@@ -32,8 +33,8 @@ class AllowedKeys:
             self._names = read_allowed(folder)
 
     def name_of(self, key: bytes) -> str:
-        """Name of the client with this public key (32 bytes); empty when it is not allowed."""
-        with suppress(OSError):  # gone or unreadable: what was allowed before stays so
+        """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
+        with suppress(OSError):  # missing or unreadable: keep the last list
             stat = (self._folder / ALLOWED).stat()
             if self._seen != (stat.st_mtime_ns, stat.st_size):
                 self._names = read_allowed(self._folder)
@@ -42,7 +43,7 @@ class AllowedKeys:
 
 
 def read_allowed(folder: Path) -> dict[str, str]:
-    """Public keys (Z85 text) and names of the clients that may connect. A key folder without the file allows `host`."""
+    """Return the names of the clients that may connect, by public key (Z85 text)."""
     try:
         lines = (folder / ALLOWED).read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
@@ -53,13 +54,13 @@ def read_allowed(folder: Path) -> dict[str, str]:
     return {key: name.strip() or "nameless" for key, _, name in keys if len(key) == KEY_CHARACTERS}
 
 
-# --- for `polysight-pi keys`: these raise ConfigError, or OSError when the folder cannot be written -------------------
+# --- `polysight-pi keys`: these raise ConfigError, or OSError if the folder cannot be written -------------------------
 
 
 def make_keys(folder: Path, replace: bool = False) -> list[Path]:
-    """Make `pi.key`, `pi.key_secret`, `host.key` and `host.key_secret`, the secret ones readable by the owner alone.
+    """Make `pi.key`, `pi.key_secret`, `host.key` and `host.key_secret`; secret files are readable by the owner only.
 
-    Returns the files. Raises ConfigError when there are keys already (unless `replace`).
+    Returns the files. Raises ConfigError if there are keys already, unless `replace`.
     """
     there = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
     if there and not replace:
@@ -67,6 +68,7 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
             f"{there[0]} exists",
             "keys were made before; new ones lock out every host that has the old ones",
             f"keep them, or give --replace, then {COPY}",
+            code=ErrorCode.FILE_EXISTS,
         )
     folder.mkdir(parents=True, exist_ok=True)
     made = [path for name in PARTIES for path in _create(folder, name)]
@@ -75,12 +77,13 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
 
 
 def allow(folder: Path, name: str) -> list[Path]:
-    """Make keys for one more client and allow them. Returns its files; the secret one goes to the client alone."""
+    """Make keys for one more client and allow it. Return its files; the secret one is for that client only."""
     if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
         raise ConfigError(
             f"client {name!r} cannot be added",
-            "its name is taken, or has other signs than a-z 0-9 - _",
+            "its name is taken, or has characters other than a-z 0-9 - _",
             "choose another name, or revoke that client first",
+            code=ErrorCode.NAME_TAKEN,
         )
     made = _create(folder, name)
     _write_allowed(folder, read_allowed(folder) | {_public(folder, name): name})
@@ -88,11 +91,12 @@ def allow(folder: Path, name: str) -> list[Path]:
 
 
 def revoke(folder: Path, name: str) -> None:
-    """Allow this client no more, at once: its next command is refused, and it cannot connect."""
+    """Remove a client from the list: its next command is refused, and it cannot connect again."""
     names = read_allowed(folder)
     left = {key: other for key, other in names.items() if other != name}
     if left == names:
-        raise ConfigError(f"no client {name!r} is allowed", "a typing error", f"allowed: {', '.join(names.values())}")
+        known = f"allowed: {', '.join(names.values())}"
+        raise ConfigError(f"no client {name!r} is allowed", "a typing error", known, code=ErrorCode.KEY_UNKNOWN)
     _write_allowed(folder, left)
 
 

@@ -1,6 +1,6 @@
-"""The state machine of stage, run and row: RULES says which event may come in which state, and what it leads to.
+"""The state machine of stage, run and row: RULES lists the events of each state, their actions and the next states.
 
-The actions are methods of `RowMachine` (row_machine.py). The same tables are in docs/spec/wire.md, "State machine".
+The actions are methods of `RowMachine` (row_machine.py). docs/spec/wire.md, "State machine", has the same tables.
 """
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ from functools import partial
 from typing import Any, Literal, NamedTuple
 
 from polysight.shared import messages as m
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
 
 
 class RefusedError(PolysightError):
-    """A command is refused; `number` is of shared/faults.py, whose table says what is not said here."""
+    """A command is refused with a PiFault number; shared/faults.py has the default texts of each number."""
 
     def __init__(self, number: int, what: str, why: str = "", remedy: str = "") -> None:
-        super().__init__(what, why, remedy)
+        super().__init__(what, why, remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = int(number)
 
 
@@ -28,9 +29,9 @@ State = Literal["idle", "homing", "homed", "ready", "running", "held", "stopping
 
 
 class Rule(NamedTuple):
-    """An event in one of some states: what is done (a method), and the state afterwards.
+    """Action (name of a method) and next state of an event in the listed states.
 
-    `leads_to` lists the possible next states, the usual one first; the action returns one of the others.
+    `leads_to` has the possible next states, the default first; the action may return one of the others.
     """
 
     event: str
@@ -40,7 +41,7 @@ class Rule(NamedTuple):
 
 
 RULES = (
-    # Commands. In any other state they are refused.
+    # Commands; refused in all other states.
     Rule("Home", "idle homed ready fault", "homing", "home"),
     Rule("Home", "homing", "same"),
     Rule("BeginRun", "homed", "ready", "begin_run"),
@@ -57,7 +58,7 @@ RULES = (
     Rule("Abort", "homing", "same", "stop"),
     Rule("Abort", "idle homed ready stopping ending fault", "same"),
     Rule("Pulse", "idle homed fault", "same"),
-    # The stage. In any other state what it says is ignored.
+    # Replies of the stage; ignored in all other states.
     Rule("homed", "homing", "homed ready", "note_homed"),
     Rule("passed", "running held", "done ending", "note_passed"),
     Rule("passed", "stopping", "ending", "note_stopped"),
@@ -81,27 +82,27 @@ RULES = (
     Rule("timeout", "done", "ending", "disarm"),
     Rule("settled", "ending", "ready idle fault", "finish_row"),
 )
-LIMITS_S: dict[State, float] = {
-    "homing": HOMING_LIMIT_S,
+TIMEOUTS_S: dict[State, float] = {
+    "homing": HOMING_TIMEOUT_S,
     "stopping": 3.0,  # from STOP to standstill
     "done": 1.0,  # from the stage's `done` to the last burst
-}  # running: the row's own; the others: none
-END_LIMIT_S = 0.5  # from STOP to standstill when this program is told to end
-HOST_MISSES = 4  # heartbeats of the host that may fail to come
-WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others are told as they are
+}  # running: set for each row; all others: no limit
+END_TIMEOUT_S = 0.5  # from STOP to standstill when the program is being ended
+HOST_MISSES = 4  # missing heartbeats after which the host is lost
+WIRE_STATE: dict[State, m.State] = {"stopping": "running", "ending": "done"}  # the others have the same name
 
 
 class Machine:
-    """Applies RULES, keeps the deadline of the state, and watches the host while a row is in motion.
+    """Applies RULES, checks the time limit of the state and, during a row, the host's heartbeat.
 
-    Only the executor's thread calls it, except `note_host_alive`.
+    Used by the executor's thread only, except `note_host_alive`.
     """
 
     def __init__(self, post: Callable[[Callable[[], object]], None], clock: Callable[[], float]) -> None:
         self._post, self._clock = post, clock
         self.state: State = "idle"
         self.reason = ""  # of the first fault
-        self.row_limit_s = math.inf
+        self.row_timeout_s = math.inf
         self._deadline_s = math.inf
         self.watch_host(0)
         self._rules: dict[tuple[str, str], tuple[list[Any], Callable[..., str | None]]] = {
@@ -111,7 +112,7 @@ class Machine:
         }
 
     def happen(self, event: str, *args: Any) -> bool:
-        """Apply the rule for this event in this state. False if there is none: nothing has changed."""
+        """Apply the rule of this event in the current state; return False if there is none."""
         if (self.state, event) not in self._rules:
             return False
         possible, action = self._rules[self.state, event]
@@ -124,13 +125,13 @@ class Machine:
         return True
 
     def _enter(self, state: State) -> None:
-        limit_s = self.row_limit_s if state == "running" else LIMITS_S.get(state, math.inf)
-        self.state, self._deadline_s = state, self._clock() + limit_s
-        if state == "ending":  # behind the bursts that wait in the queue
+        timeout_s = self.row_timeout_s if state == "running" else TIMEOUTS_S.get(state, math.inf)
+        self.state, self._deadline_s = state, self._clock() + timeout_s
+        if state == "ending":  # after the bursts that are still in the queue
             self._post(partial(self.happen, "settled"))
 
     def require(self, event: str) -> None:
-        """Raise RefusedError if this command has no rule in this state."""
+        """Raise RefusedError if this command has no rule in the current state."""
         if (self.state, event) not in self._rules:
             row = self.state in ("running", "held", "stopping", "done", "ending")
             raise RefusedError(
@@ -141,13 +142,13 @@ class Machine:
             )
 
     def command(self, event: str, *args: Any) -> None:
-        """Carry out a command. Raises RefusedError."""
+        """Execute a command. Raises RefusedError."""
         self.require(event)
         self.happen(event, *args)
 
     @property
     def wire_state(self) -> m.State:
-        """The state as it is told on the wire."""
+        """The name of the state in messages."""
         return WIRE_STATE.get(self.state) or self.state  # pyright: ignore[reportReturnType]
 
     def _nothing(self, *_: object) -> None:
@@ -156,32 +157,32 @@ class Machine:
     # --- time -------------------------------------------------------------------------------------------------------
 
     def watch_host(self, heartbeat_ms: int) -> None:
-        """The host promises to be heard so often; 0: it is not watched."""
-        self._host_limit_s = HOST_MISSES * heartbeat_ms / 1e3 if heartbeat_ms else math.inf
+        """Expect the host's heartbeat at this interval; 0 disables the check."""
+        self._host_timeout_s = HOST_MISSES * heartbeat_ms / 1e3 if heartbeat_ms else math.inf
         self._host_alive_s = self._clock()
 
     def note_host_alive(self) -> None:
-        """The host of the run lives. From any thread."""
+        """Note a heartbeat of the run's host. From any thread."""
         self._host_alive_s = max(self._host_alive_s, self._clock())
 
     @property
     def host_lives(self) -> bool:
-        """True if the host has kept its promise so far; False if it promised nothing."""
-        return self._host_limit_s < math.inf and self._clock() < self._host_alive_s + self._host_limit_s
+        """True if every heartbeat so far arrived on time; False if none is expected."""
+        return self._host_timeout_s < math.inf and self._clock() < self._host_alive_s + self._host_timeout_s
 
     @property
     def _host_lost_s(self) -> float:
-        return self._host_alive_s + self._host_limit_s if self.state in ("running", "held") else math.inf
+        return self._host_alive_s + self._host_timeout_s if self.state in ("running", "held") else math.inf
 
     def seconds_left(self) -> float | None:
-        """Until something is due; None when nothing is."""
+        """Return the time until the next deadline, or None."""
         at_s = min(self._deadline_s, self._host_lost_s)
         return None if at_s == math.inf else max(0.0, at_s - self._clock())
 
-    def check_limits(self) -> None:
-        """Act on deadlines that have passed."""
+    def check_deadlines(self) -> None:
+        """Handle deadlines that have passed."""
         if self._clock() >= self._deadline_s:
             self.happen("timeout")
         if self._clock() >= self._host_lost_s:
-            silence = f"nothing was heard of the host for {self._host_limit_s * 1e3:.0f} ms"
-            self.happen("row fault", PiFault.HOST_LOST, silence)
+            reason = f"no heartbeat of the host for {self._host_timeout_s * 1e3:.0f} ms"
+            self.happen("row fault", PiFault.HOST_LOST, reason)

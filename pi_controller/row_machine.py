@@ -1,6 +1,6 @@
-"""What the actions of the state machine (machine.py) do with stage, trigger loop and the running row.
+"""The actions of the state machine (machine.py) on stage, trigger loop and the running row.
 
-The first fault is kept until the next `Home` or row. Everything here runs in the executor's thread.
+The first fault is kept until the next `Home` or row. All methods run in the executor's thread.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from functools import partial
 
 from polysight.pi_controller.bursts import BurstSpec
 from polysight.pi_controller.journal import Journal
-from polysight.pi_controller.machine import END_LIMIT_S, Machine, RefusedError
-from polysight.pi_controller.stage import MOST_MM, StageDriver
+from polysight.pi_controller.machine import END_TIMEOUT_S, Machine, RefusedError
+from polysight.pi_controller.stage import MAX_MM, StageDriver
 from polysight.pi_controller.stage_link import StageLostError, StageRefusedError
 from polysight.pi_controller.trigger import BurstSent, Counts, Job, LoopFault, TriggerLoop, TriggerWatch
 from polysight.shared import messages as m
@@ -21,10 +21,10 @@ from polysight.shared.config import Stage
 from polysight.shared.errors import ProtocolError
 from polysight.shared.faults import PiFault, StageError, explain
 from polysight.shared.raster import Row
-from polysight.shared.stage_line import HOMING_LIMIT_S, Immediate, Reply
+from polysight.shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
 STATUS_EVENT_S = 0.24
-RESTS = 3  # statuses at rest after which the end of a motion counts as lost
+RESTS = 3  # consecutive statuses at rest after which the reply to the end of a motion counts as lost
 MOVING = ("homing", "running", "held", "stopping")
 POSITION_LOST = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
@@ -33,34 +33,34 @@ POSITION_LOST = (
 
 @dataclass
 class RunningRow:
-    """A row that the stage has taken. `status` is set as soon as its end is decided."""
+    """A row that the stage has started. `status` is set once the row's result is decided."""
 
     row: Row
     take: int
     job: Job
-    sequence: int  # of the stage's ROW, and of its `done`
+    sequence: int  # of the stage's ROW and its `done`
     status: m.RowStatus | None = None
     fault: int = 0
     reason: str = ""
-    lasting: bool = False  # the state is fault afterwards
-    points: int = 0  # passed, by the stage's count
-    bursts: int = 0  # told to the host
+    lasting: bool = False  # the next state is fault
+    points: int = 0  # passed, counted by the stage
+    bursts: int = 0  # reported to the host
 
     def judge(self, counts: Counts) -> None:
-        """Decide how a row ended that nothing stopped: `done` if every count agrees, else `fault`."""
+        """Set the result of a row that was not stopped: `done` if all counts agree, else `fault`."""
         n, pulses = self.row.points, self.row.points * self.job.spec.pulses
         if (self.points, *counts) == (n, n, n, pulses):
             self.status = "done"
             return
         self.status, self.fault = "fault", int(PiFault.POINTS_MISMATCH)
         self.reason = (
-            f"{n} points asked for, {self.points} passed by the stage, {counts.edges} edges seen, "
+            f"{n} points requested, {self.points} passed by the stage, {counts.edges} edges received, "
             f"{counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
         )
 
 
 class RowMachine(Machine):
-    """The machine with its actions. `post` puts a call behind everything that waits in the executor's queue."""
+    """The state machine with its actions. `post` appends a call to the executor's queue."""
 
     def __init__(
         self,
@@ -75,16 +75,16 @@ class RowMachine(Machine):
         self.row: RunningRow | None = None
         self.homed = self.in_run = False
         self.fault = 0  # the first one; its reason is in `reason`
-        self.lost_mm = (0.0, 0.0)  # found by the last homing
-        self._homing, self._homing_underway = -1, False  # sequence of HOME; whether the stage has taken it
+        self.lost_mm = (0.0, 0.0)  # steps lost before the last homing, which found them
+        self._homing, self._homing_underway = -1, False  # sequence of HOME; True once the stage has accepted it
         self._lines_dead = self._terminating = False
         self._rests, self._watch = 0, TriggerWatch()
         self._status_sent_s = 0.0
 
-    # --- what comes by itself ---------------------------------------------------------------------------------------
+    # --- events of trigger loop and stage ---------------------------------------------------------------------------
 
     def on_burst(self, sent: BurstSent) -> None:
-        """A burst has ended."""
+        """Journal a burst of the row."""
         row, r = self.row, sent.record
         if row is None or sent.job is not row.job or not r.pulses:
             return
@@ -98,7 +98,7 @@ class RowMachine(Machine):
             self.happen("all sent")
 
     def on_loop_fault(self, fault: LoopFault) -> None:
-        """The trigger loop has given up: this row, or for good."""
+        """Handle a fault of the trigger loop, which ends the row, or the loop itself."""
         if fault.job is None:
             self._lines_dead = True
             self.happen("lasting fault", fault.number, fault.detail)
@@ -106,16 +106,16 @@ class RowMachine(Machine):
             self.happen("row fault", fault.number, fault.detail)
 
     def on_stage(self, reply: Reply) -> None:
-        """What the stage tells by itself."""
+        """Handle an unsolicited reply of the stage."""
         homing, homed = self.state == "homing", reply.sequence == self._homing
         if reply.kind == "status":
             self._on_status(reply)
         elif reply.kind == "ok":
             self._homing_underway |= homing and homed
         elif homing and not self._homing_underway:
-            pass  # from before homing: it began with clearing
+            pass  # sent before HOME was accepted
         elif reply.kind == "banner":
-            self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: its banner came")
+            self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: it sent its banner")
         elif reply.kind == "alarm" and reply.number == StageError.STOPPED:
             self.happen("stopped")
         elif reply.kind == "alarm":
@@ -133,15 +133,15 @@ class RowMachine(Machine):
         if row is not None and self.state in MOVING:
             row.points = max(0, _number(reply, "points"))
             if self.state != "stopping" and self._watch.is_silent(row.points, edges):
-                silent = f"the stage has passed {row.points} points, {edges} edges were seen: wire off?"
-                self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, silent)
+                reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
+                self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
         waits = self.state in MOVING and (row is not None or self._homing_underway)
         at_rest = reply.fields.get("state") in ("idle", "alarm")
         self._rests = self._rests + 1 if waits and at_rest else 0
         if self._rests >= RESTS:
             self._rests = 0
             try:
-                self.stage.link.repeat()  # how the motion ended is told again
+                self.stage.link.repeat()  # the stage repeats the end of its motion
             except StageLostError as e:
                 self.happen("stage lost", e.number, str(e))
 
@@ -180,7 +180,7 @@ class RowMachine(Machine):
         self.stage.at_rest()
         k = self.stage.config.steps_per_mm
         lost_x_mm, lost_y_mm = (_number(reply, key) / k for key in ("lostx", "losty"))
-        self.lost_mm = (max(-MOST_MM, min(lost_x_mm, MOST_MM)), max(-MOST_MM, min(lost_y_mm, MOST_MM)))
+        self.lost_mm = (max(-MAX_MM, min(lost_x_mm, MAX_MM)), max(-MAX_MM, min(lost_y_mm, MAX_MM)))
         self.homed = True
         return "ready" if self.in_run else "homed"
 
@@ -203,7 +203,7 @@ class RowMachine(Machine):
                 self.happen("not homed")
             raise
         self.row = RunningRow(row, take, job, sequence)
-        self.row_limit_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
+        self.row_timeout_s = 30.0 + 3 * row_duration_s(row, self.stage.config, speed_mm_s)
         self._rests, self._watch = 0, TriggerWatch()
         self.fault, self.reason = 0, ""
         self._journal.add(m.RowStarted, row=row, take=take)
@@ -217,7 +217,7 @@ class RowMachine(Machine):
     # --- actions: how a row ends ------------------------------------------------------------------------------------
 
     def _decide(self, status: m.RowStatus, number: int, reason: str, lasting: bool = False) -> None:
-        """How the row ends. The first decision stays."""
+        """Set the row's result, unless it is set already, and disarm the trigger loop."""
         if self.row is not None:
             self.row.lasting |= lasting
             if self.row.status is None:
@@ -225,7 +225,7 @@ class RowMachine(Machine):
                 self._loop.disarm()
 
     def _stop(self, *_: object) -> str | None:
-        """Stop what moves. Returns `ending` for a row that cannot be stopped."""
+        """Stop the stage if it moves. Returns `ending` for a row that cannot be stopped."""
         if self.state in ("homing", "running", "held"):
             try:
                 self.stage.link.send_byte(Immediate.STOP)
@@ -241,11 +241,11 @@ class RowMachine(Machine):
         return self._stop()
 
     def terminate(self) -> bool:
-        """The program is told to end: stop what moves. Returns whether a row has to end first."""
+        """Stop the stage because the program is being ended. Returns True if a row has to end first."""
         self._terminating = True
-        self.happen("Abort", "polysight-pi was told to end")
+        self.happen("Abort", "polysight-pi was ended")
         if self.state == "stopping":
-            self._deadline_s = self._clock() + END_LIMIT_S
+            self._deadline_s = self._clock() + END_TIMEOUT_S
         return self.row is not None
 
     def _fail_row(self, number: int, reason: str) -> str | None:
@@ -259,7 +259,7 @@ class RowMachine(Machine):
         return self._stop()
 
     def _lose_stage(self, number: int, reason: str) -> None:
-        """Lost, in alarm, or reset: nothing can be stopped any more."""
+        """Handle a stage that is lost, in alarm, or reset: it cannot be stopped any more."""
         self.homed = False
         self.stage.at_rest()
         if self.state != "fault":
@@ -271,23 +271,23 @@ class RowMachine(Machine):
 
     def _time_out(self) -> None:
         if not self._terminating:
-            words = {
-                "homing": f"not homed after {HOMING_LIMIT_S} s",
-                "running": f"the row has not ended after {self.row_limit_s:.0f} s",
+            reasons = {
+                "homing": f"not homed after {HOMING_TIMEOUT_S} s",
+                "running": f"the row has not ended after {self.row_timeout_s:.0f} s",
                 "stopping": "the stage did not stop",
             }
-            self._lose_stage(PiFault.STAGE_LOST, words[self.state])
+            self._lose_stage(PiFault.STAGE_LOST, reasons[self.state])
 
     def _note_passed(self, reply: Reply) -> str | None:
         row = self._current
         self.stage.at_rest()
         row.points = max(0, _number(reply, "points", row.row.points))
         if _number(reply, "held"):
-            row.reason = "held on the way: some positions were passed below full speed"
+            row.reason = "held during the row: some positions were passed below full speed"
         return "ending" if row.bursts >= row.row.points else None
 
     def _note_stopped(self, reply: Reply | None = None) -> None:
-        """The stage rests after STOP, or had come to the row's end by itself when STOP arrived."""
+        """Handle the stage at rest after STOP; it may have reached the row's end before."""
         if reply is not None:
             self._current.points = max(0, _number(reply, "points", self._current.row.points))
         self._decide("aborted", PiFault.ABORTED, "the stage was stopped")
@@ -332,7 +332,7 @@ class RowMachine(Machine):
 
 
 def row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:
-    """About how long a row takes, the longest way to its first point included."""
+    """Estimate the duration of a row, including the longest travel to its first point."""
     travel_s = (stage.travel_x_mm + stage.travel_y_mm) / stage.travel_speed_mm_s
     return travel_s + abs(row.step_mm) * row.points / speed_mm_s + 4 * speed_mm_s / stage.accel_mm_s2
 

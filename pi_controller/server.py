@@ -1,7 +1,7 @@
-"""The Pi's two ZeroMQ sockets: events out (PUB), commands in and replies out (ROUTER), in one thread.
+"""The Pi's two ZeroMQ sockets, served by one thread: events (PUB), commands and replies (ROUTER).
 
-Only this thread touches the sockets; others hand over bytes and wake it. A ROUTER keeps each command's envelope, so
-that `Hello`, `Status` and `Alive` are answered while the executor works, or hangs. Specification: docs/spec/wire.md.
+Only this thread uses the sockets; others queue messages and wake it. A ROUTER keeps each command's envelope, so
+`Hello`, `Status` and `Alive` are answered while the executor is busy or hangs. Specification: docs/spec/wire.md.
 """
 
 from __future__ import annotations
@@ -24,15 +24,11 @@ from polysight.shared.faults import PiFault
 from polysight.shared.sockets import EVENT_TOPIC, authenticator, is_loopback, publisher, replier
 
 LINGER_MS = 200
-REPLIES_WAITING = 1000  # for clients that do not read; what is more is dropped, and its client asks again
 Envelope = tuple[bytes, ...]
 
 
 class Server:
-    """Binds both sockets.
-
-    Raises ConfigError or DeviceError when an address is wrong, in use, or has no keys.
-    """
+    """Binds both sockets. Raises ConfigError or DeviceError if an address is wrong, in use, or has no keys."""
 
     def __init__(self, command_address: str, event_address: str, key_dir: Path, heartbeat_ms: int) -> None:
         self._heartbeat_ms = heartbeat_ms
@@ -40,7 +36,7 @@ class Server:
         self._allowed = AllowedKeys(key_dir)
         self._secret = not is_loopback(command_address)
         try:
-            self._zap = authenticator(self._context)  # before the others are bound: it is asked for each connection
+            self._zap = authenticator(self._context)  # before the others are bound: it authenticates their connections
             self._commands = replier(self._context, command_address, key_dir)
             self._events = publisher(self._context, event_address, key_dir)
         except PolysightError:
@@ -54,21 +50,21 @@ class Server:
         self._stop = False
 
     def publish(self, events: list[bytes]) -> None:
-        """Send packed events, in order. From any thread; returns at once."""
-        self._hand_over(*(((), raw) for raw in events))
+        """Queue packed events, in order. From any thread; returns at once."""
+        self._queue(*(((), raw) for raw in events))
 
-    def _hand_over(self, *messages: tuple[Envelope, bytes]) -> None:
+    def _queue(self, *messages: tuple[Envelope, bytes]) -> None:
         for message in messages:
             self._out.put(message)
         os.eventfd_write(self._wake, 1)
 
     def stop(self) -> None:
-        """End :meth:`run`. From any thread, or a signal handler."""
+        """End :meth:`run`. From any thread or a signal handler."""
         self._stop = True
         os.eventfd_write(self._wake, 1)
 
     def run(self, executor: Executor) -> None:
-        """Serve until :meth:`stop`, or until the executor has crashed."""
+        """Serve until :meth:`stop` or a crash of the executor."""
         poller = zmq.Poller()
         poller.register(self._wake, zmq.POLLIN)
         poller.register(self._commands, zmq.POLLIN)
@@ -84,12 +80,12 @@ class Server:
                 os.eventfd_read(self._wake)
                 self.drain()
             if self._zap in ready:
-                self._admit()
+                self._authenticate()
             if self._commands in ready:
                 self._receive(executor)
 
     def drain(self) -> None:
-        """Send what was handed over. In the thread of :meth:`run`, or after it."""
+        """Send the queued messages. In the thread of :meth:`run`, or after its end."""
         while True:
             try:
                 envelope, raw = self._out.get_nowait()
@@ -100,8 +96,8 @@ class Server:
             else:
                 self._events.send_multipart([EVENT_TOPIC, raw])
 
-    def _admit(self) -> None:
-        """Answer ZeroMQ's question (ZAP, RFC 27) whether a client with this public key may connect."""
+    def _authenticate(self) -> None:
+        """Answer an authentication request of ZeroMQ (ZAP, RFC 27): a client with an allowed public key may connect."""
         version, number, _, _, _, mechanism, *credentials = self._zap.recv_multipart()
         key = bytes(credentials[0]) if mechanism == b"CURVE" and credentials else b""
         name = self._allowed.name_of(key) if key else ""
@@ -109,17 +105,17 @@ class Server:
         self._zap.send_multipart([version, number, code, text, key.hex().encode(), b""])
 
     def _receive(self, executor: Executor) -> None:
-        """Take one command: its envelope (who sent it, up to the empty frame), and one frame of content."""
+        """Answer one command: its envelope (routing frames up to the empty one) and one frame of content."""
         frames = self._commands.recv_multipart(copy=False)
         parts = [f.bytes for f in frames]
         if b"" not in parts[1:-1]:
-            return  # no client's framing: nobody waits for a reply
+            return  # no REQ framing: no client waits for a reply
         end = parts.index(b"", 1) + 1
         envelope = tuple(parts[:end])
         if self._secret and not self._allowed.name_of(bytes.fromhex(str(frames[-1].get("User-Id")))):
             reply = refused(PiFault.NOT_OWNER, "this client's key was revoked", "see `polysight-pi keys --list`")
         else:
-            reply = self._take(b"".join(parts[end:]), envelope, executor)
+            reply = self._answer(b"".join(parts[end:]), envelope, executor)
         if reply is not None:
             self._reply(envelope, m.pack(reply))
 
@@ -127,41 +123,41 @@ class Server:
         try:
             self._commands.send_multipart([*envelope, raw], zmq.NOBLOCK)
         except zmq.ZMQError:
-            return  # the client is gone, or reads nothing: it asks again
+            return  # the client is gone or does not read; it will retry
 
     def close(self) -> None:
-        """Close the sockets, giving sent messages a moment to leave."""
+        """Close the sockets after a moment for messages already sent."""
         self._context.destroy(linger=LINGER_MS)
         os.close(self._wake)
 
-    def _take(self, raw: bytes, envelope: Envelope, executor: Executor) -> m.AnyReply | None:
-        """The reply to a command; None when the executor will give it. Nothing that arrives here ends the program."""
+    def _answer(self, raw: bytes, envelope: Envelope, executor: Executor) -> m.AnyReply | None:
+        """Return the reply to a command, or None if the executor replies later. No message can end the program."""
         try:
             command = m.unpack_command(raw)
         except ProtocolError as e:
             number = PiFault.VERSION if isinstance(e, VersionError) else PiFault.BAD_REQUEST
             return refused(number, e.what, e.why, e.remedy)
-        except Exception as e:  # noqa: BLE001 - told to the client, and in the log
+        except Exception as e:  # noqa: BLE001 - reported to the client and in the log
             traceback.print_exc()
             return refused(PiFault.BAD_REQUEST, f"a command of {len(raw)} bytes cannot be read: {type(e).__name__}")
         if executor.unresponsive_s > HUNG_S:
-            return refused(PiFault.PROGRAM, f"the executor has stood still for {executor.unresponsive_s:.0f} s")
+            return refused(PiFault.PROGRAM, f"the executor has hung for {executor.unresponsive_s:.0f} s")
         if isinstance(command, m.Hello):
             return msgspec.structs.replace(executor.hello, t_unix_ns=time.time_ns())
         if isinstance(command, m.Status):
             return executor.status
         if isinstance(command, m.Alive):
             return executor.host_alive(command.scan_id, command.owner)
-        if executor.submit(command, lambda reply: self._hand_over((envelope, m.pack(reply)))):
+        if executor.submit(command, lambda reply: self._queue((envelope, m.pack(reply)))):
             return None
-        return refused(PiFault.NOT_READY, "too many commands wait to be carried out", "", "wait for replies")
+        return refused(PiFault.NOT_READY, "too many commands are waiting", "", "wait for replies")
 
     def _beat(self, executor: Executor) -> None:
-        """Tell that this program lives; while the executor hangs, it does not."""
+        """Publish a heartbeat, unless the executor hangs."""
         if executor.unresponsive_s > HUNG_S:
             return
-        # Every event up to the status's number was handed over before the status was taken, so draining first keeps a
-        # heartbeat from announcing an event that has not been sent.
+        # Events up to status.last_seq are in the queue by now; sending them first keeps a heartbeat from announcing an
+        # event that was not sent.
         status = executor.status
         self.drain()
         beat = m.Heartbeat(

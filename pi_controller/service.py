@@ -1,4 +1,4 @@
-"""`polysight-pi run`: puts lines, stage, executor and sockets together, and takes them apart in a safe order."""
+"""`polysight-pi run`: creates lines, stage, executor and sockets, and closes them in a safe order."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from polysight.pi_controller.server import Server
 from polysight.pi_controller.stage import StageDriver
 from polysight.pi_controller.trigger import TriggerLoop
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 
-END_LIMIT_S = 0.8
-TAKE_OVER_KEY = "take-over-key"  # file beside the journals: owner of every run, for the person at the Pi
+END_TIMEOUT_S = 0.8
+TAKE_OVER_KEY = "take-over-key"  # file beside the journals with a key that every run accepts from a person at the Pi
 
 
 def log(text: str) -> None:
-    """One line to the log (stderr)."""
+    """Write one line to the log (stderr)."""
     sys.stderr.write(f"polysight-pi: {text}\n")
     sys.stderr.flush()
 
 
 class Service:
-    """The Pi half as a whole, on GPIO or on simulated wires.
+    """The whole Pi half, on GPIO or on simulated wires.
 
-    Raises
-    ------
-    ConfigError, DeviceError
-        when an address, a line, the journal or the stage cannot be had. What was opened before is closed again.
+    Raises ConfigError or DeviceError if an address, a line, the journal or the stage is not available; everything
+    opened before is closed.
     """
 
     def __init__(self, instrument: Instrument, wires: Path | None = None) -> None:
@@ -44,7 +43,7 @@ class Service:
         with ExitStack() as opened:
             journal = Journal(folder, lambda events: self.server.publish(events), log)
             opened.callback(_close, journal)
-            # What is not permitted to its thread was not permitted to the process, which has said so.
+            # Rights that the thread lacks were reported already for the process.
             prepare = system.prepare_thread if wires is None else lambda: None
             self._loop = TriggerLoop(open_lines(instrument, wires), self._post, prepare)
             opened.callback(self._loop.stop)
@@ -61,26 +60,25 @@ class Service:
         self.executor.post(item)
 
     def serve(self) -> None:
-        """Serve until :meth:`stop`; then stop the stage and end the row. Raises DeviceError when a part failed."""
+        """Serve until :meth:`stop`, then stop the stage and end the row. Raises DeviceError after an internal error."""
         self._loop.start()
         self.executor.start()
         memory = system.MemoryWatch(self.server.ports, log)
         memory.start()
         self.server.run(self.executor)
         memory.stop()
-        self.executor.stop(END_LIMIT_S)
+        self.executor.stop(END_TIMEOUT_S)
         self.server.drain()
         if self.executor.crash is not None:
-            raise DeviceError(
-                f"the executor failed: {self.executor.crash!r}", "a fault of this program", "report it with its trace"
-            )
+            what = f"the executor failed: {self.executor.crash!r}"
+            raise DeviceError(what, "an internal error", "report it with its trace")
 
     def stop(self) -> None:
         """End :meth:`serve`. From any thread, or a signal handler."""
         self.server.stop()
 
     def close(self) -> None:
-        """Outputs low first, then everything is closed."""
+        """Set outputs low, then close everything."""
         self._loop.stop()
         self._opened.close()
 
@@ -93,19 +91,20 @@ def _close(journal: Journal) -> None:
 
 
 def _write_secret(path: Path, secret: str) -> None:
-    """Write a file that this program's user alone can read. Raises ConfigError."""
+    """Write a file that only this program's user can read. Raises ConfigError."""
     try:
         path.unlink(missing_ok=True)
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), "w") as file:
             file.write(secret)
     except OSError as e:
-        raise ConfigError(f"{path}: {e.strerror}", "the disk is full or read-only", "free space there") from None
+        why = "the disk is full or read-only"
+        raise ConfigError(f"{path}: {e.strerror}", why, "free space there", code=ErrorCode.DISK_FULL) from None
 
 
 def run(instrument: Instrument, wires: Path | None) -> int:
-    """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout when it serves.
+    """Serve until SIGTERM or SIGINT. Prints `ready <command address>` on stdout once it does.
 
-    Raises ConfigError or DeviceError when it cannot start.
+    Raises ConfigError or DeviceError if it cannot start.
     """
     if wires is not None:
         system.die_with_parent(signal.SIGTERM)

@@ -1,7 +1,7 @@
-"""Lines of a simulated rig: edges come and go over a local socket, each with its wire time (shared/wires.py).
+"""Lines of a simulated rig: edges are sent and received over a local socket, with their wire time (shared/wires.py).
 
-Wire time is the simulated stage's clock. Here it is the latest of the edges seen and of the deadlines slept until, so a
-burst takes no wall time, and its pulses lie exactly on their deadlines however loaded the machine is.
+Wire time is the simulated stage's clock. Here it is the latest of the received edges and of the deadlines slept until,
+so a burst takes no wall time and its pulses are exactly on their deadlines, however busy the machine is.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from polysight.shared.wires import WireClient, WireEdge
 
 
 class WireLines:
-    """Trigger lines on simulated wires; `path` is the hub's socket. Raises DeviceError when no hub listens there."""
+    """Lines on simulated wires; `path` is the hub's socket. Raises DeviceError if no hub listens there."""
 
     name: str = WIRES
 
@@ -29,20 +29,20 @@ class WireLines:
         self._unsent: list[WireEdge] = []
 
     def now_ns(self) -> int:
-        """Wire time."""
+        """Return the wire time."""
         return self._now_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        """Advance wire time; returns at once."""
+        """Advance the wire time; return at once."""
         self._now_ns = max(self._now_ns, t_ns)
 
-    def wait_edge(self, limit_s: float) -> Edge | None:
-        """Send the edges of the last burst, and wait for the next rising edge of the trigger line.
+    def wait_edge(self, timeout_s: float) -> Edge | None:
+        """Send the edges of the last burst and wait for the next rising edge of the trigger line.
 
-        Raises DeviceError when the hub is gone.
+        Raises DeviceError when the hub is lost.
         """
         self._flush()
-        deadline = time.monotonic() + limit_s
+        deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
             message = self._client.receive(left)
             if isinstance(message, WireEdge) and message.line == self._trigger and message.value:
@@ -52,7 +52,7 @@ class WireLines:
         return None
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
-        """Make a pulse on all output lines from wire time now on."""
+        """Send a pulse on all output lines, starting now; return its times."""
         begin_ns = self._now_ns
         self._set_output(True)
         self.sleep_until(begin_ns + width_ns)
@@ -70,7 +70,7 @@ class WireLines:
             self._client.send(*unsent)
 
     def close(self) -> None:
-        """Leave the wires, outputs low."""
+        """Set the outputs low and disconnect from the hub."""
         try:
             self._set_output(False)
             self._flush()
@@ -79,12 +79,12 @@ class WireLines:
 
 
 class SpiWireLines(WireLines):
-    """Simulated wires whose SYNC_IN is MOSI: the bits of a transfer become edges, each at its bit's wire time."""
+    """Simulated wires whose SYNC_IN is MOSI: the bits of a transfer become edges at the wire time of their bit."""
 
     bufsiz = DEFAULT_BUFSIZ
 
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
-        """Play a transfer, most significant bit first; the line stays as the last bit left it."""
+        """Send the edges of a transfer, most significant bit first; the line keeps the level of the last bit."""
         begin_ns = self._now_ns
         for i, byte in enumerate(burst.data):
             if byte or self._active:

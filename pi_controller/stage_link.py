@@ -1,7 +1,7 @@
-"""The serial link to the stage: numbered lines that are sent again until answered, and bytes that act at once.
+"""The serial link to the stage: numbered lines, repeated until answered, and immediate bytes.
 
-A reader thread separates answers to lines from what comes by itself (done, alarm, status, banner), and asks for the
-stage's status at an interval, which is also the heartbeat without which a moving stage stops.
+A reader thread separates answers to lines from unsolicited replies (done, alarm, status, banner). It also asks for the
+stage's status at an interval: this is the heartbeat without which a moving stage stops.
 Protocol: docs/spec/stage-line.md.
 """
 
@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import serial
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ProtocolError
 from polysight.shared.faults import PiFault, StageError, explain
 from polysight.shared.stage_line import (
@@ -28,20 +29,18 @@ from polysight.shared.stage_line import (
     Reply,
 )
 
-# The first opening of the port resets an UNO: its boot loader takes up to 2 s before the sketch sends its banner.
-BANNER_LIMIT_S = 3.0
-# Longer than the longest line and its answer take at 115200 baud (14 ms), with room for a busy machine.
-ANSWER_LIMIT_S = 0.5
+BANNER_TIMEOUT_S = 3.0  # the first opening of the port resets an UNO, whose boot loader takes up to 2 s
+ANSWER_TIMEOUT_S = 0.5  # the longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine
 TRIES = 4
 RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
 STATUS_PER_HEARTBEAT = 4  # while moving
-# A status unanswered for so much of a heartbeat: the stage is lost. With the time to the next question and a look at
-# the port, a stage that falls silent is noticed before its own heartbeat stops it.
+# Timeout of a status request, in heartbeats. With the time until the next request and the read timeout, a silent stage
+# is noticed before its own heartbeat stops it.
 SILENT_HEARTBEATS = 0.5
 
 
 class StageLostError(DeviceError):
-    """The stage does not answer, or its port is gone."""
+    """The stage does not answer, or its port is lost."""
 
     number = PiFault.STAGE_LOST
 
@@ -51,12 +50,13 @@ class StageRefusedError(DeviceError):
 
     def __init__(self, verb: str, number: int) -> None:
         what, why, remedy = explain(number)
-        super().__init__(f"stage refused {verb}: error {number}, {what}", why, remedy)
+        what = f"stage refused {verb}: error {number}, {what}"
+        super().__init__(what, why, remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = number
 
 
 class StageLost(NamedTuple):
-    """News: the link is dead, and why."""
+    """The link is lost."""
 
     reason: str
 
@@ -65,16 +65,16 @@ StageNews = Reply | StageLost
 
 
 class StatusWatch:
-    """When to ask the stage for its status, and when it has been silent for too long."""
+    """Schedules status requests and detects a silent stage. All times are those of one clock, in seconds."""
 
     def __init__(self, heartbeat_s: float, now_s: float) -> None:
         self._silence_s, self._asked_s = SILENT_HEARTBEATS * heartbeat_s, now_s
         self._unanswered_since_s: float | None = None
-        self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)  # how often to ask `is_due` and `silent_s`
-        self.interval_s = 0.0  # 0: it is not asked
+        self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)  # interval for calling `is_due` and `silent_s`
+        self.interval_s = 0.0  # between status requests; 0: none
 
     def is_due(self, now_s: float) -> bool:
-        """Whether to ask now."""
+        """Return True, once per interval, if the status is to be requested now."""
         if not self.interval_s or now_s - self._asked_s < self.interval_s:
             return False
         self._asked_s = now_s
@@ -83,27 +83,27 @@ class StatusWatch:
         return True
 
     def heard(self) -> None:
-        """The stage has said something."""
+        """Note that the stage has sent something."""
         self._unanswered_since_s = None
 
     def silent_s(self, now_s: float) -> float:
-        """For how long it has been silent; 0 as long as that is no longer than allowed."""
+        """Return how long the stage has been silent; 0 while that is within the timeout."""
         silent_s = 0.0 if self._unanswered_since_s is None else now_s - self._unanswered_since_s
         return silent_s if silent_s > self._silence_s else 0.0
 
 
 class StageLink:
-    """One open serial link to `port`. Every method raises StageLostError when the stage does not answer.
+    """An open serial link to the stage at `port`. Every method raises StageLostError if the stage does not answer.
 
     Parameters
     ----------
     news
-        Takes, from the reader thread, every reply that answers no line, every `ok` (it divides what came before a
-        command from what came after), and one :class:`StageLost` when the link dies. Must return at once.
+        Called by the reader thread with every unsolicited reply, every `ok` (it separates replies before a command from
+        those after it), and one :class:`StageLost` when the link is lost. Must return at once.
     heartbeat_s
-        Of the stage: its status, once asked for, is answered within half of it, or the stage is lost.
-    banner_limit_s
-        How long to wait for the banner of a stage that the opening reset; without one it is greeted all the same.
+        The stage's heartbeat; the stage is lost if a status request is not answered within half of it.
+    banner_timeout_s
+        Timeout for the banner of a stage that was reset by opening the port; a stage without one is greeted anyway.
     """
 
     def __init__(
@@ -112,13 +112,13 @@ class StageLink:
         baud: int,
         news: Callable[[StageNews], None],
         heartbeat_s: float = 2.0,
-        banner_limit_s: float = BANNER_LIMIT_S,
+        banner_timeout_s: float = BANNER_TIMEOUT_S,
     ) -> None:
         self.port, self._news = port, news
         self._watch = StatusWatch(heartbeat_s, time.monotonic())
         try:
             self._serial = serial.Serial(port, baud, timeout=self._watch.look_s, write_timeout=1.0, exclusive=True)
-            # DTR stays up when the port is closed: its rise resets an UNO, which would forget where the stage stands.
+            # Keep DTR up when the port is closed: its next rise would reset an UNO, which would lose its position.
             settings = termios.tcgetattr(self._serial.fileno())
             settings[2] &= ~termios.HUPCL
             termios.tcsetattr(self._serial.fileno(), termios.TCSANOW, settings)
@@ -128,6 +128,7 @@ class StageLink:
                 f"stage port {port} cannot be opened: {reason}",
                 "cable unplugged, wrong port, no permission (group dialout), or another program uses it",
                 "check stage.port in instrument.toml and `ls -l /dev/ttyACM* /dev/ttyUSB*`",
+                code=ErrorCode.FILE_UNREADABLE,
             ) from None
         self._write_lock = threading.Lock()
         self._answers: queue.SimpleQueue[Reply | None] = queue.SimpleQueue()
@@ -136,18 +137,18 @@ class StageLink:
         self._greeted = self._closing = False
         self._sequence = self.bad_lines = 0
         self._last_line = b""
-        self.lost = ""  # why the link is dead
+        self.lost = ""  # the reason, once the link is lost
         self._reader = threading.Thread(target=self._read, name="stage", daemon=True)
         self._reader.start()
         try:
-            self._greet(banner_limit_s)
+            self._greet(banner_timeout_s)
         except DeviceError:
             self.close()
             raise
 
-    def _greet(self, banner_limit_s: float) -> None:
-        self._banner_seen.wait(banner_limit_s)
-        self._write(b"\n")  # whatever half a line came before is forgotten
+    def _greet(self, banner_timeout_s: float) -> None:
+        self._banner_seen.wait(banner_timeout_s)
+        self._write(b"\n")  # ends a partial line sent earlier
         hello = self.request("HELLO")
         fields = {**(self._banner.fields if self._banner else {}), **hello.fields}
         self.firmware, self.steps_per_mm = fields.get("fw", ""), fields.get("steps", "")
@@ -156,13 +157,14 @@ class StageLink:
                 f"stage at {self.port} speaks protocol {fields['proto']}, this program speaks {PROTOCOL_VERSION}",
                 "firmware and Pi program are of different releases",
                 "flash the sketch of this release",
+                code=ErrorCode.VERSION_UNSUPPORTED,
             )
         self._greeted = True
 
     def request(self, verb: str, *args: int) -> Reply:
-        """Send a line, again with its number when it is lost or damaged, until it is answered.
+        """Send a line and return the answer; retry with the same number if it is lost or damaged.
 
-        Raises StageRefusedError when the stage refuses it, StageLostError when it does not answer.
+        Raises StageRefusedError if the stage refuses the line, StageLostError if it does not answer.
         """
         answer = self._exchange(verb, args)
         if answer.number == StageError.SEQUENCE and verb != "HELLO":
@@ -187,10 +189,11 @@ class StageLink:
             f"stage at {self.port} does not answer {verb}" + (f": {self.lost}" if self.lost else ""),
             "cable unplugged, board without the sketch, or wrong port",
             "check the USB cable, stage.port and stage.baud; `make flash` puts the sketch on the board",
+            code=ErrorCode.NO_ANSWER,
         )
 
     def _answer(self, sequence: int) -> Reply | None:
-        deadline = time.monotonic() + ANSWER_LIMIT_S
+        deadline = time.monotonic() + ANSWER_TIMEOUT_S
         while (left := deadline - time.monotonic()) > 0:
             try:
                 answer = self._answers.get(timeout=left)
@@ -205,11 +208,11 @@ class StageLink:
         self._write(byte.sent)
 
     def repeat(self) -> None:
-        """Send the last line again: the stage repeats its answer, and how the motion ended, without moving."""
+        """Send the last line again: the stage repeats its answer and the end of its motion, without moving."""
         self._write(self._last_line)
 
     def ask_status_every(self, interval_s: float) -> None:
-        """Ask for the status from now on: the heartbeat of a moving stage. 0 stops asking."""
+        """Request the status at this interval: the heartbeat of a moving stage. 0 stops the requests."""
         self._watch.interval_s = interval_s
 
     def close(self) -> None:
@@ -228,11 +231,11 @@ class StageLink:
             with self._write_lock:
                 self._serial.write(data)
         except OSError as e:
-            self._die(f"writing failed: {e}")
+            self._lose(f"writing failed: {e}")
             unplugged = "cable unplugged, or the board lost power"
             raise StageLostError(f"stage at {self.port} is lost: {e}", unplugged, "check the USB cable") from None
 
-    def _die(self, reason: str) -> None:
+    def _lose(self, reason: str) -> None:
         if self.lost or self._closing:
             return
         self.lost = reason
@@ -247,7 +250,7 @@ class StageLink:
                 data = self._serial.read(1)
                 data += self._serial.read(self._serial.in_waiting)
             except (OSError, TypeError) as e:  # pyserial raises TypeError when the port is closed under a read
-                self._die(f"reading failed: {e}")
+                self._lose(f"reading failed: {e}")
                 return
             now = time.monotonic()
             if data:
@@ -257,7 +260,7 @@ class StageLink:
                     self._take(line + b"\n")
                 buffer = buffer[-MAX_LINE_BYTES:]
             elif (silent_s := self._watch.silent_s(now)) and not self._unread():
-                self._die(f"silent for {silent_s:.1f} s")
+                self._lose(f"silent for {silent_s:.1f} s")
                 return
             if self._watch.is_due(now):
                 try:
@@ -266,7 +269,7 @@ class StageLink:
                     return
 
     def _unread(self) -> bool:
-        """Whether something has come since the last look: it may have been us who had no turn."""
+        """True if bytes arrived since the last read: this thread, not the stage, may have been late."""
         try:
             return self._serial.in_waiting > 0
         except (OSError, TypeError):
@@ -276,7 +279,7 @@ class StageLink:
         try:
             reply = Reply.decode(line.replace(b"\r\n", b"\n"))
         except ProtocolError:
-            self.bad_lines += 1  # the line it may have answered is sent again
+            self.bad_lines += 1  # if it was an answer, its line is retried
             return
         if reply.kind in ("ok", "error"):
             self._answers.put(reply)

@@ -1,4 +1,4 @@
-"""What this program asks of Linux: to be on time, to be watched by systemd, and not to run out of memory."""
+"""Linux services: real-time scheduling, systemd notifications, and a limit on memory."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from pathlib import Path
 
 _PR_SET_PDEATHSIG, _PR_SET_TIMERSLACK = 1, 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
-# Of the trigger thread, and of the others: they share the interpreter's lock with it, so none may be kept from the
-# processor by other programs while it holds that lock.
+# Of the trigger thread and of the others. All share the interpreter's lock, so a thread that holds it must not be
+# preempted by other programs.
 PRIORITY, OTHERS_PRIORITY = 50, 40
-SWITCH_INTERVAL_S = 100e-6  # a thread that computes gives way after 5 ms by default: three pulse periods
-MOST_BYTES = 160 << 20  # the program takes 30 to 60 MB, a subscriber that stands still up to 50
-SPARE_BYTES = 64 << 20  # above what a cut leaves, at least: freed memory does not all go back to the system
+SWITCH_INTERVAL_S = 100e-6  # the default of 5 ms is three pulse periods
+MAX_BYTES = 160 << 20  # the program needs 30 to 60 MB, a subscriber that does not read up to 50
+SPARE_BYTES = 64 << 20  # minimum above the memory left after a cut: not all freed memory returns to the system
 LOOK_S = 0.05
 SETTLE_S = 0.5
 
 
 def prepare_process() -> list[str]:
-    """Lock memory, freeze the garbage collector's heap, let threads take over quickly, ask for real-time scheduling.
+    """Lock memory, freeze the garbage collector's heap, shorten thread switching, request real-time scheduling.
 
-    Returns what was not permitted, one sentence each, with what to do.
+    Returns one sentence for each right that was not granted, with the remedy.
     """
     gc.freeze()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -42,7 +42,7 @@ def prepare_process() -> list[str]:
 
 
 def prepare_thread(priority: int = PRIORITY) -> list[str]:
-    """The trigger thread's priority and the shortest timer slack. Returns what was not permitted, as above."""
+    """Set the trigger thread's priority and the shortest timer slack. Returns as :func:`prepare_process`."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
         return ["timer slack stays at 50 us: pulses may be that late", *_schedule(priority)]
@@ -59,7 +59,7 @@ def _schedule(priority: int) -> list[str]:
 
 
 def notify_systemd(state: str) -> None:
-    """Tell the service manager, if there is one (sd_notify(3)): `READY=1`, or `WATCHDOG=1` to be left alive."""
+    """Notify the service manager, if there is one (sd_notify(3)): `READY=1`, or `WATCHDOG=1` to feed the watchdog."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if address:
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as s:
@@ -67,7 +67,7 @@ def notify_systemd(state: str) -> None:
 
 
 def die_with_parent(signal_number: int) -> None:
-    """Ask the kernel to send this signal when the parent ends: a simulated rig leaves no processes behind."""
+    """Have the kernel send this signal when the parent ends, so that a simulated rig leaves no processes behind."""
     parent = os.getppid()
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal_number, 0, 0, 0)
     if os.getppid() != parent:
@@ -75,43 +75,42 @@ def die_with_parent(signal_number: int) -> None:
 
 
 class MemoryWatch(threading.Thread):
-    """Cuts the network connections at `ports` when they take too much memory; clients connect again.
+    """Cuts the network connections at `ports` when they use too much memory; clients connect again.
 
-    ZeroMQ bounds a frame, but neither a message of many frames nor how much a client may subscribe to, and it takes
-    both in while this program waits for it. The unit's own bound (MemoryMax) would end the program, and a row with it.
-    `warn` takes a sentence for each time.
+    ZeroMQ limits the size of a frame, but neither the frames of a message nor the subscriptions of a client. The unit's
+    own limit (MemoryMax) would end the program and its row. Each cut is reported to `warn`.
     """
 
     def __init__(self, ports: set[int], warn: Callable[[str], object]) -> None:
         super().__init__(name="memory", daemon=True)
         self._ports, self._warn = ports, warn
         self._ended = threading.Event()
-        self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)  # kept: descriptors may run out
-        self._most_bytes = max(MOST_BYTES, self.resident_bytes() + SPARE_BYTES)
+        self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)  # kept open: descriptors may run out
+        self._most_bytes = max(MAX_BYTES, self.resident_bytes() + SPARE_BYTES)
 
     def resident_bytes(self) -> int:
-        """Memory that this process has in use."""
+        """Return the memory in use by this process."""
         return int(os.pread(self._statm, 100, 0).split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     def run(self) -> None:
-        """Look until :meth:`stop`."""
+        """Check the memory regularly until :meth:`stop`."""
         while not self._ended.wait(LOOK_S):
             held = self.resident_bytes()
             if held <= self._most_bytes:
                 continue
-            with suppress(OSError):  # no descriptor is left: again at the next look
+            with suppress(OSError):  # no descriptor left: retried at the next check
                 cut = self._cut_connections()
                 self._ended.wait(SETTLE_S)
                 ctypes.CDLL(None).malloc_trim(0)
                 left = self.resident_bytes()
-                self._most_bytes = max(MOST_BYTES, left + SPARE_BYTES)
+                self._most_bytes = max(MAX_BYTES, left + SPARE_BYTES)
                 self._warn(f"{held >> 20} MiB in memory: {cut} connections were cut, {left >> 20} MiB are left")
 
     def _cut_connections(self) -> int:
-        """Shut this process's TCP connections at the ports down: closing them is ZeroMQ's. Returns how many."""
+        """Shut down the TCP connections at the ports (ZeroMQ closes them). Return their number."""
         cut = 0
         for link in Path("/proc/self/fd").iterdir():
-            with suppress(OSError):  # closed meanwhile, or nobody is connected
+            with suppress(OSError):  # closed meanwhile, or not connected
                 if not str(link.readlink()).startswith("socket:"):
                     continue
                 with socket.socket(fileno=os.dup(int(link.name))) as s:
@@ -122,7 +121,7 @@ class MemoryWatch(threading.Thread):
         return cut
 
     def stop(self) -> None:
-        """End it."""
+        """End the thread."""
         self._ended.set()
         self.join()
         os.close(self._statm)

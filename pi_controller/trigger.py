@@ -1,4 +1,4 @@
-"""The trigger loop: a thread of its own that turns each trigger edge into a burst, and waits for nothing else."""
+"""The trigger loop: a thread that answers each trigger edge with a burst and does nothing else."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from polysight.shared.faults import PiFault
 from polysight.shared.messages import Pulsed, Timing
 from polysight.shared.raster import FIRST_PULSE_DELAY_S
 
-# From edge to first pulse. A fixed delay longer than the usual wake-up keeps the pulses of all positions at the same
-# place behind their edges; 200 us are 4 um of travel at 20 mm/s.
+# From edge to first pulse. A fixed delay, longer than the usual wake-up time, keeps the pulses of all positions at the
+# same distance behind their edges; 200 us are 4 um of travel at 20 mm/s.
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
-LOOK_UP_S = 0.1  # how often the loop looks whether it shall end; edges are not delayed by it
-SILENT_STATUSES = 2  # statuses of the stage without an edge between them ...
-SILENT_POINTS = 2  # ... in which it passed so many points: the wire is off
+LOOK_UP_S = 0.1  # timeout of waiting for an edge, after which the loop checks if it has to stop
+SILENT_STATUSES = 2  # consecutive stage statuses without an edge ...
+SILENT_POINTS = 2  # ... while at least this many points were passed: the trigger wire is off
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A row whose edges are answered: `points` edges are expected, later than `armed_ns`. Jobs differ by identity."""
+    """A row whose edges are answered: `points` edges are expected, later than `armed_ns`. Compared by identity."""
 
     points: int
     spec: BurstSpec
@@ -50,7 +50,7 @@ class BurstSent(NamedTuple):
 
 
 class LoopFault(NamedTuple):
-    """The row of this job (None: any) cannot go on. The loop is disarmed."""
+    """The row of this job (None: every row) has failed; the loop is disarmed."""
 
     job: Job | None
     number: int
@@ -58,7 +58,7 @@ class LoopFault(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """Of the row that was armed last."""
+    """Counts of the row that was armed last."""
 
     edges: int = 0
     bursts: int = 0
@@ -66,17 +66,17 @@ class Counts(NamedTuple):
 
 
 class TriggerLoop:
-    """Answers edges of the armed row with bursts.
+    """Answers the edges of the armed row with bursts.
 
     Parameters
     ----------
     lines
-        The lines; after :meth:`start` they belong to the loop's thread, which closes them at its end.
+        The lines; after :meth:`start` only the loop's thread uses them, and closes them at its end.
     post
-        Takes :class:`BurstSent`, :class:`Pulsed` (a burst that no edge asked for) and :class:`LoopFault`. Must return
+        Called with :class:`BurstSent`, :class:`Pulsed` (a burst without an edge) and :class:`LoopFault`; must return
         at once.
     prepare
-        Run first in the thread, for example to ask for real-time scheduling.
+        Called first in the thread, for example to request real-time scheduling.
     """
 
     def __init__(
@@ -102,38 +102,38 @@ class TriggerLoop:
         self._thread.start()
 
     def arm(self, points: int, spec: BurstSpec) -> Job:
-        """From now on, edges belong to this row."""
+        """Answer the edges of this row from now on."""
         with self._lock:
             self._job = Job(points, spec, self._lines.now_ns())
             self.counts = Counts()
             return self._job
 
     def disarm(self) -> Counts:
-        """Answer no more edges; a running burst ends after its pulse. Returns what was counted since :meth:`arm`."""
+        """Stop answering edges; a running burst ends after its pulse. Return the counts since :meth:`arm`."""
         self._job = None
         with self._lock:
             return self.counts
 
     def send(self, spec: BurstSpec) -> None:
-        """Send one burst that no edge asks for, when the loop next looks up. Only while no row is armed."""
+        """Send one burst without an edge, within LOOK_UP_S. Only while no row is armed."""
         self._bench = spec
 
     def check(self, spec: BurstSpec) -> None:
-        """Raise ConfigError if the lines cannot send such a burst in one piece."""
+        """Raise ConfigError if the lines cannot send this burst in one piece."""
         if isinstance(self._lines, BitLines):
             spi_burst(spec, self._lines.bufsiz)
 
     @property
     def alive(self) -> bool:
-        """Whether the loop still serves its lines."""
+        """True while the thread runs."""
         return self._thread.is_alive()
 
-    def stop(self, limit_s: float = 0.5) -> bool:
-        """End the thread; outputs go low, lines are released. Returns whether it ended within the limit."""
+    def stop(self, timeout_s: float = 0.5) -> bool:
+        """End the thread, set outputs low, release the lines. Return True if it ended within the limit."""
         first = not self._stop.is_set()
         self._stop.set()
         if self._thread.ident is not None:
-            self._thread.join(limit_s)
+            self._thread.join(timeout_s)
         elif first:
             self._lines.close()
         return not self._thread.is_alive()
@@ -151,10 +151,10 @@ class TriggerLoop:
         except DeviceError as e:
             self._fail(None, PiFault.TRIGGER_LINE_LOST, e.what)
         except Exception as e:
-            self._fail(None, PiFault.TRIGGER_LINE_LOST, f"a fault of this program: {e!r}")
+            self._fail(None, PiFault.TRIGGER_LINE_LOST, f"internal error: {e!r}")
             raise
         finally:
-            with contextlib.suppress(DeviceError):  # gone already: the fault was posted above, or the process ends
+            with contextlib.suppress(DeviceError):  # lost already: the fault was posted above, or the process ends
                 self._lines.close()
 
     def _take(self, edge: Edge) -> None:
@@ -173,7 +173,7 @@ class TriggerLoop:
             detail = f"point {point}: {early_us:.0f} us before the burst's end"
             return self._fail(job, PiFault.EDGE_DURING_BURST, detail)
         if point >= job.points:
-            return self._fail(job, PiFault.POINTS_MISMATCH, f"an edge more than the row's {job.points} points")
+            return self._fail(job, PiFault.POINTS_MISMATCH, f"one edge more than the row's {job.points} points")
         start_ns = edge.t_ns + FIRST_PULSE_DELAY_NS
         record = self._sent(send_burst(self._lines, job.spec, start_ns, self._last_rise_ns, lambda: self._is_over(job)))
         self.counts = Counts(point + 1, bursts + (record.pulses > 0), pulses + record.pulses)
@@ -209,16 +209,16 @@ class TriggerLoop:
 
 
 class TriggerWatch:
-    """Notices a stage that passes points of which no edge arrives: the trigger wire is off."""
+    """Detects a trigger wire that is off: the stage passes points and no edges arrive."""
 
     def __init__(self) -> None:
         self._edges, self._points, self._statuses = -1, 0, 0
 
     def is_silent(self, points: int, edges: int) -> bool:
-        """With each status: points passed by the stage, edges seen. Whether the wire is silent."""
+        """Update with a stage status (points passed, edges received); True if the wire is off."""
         if edges != self._edges:
             self._edges, self._points, self._statuses = edges, points, 0
             return False
-        self._points = min(self._points, points)  # the stage counts anew in each row
+        self._points = min(self._points, points)  # the stage counts from 0 in each row
         self._statuses += 1
         return self._statuses >= SILENT_STATUSES and points - max(edges, self._points) >= SILENT_POINTS

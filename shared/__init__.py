@@ -1,9 +1,10 @@
-"""What both halves of the instrument speak. Pure Python: the Pi installs this without numpy.
+"""Code that host, Pi and simulators share. Pure Python: the Pi installs it without numpy.
 
-`config` is the rig file, checked by `tables`; `raster` the grid, the stage and the plan of rows; `geometry` where the
-antennas are. `messages` go between Pi and host over `sockets`; `stage_line` goes to the stage, `faults` numbers what it
-refuses; `wires` connects simulated parts; `files` reads what others made, within limits. `errors` are for people,
-`units` for numbers. Import from the modules.
+Rig file: `config` declares it, `tables` reads and checks it, `raster` has the grid, the stage and the plan of rows,
+`geometry` the positions of the antennas. Communication: `messages` between Pi and host over the sockets of `sockets`,
+`stage_line` between Pi and stage, `faults` for their fault numbers, `wires` between simulated parts. General: `files`
+reads files with a size limit, `errors` and `error_codes` hold the exceptions, `units` conversions. Import from the
+modules; this package has no public names of its own.
 """
 
 __version__ = "0.1.0"

@@ -1,6 +1,6 @@
-"""The checked rig file `instrument.toml`: one typed declaration for every number of the instrument.
+"""Declaration of the rig file `instrument.toml`: every setting of the instrument with its type, limits and rules.
 
-Unknown keys, wrong types and broken rules are refused with the file, the key, the value and the rule.
+`load_instrument` reads it. An unknown key, a wrong type or a broken rule is refused with file, key, value and rule.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
 Vector = tuple[float, float, float]
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
+HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 DEBOUNCE_TICKS_US = 5_000
 _MOSI = {"/dev/spidev0": 10, "/dev/spidev1": 20}  # GPIO lines of a Pi's header
-HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 
 
 class Chirp(Section, frozen=True):
@@ -47,15 +47,15 @@ class Chirp(Section, frozen=True):
         top = self.start_hz + self.slope_hz_per_s * self.ramp_end_us * 1e-6
         require(
             self.start_hz >= 76e9 and top <= 81.1e9,
-            f"{self.start_hz:.4g}..{top:.5g} Hz, of start_hz, slope_hz_per_s and ramp_end_us, must be 76..81 GHz",
+            f"start_hz, slope_hz_per_s and ramp_end_us give {self.start_hz:.4g}..{top:.5g} Hz; it must be 76..81 GHz",
         )
-        none = " or 0: no filter, which only simulated rigs can have"
+        none = ", or 0 for no filter (simulated rigs only)"
         require(self.hpf1_khz in (0.0, *HPF_FIRST_KHZ), f"hpf1_khz must be one of {HPF_FIRST_KHZ}{none}")
         require(self.hpf2_khz in (0.0, *HPF_SECOND_KHZ), f"hpf2_khz must be one of {HPF_SECOND_KHZ}{none}")
         a, b = self.linear_samples
         require(
             a >= 0 and a + 12 <= b <= self.samples,
-            f"linear_samples = [{a}, {b}] must be a range of 12 or more inside 0..samples = {self.samples}",
+            f"linear_samples = [{a}, {b}] must be a range of at least 12 within 0..samples = {self.samples}",
         )
 
     @property
@@ -81,7 +81,7 @@ class Pi(Section, frozen=True):
     trigger_in: GpioLine = 26
     sync_out: tuple[GpioLine, ...] = (22,)
     wiring: Literal["fanout", "lines", "gpiomem", "spi"] = "fanout"
-    one_shot: bool = False  # a hardware one-shot makes the width of the pulses, so that the line's own does not matter
+    one_shot: bool = False  # a hardware one-shot sets the width of the pulses instead of the GPIO line
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
     journal_dir: str = "journal"
@@ -89,9 +89,9 @@ class Pi(Section, frozen=True):
     heartbeat_ms: Count = 500
     trigger_bias: Literal["pull-down", "pull-up", "disabled", "as-is"] = "pull-down"
     trigger_debounce_us: Annotated[int, msgspec.Meta(ge=0)] = 0
-    gpiomem: str = "/dev/gpiomem"  # read, as `wiring = "gpiomem"`, and not driven any more
+    gpiomem: str = "/dev/gpiomem"  # obsolete, like `wiring = "gpiomem"`: accepted, but no longer used
     spi_device: str = "/dev/spidev0.0"
-    host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # how often the host says that it lives; 0: never
+    host_heartbeat_ms: Annotated[int, msgspec.Meta(ge=0)] = 100  # period of the host's heartbeat; 0: none
 
     def __post_init__(self) -> None:
         require(len(self.sync_out) > 0, "sync_out needs at least one line")
@@ -108,7 +108,7 @@ class Pi(Section, frozen=True):
 
 
 class MountStep(Section, frozen=True):
-    """One step of a mount: a shift, or a turn about an axis of the rig."""
+    """One step of a mount: a shift, or a rotation about an axis of the rig."""
 
     shift_mm: Vector | None = None
     turn_deg: float | None = None
@@ -122,7 +122,7 @@ class MountStep(Section, frozen=True):
 
 
 class Antennas(Section, frozen=True):
-    """Antenna positions on one board, board frame, millimetres from RX1."""
+    """Antenna positions in the frame of a board, millimetres from RX1."""
 
     rx_mm: tuple[Vector, ...]
     tx_mm: tuple[Vector, ...]
@@ -154,9 +154,9 @@ class Card(Section, frozen=True):
 class NativeRadar(Section, frozen=True):
     """One board under `radar.control = "native"`.
 
-    It is found by `usb_serial`, or by `usb_path`, the place of its plug ("1-4.2": bus, then the hub's ports). With
-    `die_id` another board there is refused. `ldo_bypass` can destroy a board with 1.3 V on its RF supplies: it needs
-    the board's own USB serial number, again, in `ldo_bypass_acknowledged`.
+    It is identified by `usb_serial`, or by `usb_path`, the position of its plug ("1-4.2": bus, then the hub's ports).
+    With `die_id`, another board at this place is refused. `ldo_bypass` can destroy a board with 1.3 V RF supplies, so
+    it requires the board's USB serial number also in `ldo_bypass_acknowledged`.
     """
 
     usb_serial: str = ""
@@ -170,20 +170,20 @@ class NativeRadar(Section, frozen=True):
 
     @property
     def place(self) -> str:
-        """Where the board is found: its serial number, address, or `usb:` and the path."""
+        """Serial number or address of the board, or `usb:` and its path."""
         return self.usb_serial or f"usb:{self.usb_path}"
 
 
 class Radar(Section, frozen=True):
-    """How the radars are made to wait for the pulses of a row.
+    """How the radars are armed for the pulses of a row; paths are relative to the rig file's folder.
 
-    `endless`: started once, with frames without end; nothing is needed. `line_server`: each board's control server is
-    sent a line before each row; `servers` holds its `address:port` by board name. `native`: this host configures the
-    boards over USB; `native` says by board name where each is, the rest is for all of them. `firmware` is TI's image,
-    downloaded into the boards' RAM at each start ("": what their flash holds); a relative path counts from the rig
-    file's folder. `calibration_dir` keeps what each board's RF init found and gives it back at its next starts ("":
-    each start calibrates anew). `trace_dir` keeps all that passes between host and boards, a file each time a link is
-    opened ("": nothing). `slow_spi` sends words one by one at 1 MHz.
+    `control`: `endless`: another program started the radars with an infinite number of frames. `line_server`: a line
+    is sent to each board's control server before each row; `servers` has its `address:port` by board name. `native`:
+    this host configures the boards over USB; the table `native` identifies each board by name, and the other keys
+    apply to all. `firmware`: TI's image, downloaded to the boards' RAM at each start ("": use the firmware in their
+    flash). `calibration_dir`: folder that stores the results of each board's RF init, which are restored at later
+    starts ("": calibrate at each start). `trace_dir`: folder for logs of all traffic between host and boards, one file
+    for each connection ("": no log). `slow_spi`: send words one by one at 1 MHz.
     """
 
     control: Literal["endless", "line_server", "native"] = "endless"
@@ -209,7 +209,7 @@ class Radar(Section, frozen=True):
 
 
 class Geometry(Section, frozen=True):
-    """Where the object plane is."""
+    """Position of the object plane."""
 
     object_distance_mm: Positive
 
@@ -226,21 +226,20 @@ class Image(Section, frozen=True):
 class Polarimetry(Section, frozen=True):
     """Cross-polar leakage of the receivers as [real, imaginary] amplitude, and the Gaussian filter against speckle.
 
-    Leakage counts as known only with `leakage_std`, the standard error of each of its parts as it was measured. Without
-    it leakage was never measured: `leakage_h` and `leakage_v` are not used, and `leakage_prior` states how large it may
-    be.
+    The leakage is used only with `leakage_std`, the measured standard error of each of its parts. Without it the
+    leakage counts as not measured: `leakage_h` and `leakage_v` are ignored, and `leakage_prior` is its expected size.
     """
 
     leakage_h: tuple[float, float] = (0.0, 0.0)
     leakage_v: tuple[float, float] = (0.0, 0.0)
-    leakage_std: NonNegative | None = None  # standard error of each part of the leakage as measured; None: not measured
-    # rms magnitude of leakage that was never measured, any phase: 0.058 is what amplitudes spread evenly up to 0.1 have
+    leakage_std: NonNegative | None = None
+    # rms magnitude of unmeasured leakage of any phase; 0.058 is the rms of amplitudes distributed uniformly up to 0.1
     leakage_prior: NonNegative = 0.058
     smooth_px: NonNegative = 1.5
 
 
 class CalibrationFiles(Section, frozen=True):
-    """Dated files that `polysight calibrate` wrote; "" for none. Relative paths count from the rig file's folder."""
+    """Files of `polysight calibrate`; "" for none. Paths are relative to the rig file's folder."""
 
     direct_path: str = ""
     hpf: str = ""
@@ -248,17 +247,17 @@ class CalibrationFiles(Section, frozen=True):
 
 
 class Limits(Section, frozen=True):
-    """How much a scan puts up with."""
+    """Limits of a scan: retakes, timeouts, disk space, queue of rows."""
 
     row_retakes: Annotated[int, msgspec.Meta(ge=0)] = 2
     command_timeout_s: Positive = 5.0
     end_of_record_s: Positive = 3.0
     free_disk_bytes: Annotated[int, msgspec.Meta(ge=0)] = 1 << 30
-    rows_waiting: Count = 8  # rows that may wait to be processed before the next one is not begun
+    rows_waiting: Count = 8  # maximum number of rows that wait for processing while another is recorded
 
 
 class Instrument(Section, frozen=True):
-    """The whole rig file."""
+    """All tables of the rig file."""
 
     name: str
     chirp: Chirp
@@ -280,12 +279,12 @@ class Instrument(Section, frozen=True):
         for role in ("transmit", "receive_h", "receive_v"):
             n = sum(b.role == role for b in self.boards)
             require(n == 1, f'boards must hold exactly one with role = "{role}", found {n}')
-        # Where the chip does not debounce (no Pi's does), the kernel looks at the level some ticks after the edge.
+        # No Pi debounces in hardware; the kernel then reads the level some ticks after the edge.
         require(
             self.pi.trigger_debounce_us == 0
             or self.stage.trigger_width_us >= self.pi.trigger_debounce_us + DEBOUNCE_TICKS_US,
-            f"pi.trigger_debounce_us needs stage.trigger_width_us of at least {DEBOUNCE_TICKS_US} us more, or it"
-            " swallows every trigger; 0 switches it off",
+            f"stage.trigger_width_us must exceed pi.trigger_debounce_us by at least {DEBOUNCE_TICKS_US} us, or every"
+            " trigger is suppressed; trigger_debounce_us = 0 disables it",
         )
         names = [b.name for b in self.boards]
         for name in names:  # folders of a scan are named after them
@@ -295,41 +294,44 @@ class Instrument(Section, frozen=True):
         hosts = [(b.host_address, b.data_port) for b in self.boards]
         require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")
         unknown = sorted(set(self.radar.servers) - set(names))
-        require(not unknown, f"radar.servers names no board: {unknown}; the boards are {names}")
+        require(not unknown, f"radar.servers has unknown boards {unknown}; the boards are {names}")
         without = [n for n in names if n not in self.radar.servers]
         require(
             self.radar.control != "line_server" or not without,
-            f'radar.control = "line_server" needs one of radar.servers for every board, none for {without}',
+            f'radar.control = "line_server" needs radar.servers for every board; it is missing for {without}',
         )
         require(
             self.radar.control != "native" or set(self.radar.native) == set(names),
             f'radar.control = "native" needs radar.native for each of the boards {names}, not {[*self.radar.native]}',
         )
-        require(self.transmitter.tx_antenna < len(self.antennas.tx_mm), "boards.tx_antenna is none of antennas.tx_mm")
+        require(
+            self.transmitter.tx_antenna < len(self.antennas.tx_mm),
+            "boards.tx_antenna exceeds the antennas in antennas.tx_mm",
+        )
         misfit = self.stage.misfit(self.grid)
         require(not misfit, misfit)
 
     @property
     def transmitter(self) -> Board:
-        """The board that transmits."""
+        """Transmitting board."""
         return self.by_role("transmit")
 
     @property
     def receivers(self) -> tuple[Board, Board]:
-        """The two boards that make the images: H (s-polarised) first, then V (p-polarised)."""
+        """The two receiving boards: H (s-polarised) first, then V (p-polarised)."""
         return self.by_role("receive_h"), self.by_role("receive_v")
 
     @property
     def recorded(self) -> tuple[Board, ...]:
-        """Boards whose data is recorded."""
+        """Boards that are recorded."""
         return tuple(b for b in self.boards if b.record)
 
     def by_role(self, role: str) -> Board:
-        """The board with this role."""
+        """Return the board with this role."""
         return next(b for b in self.boards if b.role == role)
 
     def by_name(self, name: str) -> Board:
-        """The board with this name. Raises KeyError when there is none."""
+        """Return the board with this name. Raises KeyError if there is none."""
         for b in self.boards:
             if b.name == name:
                 return b
@@ -342,30 +344,30 @@ class Instrument(Section, frozen=True):
 
     @property
     def row_bytes(self) -> int:
-        """Bytes one board sends in one complete row."""
+        """Bytes of one board in one complete row."""
         return self.grid.columns * self.burst.pulses * self.frame_bytes
 
     @property
     def recorded_row_bytes(self) -> int:
-        """Bytes that are recorded of one complete row, of all boards."""
+        """Bytes of all recorded boards in one complete row."""
         return len(self.recorded) * self.row_bytes
 
     @property
     def scan_bytes(self) -> int:
-        """Bytes that are recorded of a whole scan: its raw rows."""
+        """Bytes of raw data of a whole scan."""
         return self.grid.rows * self.recorded_row_bytes
 
 
 def load_instrument(path: Path) -> Instrument:
-    """Read and check a rig file.
+    """Read and check a rig file; its relative paths become absolute.
 
     Raises
     ------
     ConfigError
-        naming file, key, value and rule.
+        with file, key, value and rule.
     """
     rig = decode(read_toml(path), Instrument, str(path))
-    folder = path.parent.resolve()  # from now on the working folder does not matter, nor where a manifest is read
+    folder = path.parent.resolve()
     files = {kind: name and str(folder / name) for kind, name in to_builtins(rig.calibration).items()}
     pi = msgspec.structs.replace(rig.pi, key_dir=str(folder / rig.pi.key_dir))
     paths = ("firmware", "calibration_dir", "trace_dir")

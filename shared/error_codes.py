@@ -1,6 +1,6 @@
-"""The kinds of errors, for programs and tests that must tell them apart without reading sentences.
+"""Codes of errors, so that programs and tests distinguish them without comparing sentences.
 
-The general ones come first and fit most cases; a room adds its own only for an error that callers or tests distinguish.
+The general codes fit most cases; a room adds its own only for an error that callers or tests distinguish.
 """
 
 from __future__ import annotations
@@ -49,3 +49,12 @@ class ErrorCode(StrEnum):
     ORIGIN_FOREIGN = "origin-foreign"  # the request comes from a page of another site
     READ_ONLY = "read-only"
     TOKEN_WRONG = "token-wrong"
+
+    # host/acquisition
+    ROW_INCOMPLETE = "row-incomplete"  # all retakes of a row are used up
+    STAGE_NOT_READY = "stage-not-ready"  # not homed, in a fault, or another host's
+    STAGE_DIFFERS = "stage-differs"  # the Pi's [stage] places rows elsewhere
+
+    # Radar
+    RADAR_RESTARTED = "radar-restarted"
+    RADAR_NO_FIRMWARE = "radar-no-firmware"

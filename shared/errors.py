@@ -1,4 +1,4 @@
-"""Errors that a person can act on: what happened, the likely cause, and what to do."""
+"""Exceptions with three sentences for people (what happened, the likely cause, what to do) and a code for programs."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from polysight.shared.error_codes import ErrorCode
 
 
 class PolysightError(Exception):
-    """Base of every error this project raises on purpose.
+    """Base class of all errors that this project raises.
 
     Parameters
     ----------
     what
-        What happened, naming the file, address, line or value.
+        What happened, with the file, address, line or value.
     why
         The likely cause.
     remedy
         What to do next.
     code
-        The kind of error, for programs and tests; people read the sentences.
+        Kind of error, for programs and tests.
     """
 
     exit_status = 1
@@ -40,12 +40,12 @@ class PolysightError(Exception):
 
 
 def advice(*parts: str) -> str:
-    """What to do, as one sentence: the parts that say something."""
+    """Join the parts of a remedy that are not empty."""
     return "; ".join(part for part in parts if part)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`did you mean 'step_mm'?`, of what is known; "" when nothing is like the word."""
+    """Return `did you mean 'step_mm'?` with the most similar known word; "" if none is similar."""
     near = get_close_matches(word, list(known), n=1, cutoff=0.7)
     return f"did you mean {near[0]!r}?" if near else ""
 
@@ -57,37 +57,37 @@ class ConfigError(PolysightError):
 
 
 class DataError(PolysightError):
-    """A file or folder is not what it claims to be, or is damaged."""
+    """A file or folder is missing, damaged, or of another kind than expected."""
 
     exit_status = 3
 
 
 def no_such(path: Path) -> DataError:
-    """The error for a path at which there is nothing."""
+    """Return the error for a missing file or folder."""
     try:
         near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()])
     except OSError:
-        near = f"{path.parent} is not there either"
+        near = f"{path.parent} does not exist either"
     return DataError(
         f"{path}: does not exist",
         "the path is wrong",
-        near or "give the path of what was recorded or made",
+        near or "give the path of an existing file or folder",
         code=ErrorCode.FILE_MISSING,
     )
 
 
 class ProtocolError(PolysightError):
-    """Bytes that do not follow one of the protocols."""
+    """A message that breaks its protocol."""
 
     exit_status = 4
 
 
 class VersionError(ProtocolError):
-    """The peer speaks another major version."""
+    """The peer uses another major version of the protocol."""
 
 
 class DeviceError(PolysightError):
-    """A device, peer or network hop does not do what it should."""
+    """A device, peer or network hop failed."""
 
     exit_status = 5
 
@@ -97,12 +97,12 @@ def os_error(
     why: str = "the disk is full, a path is wrong, or you may not write there",
     remedy: str = "check the path, its permissions and the free space (df -h)",
 ) -> DeviceError:
-    """What the operating system refused and nobody caught, for a person: commands end with it instead of a trace."""
+    """Turn an OSError into a DeviceError with cause and remedy, so that a command ends without a traceback."""
     where = f"{e.filename}: " if e.filename else ""
     return DeviceError(f"{where}{e.strerror or e}", why, advice(remedy, *getattr(e, "__notes__", ())))
 
 
 class ScanError(PolysightError):
-    """A scan could not be carried out as planned."""
+    """A scan failed, or was refused."""
 
     exit_status = 6

@@ -1,4 +1,4 @@
-"""The one table of numbered faults: stage errors 1..99 (firmware and Python get them from here), Pi faults from 100.
+"""Table of numbered faults: stage errors 1..99, also used by the firmware, and Pi faults from 100.
 
 `python -m polysight.shared.faults` prints the C++ header `arduino_stage/stage_errors.h`.
 """
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Explanation(NamedTuple):
-    """What a number means, its likely cause, and what to do."""
+    """Meaning of a number, likely cause, and remedy."""
 
     what: str
     why: str
@@ -18,7 +18,7 @@ class Explanation(NamedTuple):
 
 
 class StageError(IntEnum):
-    """Numbers behind `error:N` and `alarm:N` on the stage line."""
+    """Numbers of `error:N` and `alarm:N` on the stage line."""
 
     BAD_CRC = 1
     MALFORMED = 2
@@ -42,7 +42,7 @@ class StageError(IntEnum):
 
 
 class PiFault(IntEnum):
-    """Numbers in fault events and refusals of the Pi."""
+    """Numbers of the Pi's fault events and refusals."""
 
     STAGE_LOST = 101
     STAGE_ALARM = 102
@@ -66,15 +66,15 @@ EXPLANATIONS: dict[int, Explanation] = {
     StageError.BAD_CRC: Explanation(
         "the line's checksum is wrong",
         "noise on the serial line, or a lost byte",
-        "sent again by itself; check the USB cable if it stays",
+        "retried automatically; check the USB cable if it happens again",
     ),
     StageError.MALFORMED: Explanation(
-        "the line is not of the protocol's form",
+        "the line does not follow the protocol",
         "another program talks to the stage",
         "close other programs on this port",
     ),
     StageError.LINE_TOO_LONG: Explanation(
-        "the line is longer than the stage accepts", "a lost line end", "sent again by itself"
+        "the line is longer than the stage accepts", "a lost line end", "retried automatically"
     ),
     StageError.UNKNOWN_COMMAND: Explanation(
         "the stage does not know this command",
@@ -91,7 +91,7 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the stage is moving", "a command was sent before the last one ended", "wait, or stop the stage first"
     ),
     StageError.NOT_HOMED: Explanation(
-        "the stage does not know where it is", "it was switched on, or stopped hard", "polysight-pi home"
+        "the stage is not homed", "it was switched on, or stopped abruptly", "polysight-pi home"
     ),
     StageError.SOFT_LIMIT: Explanation(
         "the target is outside the travel",
@@ -103,11 +103,13 @@ EXPLANATIONS: dict[int, Explanation] = {
     ),
     StageError.HEARTBEAT_LOST: Explanation(
         "the Pi was silent while the stage moved",
-        "the Pi program died or was starved",
+        "the Pi program crashed or got no processor time",
         "look at the Pi's log, then polysight-pi home",
     ),
     StageError.LIMIT_SWITCH: Explanation(
-        "a limit switch was hit", "lost steps, or a wrong centre", "move the stage free by hand, then polysight-pi home"
+        "a limit switch was hit",
+        "lost steps, or a wrong centre",
+        "move the stage off the switch by hand, then polysight-pi home",
     ),
     StageError.HOMING_FAILED: Explanation(
         "homing did not find the switch", "switch, wiring or direction", "check the switch and board.h"
@@ -119,14 +121,14 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the stage was stopped by command", "abort", "polysight-pi home, then resume the scan"
     ),
     StageError.TOO_FAST: Explanation(
-        "the speed is above what the firmware can step", "stage.speed_mm_s x steps_per_mm", "lower the speed"
+        "the speed exceeds the firmware's step rate", "stage.speed_mm_s x steps_per_mm is too high", "lower the speed"
     ),
     StageError.NO_RUN_UP: Explanation(
         "no room to accelerate before the first point",
         "the grid reaches the end of the travel",
         "narrow the grid, or raise accel_mm_s2",
     ),
-    StageError.SEQUENCE: Explanation("the sequence number is not the next one", "a line was lost", "say hello again"),
+    StageError.SEQUENCE: Explanation("the sequence number is not the next one", "a line was lost", "send HELLO again"),
     StageError.DISABLED: Explanation(
         "the motors are switched off", "it was reset, or just switched on", "polysight-pi home"
     ),
@@ -140,12 +142,12 @@ EXPLANATIONS: dict[int, Explanation] = {
     ),
     PiFault.EDGE_LOST: Explanation(
         "a trigger edge was lost",
-        "the kernel's edge buffer ran over, or a glitch",
-        "the row is taken again; check the load of the Pi",
+        "the kernel's edge buffer overflowed, or a glitch",
+        "the row is retaken; check the load of the Pi",
     ),
     PiFault.EDGE_DURING_BURST: Explanation(
-        "the next trigger came before the burst had ended",
-        "stage too fast for burst x period",
+        "the next trigger came before the end of the burst",
+        "the stage is too fast for burst x period",
         "lower stage.speed_mm_s or burst.pulses, and make a new scan",
     ),
     PiFault.PULSE_TOO_LONG: Explanation(
@@ -155,28 +157,28 @@ EXPLANATIONS: dict[int, Explanation] = {
     ),
     PiFault.PERIOD_TOO_SHORT: Explanation(
         "two SYNC_IN pulses came closer than the radar allows",
-        "the Pi was late and caught up",
-        "the row is taken again; check the load of the Pi",
+        "the Pi was late and tried to catch up",
+        "the row is retaken; check the load of the Pi",
     ),
     PiFault.TRIGGER_LINE_LOST: Explanation(
-        "the trigger line is gone",
-        "another program took the line, or the chip vanished",
+        "the trigger line is not available",
+        "another program uses the line, or the GPIO chip disappeared",
         "stop polysight-pi on the Pi, `polysight-pi check` there, start it again",
     ),
     PiFault.HOST_LOST: Explanation(
-        "the host is silent", "host program or network down", "polysight resume SCAN on the host"
+        "the host sends no heartbeat", "the host's program or the network is down", "polysight resume SCAN on the host"
     ),
     PiFault.JOURNAL_FULL: Explanation(
         "the journal cannot be written", "disk full or read-only", "free space on the Pi"
     ),
     PiFault.POINTS_MISMATCH: Explanation(
-        "points passed, edges seen and bursts sent differ",
+        "the numbers of points passed, edges detected and bursts sent differ",
         "a lost or spurious trigger edge",
-        "the row is taken again; check the trigger wire",
+        "the row is retaken; check the trigger wire",
     ),
     PiFault.NOT_READY: Explanation(
         "the Pi is not ready for this command",
-        "see the state beside this refusal",
+        "see the state in this refusal",
         "home the stage, end the running row, or clear the fault first",
     ),
     PiFault.BAD_REQUEST: Explanation(
@@ -184,34 +186,34 @@ EXPLANATIONS: dict[int, Explanation] = {
         "host and Pi have different rig files",
         "use the same instrument.toml on both",
     ),
-    PiFault.ABORTED: Explanation("the row was aborted", "asked for by the host or a signal", "resume the scan"),
+    PiFault.ABORTED: Explanation("the row was aborted", "the host or a signal requested it", "resume the scan"),
     PiFault.VERSION: Explanation(
-        "the peer speaks another major version",
+        "the peer uses another major version of the protocol",
         "host and Pi are of different releases",
         "install the same release on both",
     ),
     PiFault.NOT_OWNER: Explanation(
         "the run belongs to another program",
-        "only the program that began the run may command it",
-        "command it there; a person at the Pi uses `polysight-pi take-over`",
+        "only the program that started the run may send commands",
+        "use that program, or `polysight-pi take-over` at the Pi",
     ),
     PiFault.PROGRAM: Explanation(
-        "the Pi's program failed at this command",
-        "a fault of this program, or it hangs",
-        "see `journalctl -u polysight-pi` and report it; systemd starts a hanging program again",
+        "the Pi's program failed to execute this command",
+        "a defect of this program, or it hangs",
+        "see `journalctl -u polysight-pi` and report it; systemd restarts a program that hangs",
     ),
 }
 
 
 def explain(number: int) -> Explanation:
-    """The table's entry, or one that says that the number is unknown."""
+    """Return the entry of a number, or a general one if it is unknown."""
     return EXPLANATIONS.get(
         number, Explanation(f"unknown fault {number}", "a newer peer", "install the same release everywhere")
     )
 
 
 def c_header() -> str:
-    """The stage errors as a C++ header, so that firmware and Python share one table."""
+    """Return the stage errors as a C++ header for the firmware."""
     lines = [
         "// Generated by `python -m polysight.shared.faults`; do not edit. The table is shared/faults.py.",
         "#pragma once",

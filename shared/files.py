@@ -1,4 +1,4 @@
-"""Files that others made, read within limits: no device or pipe keeps a program waiting, no size fills its memory."""
+"""Read files with limits (no pipe blocks the program, no size fills its memory), and write them safely."""
 
 from __future__ import annotations
 
@@ -11,65 +11,74 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
-MOST_JSON_BYTES = 256 << 20
-"""Of a JSON file: a hundred times the manifest of a scan of ten thousand rows."""
+MAX_JSON_BYTES = 256 << 20  # a hundred times the manifest of a scan of ten thousand rows
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file to be read; a pipe without a writer hangs nobody.
+    """Open a regular file for reading. Does not block on a pipe without a writer.
 
     Raises
     ------
     DataError
-        when it is a folder, a device or a pipe.
+        if it is a folder, a device or a pipe.
     OSError
-        when it cannot be opened.
+        if it cannot be opened.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise DataError(f"{path}: is no regular file", "a folder, a device or a pipe", "give a file")
+            raise DataError(
+                f"{path}: is not a regular file",
+                "it is a folder, a device or a pipe",
+                "give a file",
+                code=ErrorCode.FILE_FOREIGN,
+            )
         return os.fdopen(os.dup(descriptor), "rb")
     finally:
         os.close(descriptor)
 
 
-def read_bounded(path: Path, most: int) -> bytes:
-    """A regular file's bytes, `most` at most; devices, pipes and larger files are refused before they are read.
+def read_bounded(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file of at most `max_bytes` bytes.
 
     Raises
     ------
     DataError
-        when it is none, or larger.
+        if it is larger, or not a regular file.
     OSError
-        when it cannot be read.
+        if it cannot be read.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        data = file.read(most + 1) if size <= most else b""
-    if size > most or len(data) > most:
-        size = max(size, len(data))
-        raise DataError(f"{path}: {size} bytes, {most} at most are read", "another file", "check which file it is")
+        data = file.read(max_bytes + 1) if size <= max_bytes else b""
+    if (size := max(size, len(data))) > max_bytes:
+        raise DataError(
+            f"{path}: {size} bytes, the limit is {max_bytes}",
+            "it is another kind of file",
+            "check the path",
+            code=ErrorCode.FILE_TOO_LARGE,
+        )
     return data
 
 
-def read_json(path: Path, most: int = MOST_JSON_BYTES) -> Any:
-    """What a JSON file holds.
+def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Read a JSON file.
 
     Raises
     ------
     ValueError
-        when it is not JSON in UTF-8, or lists in it are nested too deeply to be read.
+        if it is not JSON in UTF-8, or nested too deeply.
     DataError, OSError
-        as :func:`read_bounded`.
+        as `read_bounded`.
     """
-    return parse_json(read_bounded(path, most))
+    return parse_json(read_bounded(path, max_bytes))
 
 
 def parse_json(raw: bytes) -> Any:
-    """What JSON in UTF-8 says. Raises ValueError, also where lists are nested too deeply to be read."""
+    """Parse JSON in UTF-8. Raises ValueError, also if it is nested too deeply."""
     try:
         return json.loads(raw.decode("utf-8"))
     except RecursionError:
@@ -78,7 +87,7 @@ def parse_json(raw: bytes) -> Any:
 
 @contextmanager
 def named(path: Path) -> Iterator[None]:
-    """Within the block, an OSError that names no file (a full disk, while bytes are written) names this one."""
+    """Add this path to an OSError of the block that has none, such as a full disk during a write."""
     try:
         yield
     except OSError as e:
@@ -88,7 +97,7 @@ def named(path: Path) -> Iterator[None]:
 
 
 def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:
-    """Open a file to be written; a link in its place is refused, never written through. Raises OSError."""
+    """Open a file for writing. Raises OSError, also for a symbolic link, through which nothing is written."""
     if path.is_symlink():
-        raise OSError(errno.ELOOP, "it is a link, and files elsewhere are not written to", str(path))
+        raise OSError(errno.ELOOP, "it is a symbolic link; polysight does not write through links", str(path))
     return path.open(mode, buffering)

@@ -1,7 +1,7 @@
-"""Antenna positions in the rig frame, from the mounts written in the rig file.
+"""Antenna positions in the rig frame, computed from the mounts in the rig file.
 
 Rig frame: origin midway between the two board origins, x from TX to RX, y vertical, z towards the object.
-Plain Python on purpose: the Pi half has no numpy, and both host and simulators read the same rig file.
+Plain Python, because the Pi has no numpy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def _turn(v: Vector, axis: str, degrees: float) -> Vector:
 
 
 def place(point_mm: Vector, mount: tuple[MountStep, ...]) -> Vector:
-    """Carry a point of a board through its mount, step by step in the order given; metres, rig frame."""
+    """Transform a point of a board (mm) by the steps of its mount, in order; returns metres in the rig frame."""
     v = point_mm
     for step in mount:
         if step.turn_deg is not None and step.about is not None:
@@ -36,24 +36,24 @@ def place(point_mm: Vector, mount: tuple[MountStep, ...]) -> Vector:
 
 
 def tx_position_m(rig: Instrument) -> Vector:
-    """Position of the transmitting antenna at stage offset zero, metres, rig frame."""
+    """Return the position of the transmitting antenna at stage offset zero, metres, rig frame."""
     board = rig.transmitter
     return place(rig.antennas.tx_mm[board.tx_antenna], board.mount)
 
 
 def rx_positions_m(rig: Instrument, board: Board) -> tuple[Vector, ...]:
-    """Positions of a board's RX antennas at stage offset zero, metres, rig frame; RX1 first."""
+    """Return the positions of a board's RX antennas at stage offset zero, metres, rig frame; RX1 first."""
     return tuple(place(p, board.mount) for p in rig.antennas.rx_mm)
 
 
 def direct_path_m(rig: Instrument, board: Board) -> tuple[float, ...]:
-    """TX to each RX of a board in a straight line, metres."""
+    """Return the length of the straight path from TX to each RX of a board, metres."""
     tx = tx_position_m(rig)
     return tuple(math.dist(tx, rx) for rx in rx_positions_m(rig, board))
 
 
 def specular_midpoint_m(rig: Instrument, board: Board) -> Vector:
-    """Where the object plane mirrors TX into the board's first RX, at stage offset zero."""
+    """Return the point of the object plane that reflects TX into the board's first RX, stage offset zero, metres."""
     tx, rx, z = tx_position_m(rig), rx_positions_m(rig, board)[0], rig.geometry.object_distance_mm / 1e3
     a, b = z - tx[2], z - rx[2]
     t = a / (a + b)
@@ -61,6 +61,6 @@ def specular_midpoint_m(rig: Instrument, board: Board) -> Vector:
 
 
 def incidence_deg(rig: Instrument, board: Board) -> float:
-    """Incidence angle at the specular midpoint of TX and the board's first RX, degrees."""
+    """Return the incidence angle at the specular midpoint of TX and the board's first RX, degrees."""
     tx, mid = tx_position_m(rig), specular_midpoint_m(rig, board)
     return math.degrees(math.atan2(math.hypot(mid[0] - tx[0], mid[1] - tx[1]), mid[2] - tx[2]))

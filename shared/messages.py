@@ -1,8 +1,7 @@
-"""Every message between Pi and host, typed, packed with msgpack, checked on decode.
+"""Messages between Pi and host: typed, packed with msgpack, checked on decoding.
 
-A message is a msgpack map. `type` names it, `version` is "major.minor": another major version is refused by name. New
-fields have defaults and go last, so that old and new programs of one major version understand each other.
-Specification: docs/spec/wire.md.
+A message is a msgpack map with its `type` and its `version`, "major.minor"; another major version is refused. New
+fields have defaults and come last, so that all minor versions are compatible. Specification: docs/spec/wire.md.
 """
 
 from __future__ import annotations
@@ -13,22 +12,24 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgpack
 import msgspec
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ProtocolError, VersionError
 from polysight.shared.raster import RasterPlan, Row
 
 WIRE_VERSION = "1.0"
-MOST_PULSES = 256  # of one `Pulse` ...
-MOST_PULSES_S = 2.0  # ... and how long they may last: it is answered well before anybody's patience ends
-MAX_COMMAND_BYTES = 65_536  # the Pi ends the connection of who sends a longer one
-LONGEST_PROMISE_MS = 10_000  # of a host's heartbeat: who falls silent locks others out for four of them
-# Every field has a type that is finite and bounded: a message that does not fit is refused, and reaches nothing.
+# Limits of `Pulse`; the reply arrives well before the timeout of a command.
+MAX_PULSES_AT_REST = 256
+MAX_PULSES_AT_REST_S = 2.0
+MAX_COMMAND_BYTES = 65_536  # the Pi closes the connection after a longer command
+MAX_HEARTBEAT_MS = 10_000  # of the host; after a missing heartbeat the rig stays locked for four periods
+# Every field has a finite and bounded type; a message outside the limits is refused.
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Seq = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 Index = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
 Take = Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
 Number = Annotated[int, msgspec.Meta(ge=0, lt=1000)]
-MOST_TEXT = 4000
-Text = Annotated[str, msgspec.Meta(max_length=MOST_TEXT)]
+MAX_TEXT = 4000
+Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
 Name = Annotated[str, msgspec.Meta(max_length=120)]
 ScanId = Annotated[str, msgspec.Meta(min_length=1, max_length=120, pattern=r"\A[A-Za-z0-9_-][A-Za-z0-9._-]*\Z")]
 ScanIdOrNone = Annotated[str, msgspec.Meta(max_length=120, pattern=r"\A[A-Za-z0-9._-]*\Z")]
@@ -40,16 +41,15 @@ RowStatus = Literal["done", "aborted", "fault"]
 ExitStatus = Literal["success", "abort", "fail"]
 State = Literal["idle", "homing", "homed", "ready", "running", "held", "done", "fault"]
 GPIOD, GPIOMEM, SPI, WIRES = "gpiod", "gpiomem", "spi", "wires"
-"""The Pi's trigger lines by name (`HelloReply.backend`): outputs through the kernel, by the chip's registers, by an SPI
-controller, simulated."""
+"""Backends of the Pi's SYNC_IN output (`HelloReply.backend`): kernel, GPIO registers, SPI controller, simulated."""
 _HARDWARE = (GPIOD, GPIOMEM, SPI)
 Timing = Literal["", "spi", "one-shot", "program"]
-"""What timed a burst: the SPI controller (widths and spacings), a one-shot behind the line (widths; the program the
-spacings), the program alone; "" in events of before."""
+"""Timing source of a burst: SPI controller (widths and periods), one-shot (widths, periods by the program), program;
+"" in events of earlier releases."""
 
 
 def is_simulated(backend: str) -> bool:
-    """Whether nothing real is driven. A name that is not known counts as simulated: nothing is called measured then."""
+    """Return True if the backend drives no hardware. An unknown backend counts as simulated, to be on the safe side."""
     return backend not in _HARDWARE
 
 
@@ -61,10 +61,10 @@ class _Message(msgspec.Struct, frozen=True, tag_field="type", tag=True, kw_only=
 
 
 class Event(_Message, frozen=True, kw_only=True):
-    """What every event carries.
+    """Fields of every event.
 
     `seq` counts the journalled events of one `scan_id` from 1 without gaps. Heartbeats and stage status are not
-    journalled: they carry the `seq` of the last journalled event, so that a subscriber notices a lost last event.
+    journalled: they have the `seq` of the last journalled event, so that a subscriber detects a lost last event.
     """
 
     scan_id: ScanIdOrNone
@@ -73,7 +73,7 @@ class Event(_Message, frozen=True, kw_only=True):
 
 
 class RunStarted(Event, frozen=True, kw_only=True):
-    """A run was begun or taken up again. The journal lacks the `lost` events before this one; the host has them."""
+    """A run was started or resumed. `lost`: number of earlier events that only the host still has."""
 
     plan: RasterPlan
     resumed: bool = False
@@ -81,21 +81,21 @@ class RunStarted(Event, frozen=True, kw_only=True):
 
 
 class RunStopped(Event, frozen=True, kw_only=True):
-    """A run was ended by the host."""
+    """The host ended a run."""
 
     exit_status: ExitStatus
     reason: Text = ""
 
 
 class RowStarted(Event, frozen=True, kw_only=True):
-    """The stage was told to run a row; `take` counts attempts at this row from 1."""
+    """The stage got the command to run a row; `take` counts the attempts at this row from 1."""
 
     row: Row
     take: Take
 
 
 class RowFinished(Event, frozen=True, kw_only=True):
-    """A row ended. `points` by the stage's count, `edges` seen, `bursts` and `pulses` sent and `timed_by` by the Pi."""
+    """A row ended. `points` is the stage's count; `edges`, `bursts` and `pulses` are those of the Pi."""
 
     row_index: Index
     take: Take
@@ -112,8 +112,8 @@ class RowFinished(Event, frozen=True, kw_only=True):
 class Capture(Event, frozen=True, kw_only=True):
     """One trigger edge and its burst. Times are the Pi's monotonic clock.
 
-    `width_max_ns` is the longest time any pulse may have been high (upper bound), `jitter_ns` the largest deviation of
-    a rising edge from its deadline.
+    `width_max_ns` is an upper bound of the pulse widths, `jitter_ns` the largest deviation of a rising edge from its
+    scheduled time.
     """
 
     row_index: Index
@@ -129,7 +129,7 @@ class Capture(Event, frozen=True, kw_only=True):
 
 
 class StageStatus(Event, frozen=True, kw_only=True):
-    """Where the stage is, in stage millimetres. Not journalled."""
+    """Position of the stage, stage coordinates. Not journalled."""
 
     state: Name
     x_mm: Place
@@ -139,14 +139,14 @@ class StageStatus(Event, frozen=True, kw_only=True):
 
 
 class Heartbeat(Event, frozen=True, kw_only=True):
-    """The Pi is alive. Not journalled."""
+    """Sent by the Pi every `period_ms`. Not journalled."""
 
     state: State
     period_ms: Natural
 
 
 class Fault(Event, frozen=True, kw_only=True):
-    """Something went wrong; the number is in shared/faults.py. The first fault wins and is kept."""
+    """A fault with its number in shared/faults.py. The first fault of a row is kept."""
 
     number: Number
     what: Text
@@ -161,21 +161,21 @@ JOURNALLED = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault)
 
 
 class Command(_Message, frozen=True, kw_only=True):
-    """Every command gets exactly one reply."""
+    """Base class of commands. Every command gets exactly one reply."""
 
 
 class Hello(Command, frozen=True, kw_only=True):
-    """Who is there? Answered with HelloReply in any state."""
+    """Request identity and state. Answered with HelloReply in any state."""
 
     host_release: Name = ""
 
 
 class BeginRun(Command, frozen=True, kw_only=True):
-    """Begin a run, or take up the one with this id again after either side died.
+    """Start a run, or resume the run with this id after a restart of either side.
 
-    `last_seq` is the newest event of it that the host has: the sequence goes on behind it, even when the Pi's journal
-    was lost. `heartbeat_ms`: the host promises an `Alive` so often; 0: it promises nothing. `owner`: a secret of the
-    host's choice; the commands of this run have to bring it.
+    `last_seq` is the run's last event that the host has; the Pi continues the sequence after it, even if its journal
+    was lost. `heartbeat_ms`: period of the host's `Alive` messages; 0: none. `owner`: a secret chosen by the host,
+    required in all commands of this run.
     """
 
     scan_id: ScanId
@@ -185,7 +185,7 @@ class BeginRun(Command, frozen=True, kw_only=True):
     width_us: Micros
     speed_mm_s: Speed
     last_seq: Seq = 0
-    heartbeat_ms: Annotated[int, msgspec.Meta(ge=0, le=LONGEST_PROMISE_MS)] = 0
+    heartbeat_ms: Annotated[int, msgspec.Meta(ge=0, le=MAX_HEARTBEAT_MS)] = 0
     owner: Owner = ""
 
 
@@ -199,7 +199,7 @@ class EndRun(Command, frozen=True, kw_only=True):
 
 
 class Alive(Command, frozen=True, kw_only=True):
-    """The host of this run lives. A row ends with fault 108 when four of the promised heartbeats fail to come."""
+    """Heartbeat of the host. A row ends with fault 108 if four heartbeats in a row are missing."""
 
     scan_id: ScanId
     owner: Owner = ""
@@ -210,7 +210,7 @@ class Home(Command, frozen=True, kw_only=True):
 
 
 class RunRow(Command, frozen=True, kw_only=True):
-    """Run one row of the plan. Accepted at once; RowFinished tells how it ended."""
+    """Run one row of the plan. Accepted at once; RowFinished has the result."""
 
     scan_id: ScanId
     row_index: Index
@@ -225,32 +225,32 @@ class Hold(Command, frozen=True, kw_only=True):
 
 
 class Resume(Command, frozen=True, kw_only=True):
-    """Go on after a hold, on the exact grid."""
+    """Continue after a hold, on the exact grid."""
 
     owner: Owner = ""
 
 
 class Abort(Command, frozen=True, kw_only=True):
-    """Stop the row now. RowFinished with status `aborted` follows when a row was running."""
+    """Stop the row at once. RowFinished with status `aborted` follows if a row was running."""
 
     reason: Text = ""
     owner: Owner = ""
 
 
 class Pulse(Command, frozen=True, kw_only=True):
-    """One burst on SYNC_IN at rest, outside of any run; nothing moves. Answered with Pulsed once it has been sent."""
+    """Send one burst on SYNC_IN at rest, outside of a run. Answered with Pulsed after the burst."""
 
-    pulses: Annotated[int, msgspec.Meta(ge=1, le=MOST_PULSES)]
+    pulses: Annotated[int, msgspec.Meta(ge=1, le=MAX_PULSES_AT_REST)]
     period_us: Micros
     width_us: Micros
 
 
 class Status(Command, frozen=True, kw_only=True):
-    """Answered with StatusReply in any state."""
+    """Request the status. Answered with StatusReply in any state."""
 
 
 class Replay(Command, frozen=True, kw_only=True):
-    """Journalled events of a scan from `from_seq` on, at most `limit` of them."""
+    """Request journalled events of a scan from `from_seq` on, at most `limit`."""
 
     scan_id: ScanId
     from_seq: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
@@ -263,7 +263,7 @@ AnyCommand = Hello | BeginRun | EndRun | Alive | Home | RunRow | Hold | Resume |
 
 
 class HelloReply(_Message, frozen=True, kw_only=True):
-    """Who answers, and in which state. Not told: 0 of the wall clock, {} of `stage` (`shared.raster.Stage.placing`)."""
+    """Identity and state of the Pi. Older releases send 0 for `t_unix_ns` and {} for `stage` (`placement_settings`)."""
 
     pi_release: Name
     firmware: Name
@@ -277,13 +277,13 @@ class HelloReply(_Message, frozen=True, kw_only=True):
 
 
 class Accepted(_Message, frozen=True, kw_only=True):
-    """The command was taken; `state` is the state after it."""
+    """The command was accepted; `state` is the state after it."""
 
     state: State
 
 
 class Refused(_Message, frozen=True, kw_only=True):
-    """The command was not taken, and nothing changed."""
+    """The command was refused, and changed nothing."""
 
     number: Number
     what: Text
@@ -292,8 +292,9 @@ class Refused(_Message, frozen=True, kw_only=True):
 
 
 class StatusReply(_Message, frozen=True, kw_only=True):
-    """Everything the Pi knows about itself. `row_index` is -1 when no row runs. `lost_x_mm`, `lost_y_mm`: how far the
-    motors were off when the last homing met the switches, since the homing before it.
+    """Status of the Pi. `row_index` is -1 if no row is running.
+
+    `lost_x_mm`, `lost_y_mm`: position error found by the last homing at the switches, since the homing before it.
     """
 
     state: State
@@ -313,14 +314,14 @@ class StatusReply(_Message, frozen=True, kw_only=True):
 
 
 class ReplayReply(_Message, frozen=True, kw_only=True):
-    """Events in order; `last_seq` is the newest in the journal of that scan (0 when there is none)."""
+    """Events in order; `last_seq` is the last one in the journal of that scan (0 if there is none)."""
 
     events: Annotated[list[AnyEvent], msgspec.Meta(max_length=10_000)]
     last_seq: Seq
 
 
 class Pulsed(_Message, frozen=True, kw_only=True):
-    """The burst of a `Pulse`: pulses sent, the longest one (upper bound), the latest edge; `fault` as of a row's."""
+    """Result of `Pulse`: pulses sent, upper bound of their widths, largest delay of an edge, fault number."""
 
     pulses: Natural
     width_max_ns: Natural
@@ -335,11 +336,8 @@ M = TypeVar("M")
 
 
 def pack(message: AnyEvent | AnyCommand | AnyReply) -> bytes:
-    """A message as msgpack bytes."""
-    packed = msgpack.packb(msgspec.to_builtins(message), use_bin_type=True)
-    if packed is None:
-        raise ProtocolError(f"{type(message).__name__} cannot be packed")
-    return packed
+    """Pack a message as msgpack."""
+    return msgpack.packb(msgspec.to_builtins(message), use_bin_type=True) or b""
 
 
 def _unpack(raw: bytes, kind: Any, what: str) -> Any:
@@ -347,21 +345,25 @@ def _unpack(raw: bytes, kind: Any, what: str) -> Any:
         node = msgpack.unpackb(raw, raw=False, strict_map_key=True)
     except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as e:
         raise ProtocolError(
-            f"{what} of {len(raw)} bytes is not msgpack: {str(e)[:200]}", "another program on this port?"
+            f"{what} of {len(raw)} bytes is not msgpack: {str(e)[:200]}",
+            "another program uses this port",
+            code=ErrorCode.MESSAGE_INVALID,
         ) from None
     version = node.get("version") if isinstance(node, dict) else None
     if isinstance(version, str) and version.partition(".")[0] != WIRE_VERSION.partition(".")[0]:
         raise VersionError(
-            f"{what} {str(node.get('type'))[:40]!r} has wire version {version[:20]},"
-            f" this program speaks {WIRE_VERSION}",
-            "host and Pi are of different releases",
+            f"{what} {str(node.get('type'))[:40]!r} has wire version {version[:20]}, this program uses {WIRE_VERSION}",
+            "host and Pi have different releases",
             "install the same release on both",
+            code=ErrorCode.VERSION_UNSUPPORTED,
         )
     try:
         return msgspec.convert(node, kind)
     except msgspec.ValidationError as e:
         raise ProtocolError(
-            f"{what} does not follow its declaration: {str(e)[:300]}", "host and Pi are of different releases"
+            f"{what} has invalid fields: {str(e)[:300]}",
+            "host and Pi have different releases",
+            code=ErrorCode.MESSAGE_INVALID,
         ) from None
 
 
@@ -370,18 +372,20 @@ def unpack_event(raw: bytes) -> AnyEvent:
     return _unpack(raw, AnyEvent, "event")
 
 
-def pack_kept(event: AnyEvent) -> bytes:
-    """An event as files keep it: its map with a last key `crc`, the CRC-32 of the map packed without it."""
+def pack_with_crc(event: AnyEvent) -> bytes:
+    """Pack an event for a file: its map with a last key `crc`, the CRC-32 of the map without it."""
     raw = pack(event)
     return msgpack.packb({**msgpack.unpackb(raw), "crc": zlib.crc32(raw)}) or b""
 
 
-def unpack_kept(raw: bytes) -> AnyEvent:
-    """Decode and check an event of a file. Raises ProtocolError."""
+def unpack_with_crc(raw: bytes) -> AnyEvent:
+    """Decode and check an event from a file. Raises ProtocolError."""
     event = unpack_event(raw)
     node = msgpack.unpackb(raw)
     if node.pop("crc", None) != zlib.crc32(msgpack.packb(node) or b""):
-        raise ProtocolError(f"the CRC of event {event.seq} is wrong", "damaged")
+        raise ProtocolError(
+            f"the CRC of event {event.seq} is wrong", "the file is damaged", code=ErrorCode.FILE_DAMAGED
+        )
     return event
 
 

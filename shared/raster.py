@@ -1,4 +1,4 @@
-"""How the stage walks the grid: `[grid]`, `[stage]` and `[burst]` of the rig file, and the serpentine plan of rows.
+"""Grid, stage and burst of the rig file (`[grid]`, `[stage]`, `[burst]`), and the serpentine plan of rows.
 
 Offsets are in the rig frame, in millimetres, zero = middle of the grid (docs/spec/scan-folder.md). Limits of SYNC_IN
 are those of the AWR2243 (TI mmWave Radar Interface Control, frame configuration; data sheet).
@@ -11,28 +11,29 @@ from typing import Annotated
 
 import msgspec
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import Count, NonNegative, Positive, Section, require
 from polysight.shared.units import us_to_ns
 
 FIRST_PULSE_DELAY_S = 200e-6
-"""From a trigger edge to its first SYNC_IN pulse: the Pi's fixed delay, longer than its usual wake-up."""
-MIN_PERIOD_US = 300.0  # from one rising edge to the next: an earlier one is a fatal fault of the RF core
+"""Fixed delay from a trigger edge to its first SYNC_IN pulse, longer than the usual wake-up time of the Pi."""
+MIN_PERIOD_US = 300.0  # between rising edges; a shorter period causes a fatal fault of the RF core
 WIDTH_US = (0.025, 4.0)
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
 MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
 _Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
-_Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # NaN and infinities are refused, too
-_PLACING = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
+_Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # also refuses NaN and infinities
+_PLACEMENT_KEYS = ("steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2")
 
 
 class Burst(Section, frozen=True):
     """SYNC_IN pulses of one position; each starts one frame of `chirps` chirps, `chirp_us` from one to the next.
 
-    One chirp a frame needs no `chirp_us`. One pulse of many chirps (`pulses = 1, chirps = 16`) is a shorter burst,
-    whose trigger uncertainty is drawn once; radars of `control = "native"` are told so, others must be configured for
-    it.
+    One chirp a frame needs no `chirp_us`. One pulse with many chirps (`pulses = 1, chirps = 16`) is a shorter burst
+    with a single trigger uncertainty; radars with `control = "native"` are configured for it, others must be configured
+    by hand.
     """
 
     pulses: Count
@@ -48,11 +49,13 @@ class Burst(Section, frozen=True):
         )
         shortest, longest = WIDTH_US
         require(shortest <= self.width_us <= longest, f"width_us must be {WIDTH_TEXT} (SYNC_IN pulse of the AWR2243)")
-        require(self.chirps == 1 or self.chirp_us > 0, "chirps of a frame need chirp_us, from one to the next")
+        require(
+            self.chirps == 1 or self.chirp_us > 0, "several chirps a frame need chirp_us, the time from one to the next"
+        )
         frame_us = self.chirps * self.chirp_us + MIN_PERIOD_US
         require(
             self.chirps == 1 or frame_us <= self.period_us,
-            f"period_us must be at least {frame_us:g} us: {self.chirps} chirps and {MIN_PERIOD_US:g} us after them",
+            f"period_us must be at least {frame_us:g} us: {self.chirps} chirps and a pause of {MIN_PERIOD_US:g} us",
         )
 
     def __str__(self) -> str:
@@ -62,12 +65,12 @@ class Burst(Section, frozen=True):
 
     @property
     def chirps_a_position(self) -> int:
-        """Chirps of all frames of a position."""
+        """Number of chirps of a position, over all its frames."""
         return self.pulses * self.chirps
 
     @property
     def chirp_times_s(self) -> tuple[float, ...]:
-        """When each chirp of a position begins, seconds after the first pulse."""
+        """Start times of a position's chirps, seconds after the first pulse."""
         return tuple(
             1e-6 * (pulse * self.period_us + chirp * self.chirp_us)
             for pulse in range(self.pulses)
@@ -100,27 +103,27 @@ class Stage(Section, frozen=True):
     centre_x_mm: NonNegative = 400.0
     centre_y_mm: NonNegative = 250.0
     backlash_mm: NonNegative = 0.0
-    home_after_scan: bool = False  # counts lost steps; a stage without switches takes any place for its corner
+    home_after_scan: bool = False  # measures lost steps; needs limit switches
 
     def __post_init__(self) -> None:
         require(self.centre_x_mm <= self.travel_x_mm, "centre_x_mm must lie within travel_x_mm")
         require(self.centre_y_mm <= self.travel_y_mm, "centre_y_mm must lie within travel_y_mm")
 
     @property
-    def placing(self) -> dict[str, float]:
-        """The values by which rows are placed: they come from the Pi's rig file, and must be those of the host's."""
-        return {key: float(getattr(self, key)) for key in _PLACING}
+    def placement_settings(self) -> dict[str, float]:
+        """Settings that determine the position of rows; they must be equal in the rig files of Pi and host."""
+        return {key: float(getattr(self, key)) for key in _PLACEMENT_KEYS}
 
     def run_up_mm(self, step_mm: float, speed_mm_s: float | None = None) -> float:
-        """From rest to a row's first point: the ramp v^2 / 2a, and a step (or the backlash) at constant speed.
+        """Return the distance from rest to a row's first point: v^2 / 2a, plus a step or the backlash.
 
-        `speed_mm_s`: of the row; `[stage]`'s own when None. docs/spec/stage-line.md, "A row".
+        `speed_mm_s`: speed of the row; default: the stage's. See docs/spec/stage-line.md, "A row".
         """
         speed = self.speed_mm_s if speed_mm_s is None else speed_mm_s
         return speed**2 / (2 * self.accel_mm_s2) + max(step_mm, self.backlash_mm)
 
     def misfit(self, raster: Grid | RasterPlan, speed_mm_s: float | None = None) -> str:
-        """Why a raster with its run-up does not fit the travel around the centre; "" when it does."""
+        """Explain why a raster with its run-up exceeds the travel around the centre; return "" if it fits."""
         for axis, n, step, margin, centre, travel in (
             ("x", raster.columns, raster.step_x_mm, self.run_up_mm(raster.step_x_mm, speed_mm_s),
              self.centre_x_mm, self.travel_x_mm),
@@ -151,21 +154,21 @@ class Row(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def direction(self) -> int:
-        """+1 when the stage moves towards +x, else -1."""
+        """+1 if the stage moves towards +x, otherwise -1."""
         return 1 if self.step_mm > 0 else -1
 
     def column(self, i: int) -> int:
-        """Grid column (0 = smallest x) of the i-th point met in this row."""
+        """Return the grid column (0 = smallest x) of the i-th point in the order of the scan."""
         return i if self.direction > 0 else self.points - 1 - i
 
     @property
     def x_mm(self) -> tuple[float, ...]:
-        """Nominal x offset of every point, in the order they are met (plain numbers: the Pi has no NumPy)."""
+        """Nominal x offset of every point in the order of the scan, as plain numbers because the Pi has no NumPy."""
         return tuple(self.x_start_mm + i * self.step_mm for i in range(self.points))
 
 
 class RasterPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A grid walked row by row. Build with :func:`plan_raster`."""
+    """A grid as a sequence of rows. Build it with `plan_raster`."""
 
     columns: _Steps
     rows: _Steps
@@ -173,7 +176,7 @@ class RasterPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     step_y_mm: _Offset
 
     def row(self, index: int) -> Row:
-        """Row `index` (0-based from the smallest y). Raises IndexError outside the plan."""
+        """Return row `index` (0-based from the smallest y). Raises IndexError outside the plan."""
         if not 0 <= index < self.rows:
             raise IndexError(f"row {index} is outside the plan's {self.rows} rows")
         half_width = (self.columns - 1) / 2 * self.step_x_mm
@@ -191,43 +194,38 @@ class RasterPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def plan_raster(grid: Grid) -> RasterPlan:
-    """The plan of a configured grid."""
+    """Return the plan of a grid."""
     return RasterPlan(grid.columns, grid.rows, grid.step_x_mm, grid.step_y_mm)
 
 
 def burst_duration_s(burst: Burst) -> float:
-    """Time from the first to the last chirp of a position, in seconds."""
+    """Return the time from the first to the last chirp of a position, seconds."""
     return burst.chirp_times_s[-1]
 
 
 def burst_middle_s(burst: Burst) -> float:
-    """Time from a trigger edge to the middle of its burst, in seconds."""
+    """Return the time from a trigger edge to the middle of its burst, seconds."""
     return FIRST_PULSE_DELAY_S + burst_duration_s(burst) / 2
 
 
 def check_burst_fits(grid: Grid, burst: Burst, stage: Stage) -> None:
-    """Refuse a plan whose burst does not end before the next trigger point.
-
-    Raises
-    ------
-    ConfigError
-        naming both times.
-    """
+    """Raise ConfigError if a burst does not end before the next trigger point."""
     between_s = grid.step_x_mm / stage.speed_mm_s
     burst_s = burst.pulses * burst.period_us * 1e-6
     if burst_s > between_s:
         raise ConfigError(
             f"burst of {burst.pulses} pulses x {burst.period_us} us lasts {burst_s * 1e3:.2f} ms, but the stage passes"
             f" a point every {between_s * 1e3:.2f} ms",
-            "stage.speed_mm_s, grid.step_x_mm and burst do not go together",
+            "stage.speed_mm_s, grid.step_x_mm and burst contradict each other",
             "slow the stage, widen the step, or send fewer or faster pulses",
+            code=ErrorCode.VALUES_CONFLICT,
         )
 
 
 def mean_burst_travel_mm(burst: Burst, stage: Stage) -> float:
-    """Distance from a trigger point to the mean position of its burst, along the direction of motion.
+    """Return the distance from a trigger point to the mean position of its burst, in the direction of motion.
 
-    The stage does not stop: 16 pulses 1.5 ms apart at 20 mm/s, the first 0.2 ms after the edge, are centred 0.229 mm
-    after the point.
+    The stage moves during a burst: 16 pulses every 1.5 ms at 20 mm/s, the first 0.2 ms after the edge, have their
+    centre 0.229 mm after the point.
     """
     return stage.speed_mm_s * burst_middle_s(burst)

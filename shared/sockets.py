@@ -1,4 +1,4 @@
-"""Construction of every ZeroMQ socket, in one place: time-outs, limits, and CURVE on anything that is not loopback."""
+"""Create the ZeroMQ sockets of host and Pi, with timeouts, limits, and CURVE keys on addresses other than loopback."""
 
 from __future__ import annotations
 
@@ -9,32 +9,36 @@ from typing import Any
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.messages import MAX_COMMAND_BYTES
 
 Socket = zmq.Socket[bytes]
 HOST_KEYS = ("pi.key", "host.key_secret")
-"""What the host needs of the keys that were made on the Pi. `pi.key_secret` never leaves the Pi."""
+"""Key files that the host needs, made on the Pi. `pi.key_secret` never leaves the Pi."""
 PI_KEYS = ("pi.key_secret",)
 EVENT_TOPIC = b"event"
 MAX_SUBSCRIPTION_BYTES = 1024
-SEND_LIMIT_MS = 200
-HANDSHAKE_LIMIT_MS = 5000  # who connects and says nothing holds a descriptor for so long
+SEND_TIMEOUT_MS = 200
+HANDSHAKE_TIMEOUT_MS = 5000  # then a connection without a handshake is closed
 
 
 def host_of(address: str) -> str:
-    """The host part of `tcp://host:port`. Raises ConfigError for another form."""
+    """Return the host of `tcp://host:port`. Raises ConfigError for another form."""
     scheme, _, rest = address.partition("://")
     host, _, port = rest.rpartition(":")
     if scheme != "tcp" or not host or not (port == "*" or port.isdigit()):
         raise ConfigError(
-            f"address {address!r} is not of the form tcp://host:port", "a typing error", "correct it in instrument.toml"
+            f"address {address!r} is not of the form tcp://host:port",
+            "a typing error",
+            "correct it in instrument.toml",
+            code=ErrorCode.VALUE_INVALID,
         )
     return host.strip("[]")
 
 
 def is_loopback(address: str) -> bool:
-    """Whether an address never leaves this machine."""
+    """Return True if the address is reachable only from this machine."""
     host = host_of(address)
     if host == "localhost":
         return True
@@ -45,10 +49,10 @@ def is_loopback(address: str) -> bool:
 
 
 def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
-    """CURVE on a socket whose address is not loopback.
+    """Enable CURVE on a socket whose address is not loopback. Raises ConfigError without usable keys.
 
-    `key_dir` holds PI_KEYS or HOST_KEYS as zmq.auth writes them. Which clients' keys the server takes is for its
-    :func:`authenticator`; an address that is not loopback is refused without keys.
+    `key_dir` has PI_KEYS or HOST_KEYS in the format of zmq.auth. The server's `authenticator` decides which clients
+    are accepted.
     """
     if is_loopback(address):
         return
@@ -67,11 +71,12 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
             socket.curve_serverkey = load_certificate(key_dir / HOST_KEYS[0])[0]
     except (OSError, ValueError) as e:
         raise ConfigError(
-            f"{address} is not loopback and there are no usable CURVE keys: {e}",
+            f"{address} is not loopback, and no CURVE keys are usable: {e}",
             f"{key_dir} lacks {' or '.join(needed)}, or they belong to another user",
             "make keys with `polysight-pi keys`, or use a loopback address"
             if server
             else f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {key_dir}",
+            code=ErrorCode.FILE_MISSING,
         ) from None
 
 
@@ -97,10 +102,11 @@ def _make(
         socket.close()
         raise DeviceError(
             f"{address}: {e.strerror}" if hasattr(e, "strerror") else f"{address}: {e}",
-            "another program holds this port"
+            "another program uses this port"
             if e.errno == zmq.EADDRINUSE
             else "the address does not exist on this machine",
             "stop the other program (ss -ltnp shows it), or change the address in instrument.toml",
+            code=ErrorCode.BUSY if e.errno == zmq.EADDRINUSE else ErrorCode.OTHER,
         ) from None
     except ConfigError:
         socket.close()
@@ -109,23 +115,23 @@ def _make(
 
 
 def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """PUB socket of the Pi, bound."""
+    """Create the Pi's PUB socket, bound."""
     options: dict[int, int | bytes] = {zmq.SNDHWM: 100_000, zmq.MAXMSGSIZE: MAX_SUBSCRIPTION_BYTES}
-    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_LIMIT_MS}
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS}
     return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
 
 
 def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """SUB socket of the host, connected, subscribed to all events, with a deep queue."""
+    """Create the host's SUB socket, connected, subscribed to all events, with a long queue."""
     return _make(
         context, zmq.SUB, address, key_dir, bind=False, options={zmq.RCVHWM: 100_000, zmq.SUBSCRIBE: EVENT_TOPIC}
     )
 
 
 def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """SUB socket of somebody who only looks on: a short queue, and the Pi forgets it when it falls silent.
+    """Create the SUB socket of a program that only displays events: a short queue, and a heartbeat of ZeroMQ.
 
-    The Pi queues for each subscriber; ZeroMQ's own heartbeat ends the connection of one that is stopped or cut off.
+    The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that hangs.
     """
     heartbeat: dict[int, int | bytes] = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}
     options = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC, **heartbeat}
@@ -133,50 +139,44 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 
 
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """ROUTER socket of the Pi, bound: it answers REQ sockets. Who sends a longer message than a command is cut off."""
+    """Create the Pi's ROUTER socket, bound, for REQ sockets; a message over the limit closes its connection."""
     options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
-    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_LIMIT_MS}
+    options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS}
     return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
 
 
 def authenticator(context: zmq.Context[Any]) -> Socket:
-    """REP socket that ZeroMQ asks about each client that connects by CURVE to a socket of this context (RFC 27)."""
+    """Create the REP socket to which ZeroMQ sends each CURVE client of this context for approval (ZAP, RFC 27)."""
     socket: Socket = context.socket(zmq.REP)
     socket.bind("inproc://zeromq.zap.01")
     return socket
 
 
-class Refusals:
-    """Tells a server that refuses this client from one that is silent.
-
-    Parameters
-    ----------
-    socket
-        The client's, before or after it has connected.
-    """
+class HandshakeMonitor:
+    """Detect that a server refused this client's key, as opposed to not answering. `socket`: the client's."""
 
     def __init__(self, socket: Socket) -> None:
         self._socket = socket
         self._monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
         self._refused = False
 
-    def seen(self) -> bool:
-        """Whether the server has refused this client's key, or this client the server's, until now."""
+    def refused(self) -> bool:
+        """Return True if so far the server refused this client's key, or this client the server's."""
         while self._monitor.poll(0):
             recv_monitor_message(self._monitor)
             self._refused = True
         return self._refused
 
     def close(self) -> None:
-        """Let go of the monitor. Before the socket is closed."""
+        """Close the monitor; call it before closing the socket."""
         self._socket.disable_monitor()
         self._monitor.close()
 
 
 def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """REQ socket of the host, connected. Relaxed, so that a lost reply does not wedge it.
+    """Create the host's REQ socket, connected; relaxed, so that it can send again after a lost reply.
 
-    A socket that the server refused has nobody to send to: its `send` raises zmq.Again, soon.
+    If the server refused the handshake, `send` raises zmq.Again after `SEND_TIMEOUT_MS`.
     """
-    options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1, zmq.SNDTIMEO: SEND_LIMIT_MS}
+    options: dict[int, int | bytes] = {zmq.REQ_RELAXED: 1, zmq.REQ_CORRELATE: 1, zmq.SNDTIMEO: SEND_TIMEOUT_MS}
     return _make(context, zmq.REQ, address, key_dir, bind=False, options=options)

@@ -1,6 +1,6 @@
-"""The stage line protocol: numbered, checksummed ASCII lines, and single bytes that act while the stage moves.
+"""Protocol of the stage line: ASCII lines with sequence number and CRC, and single bytes that act during motion.
 
-Specification: docs/spec/stage-line.md. The firmware's half is arduino_stage/protocol.cpp.
+Specification: docs/spec/stage-line.md. The firmware's counterpart is arduino_stage/protocol.cpp.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from polysight.shared.errors import ProtocolError
 PROTOCOL_VERSION = 2
 MAX_LINE_BYTES = 96
 MAX_SEQUENCE = 65535
-HOMING_LIMIT_S = 300.0  # then the Pi gives up and says why; whoever waits for the Pi waits longer
+HOMING_TIMEOUT_S = 300.0  # of the Pi; programs that wait for the Pi need a longer one
 _VALUE = re.compile(r"-?[0-9]{1,10}")
 _COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")
 _FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
 
 
 class Immediate(IntEnum):
-    """Bytes taken in the receive interrupt, even while moving. None is one bit away from a byte used in lines.
+    """Bytes that the stage handles in its receive interrupt, even during motion.
 
-    RESUME, which makes a stage move, is three bits away from every other byte, and has to come twice.
+    Each differs in at least two bits from every byte of a line. RESUME, which starts motion, differs in three bits
+    from every other byte and must be sent twice.
     """
 
     HOLD = 0x81
@@ -35,12 +36,12 @@ class Immediate(IntEnum):
 
     @property
     def sent(self) -> bytes:
-        """What goes over the line."""
+        """Bytes to send."""
         return bytes([self]) * (2 if self is Immediate.RESUME else 1)
 
 
 class Parameter(IntEnum):
-    """First argument of `SET`: which value of the stage is set. The unit is that of the second argument."""
+    """First argument of `SET`: the setting of the stage; the comment has the unit of the second argument."""
 
     ACCEL = 0  # steps/s^2
     HEARTBEAT = 1  # ms of silence after which a moving stage stops
@@ -48,16 +49,16 @@ class Parameter(IntEnum):
     TRAVEL_X = 3  # steps, soft limit 0..TRAVEL_X
     TRAVEL_Y = 4  # steps
     TRAVEL_SPEED = 5  # steps/s, between rows
-    BACKLASH = 6  # steps of take-up: rows come from below and run up at least so far; 0 = off
+    BACKLASH = 6  # steps; rows are approached from below, with at least this run-up; 0 = off
 
 
 def crc16(body: bytes) -> int:
-    """CRC-16/XMODEM (polynomial 0x1021, start 0), the same as avr-libc's _crc_xmodem_update."""
+    """Compute CRC-16/XMODEM (polynomial 0x1021, start 0), as avr-libc's _crc_xmodem_update."""
     return binascii.crc_hqx(body, 0)
 
 
 def seal(body: str) -> bytes:
-    """Append `*CRC` and the line end. Raises ProtocolError when the line is too long or not plain ASCII."""
+    """Append `*CRC` and the line end. Raises ProtocolError if the line is too long or not plain ASCII."""
     try:
         raw = body.encode("ascii")
     except UnicodeEncodeError:
@@ -71,13 +72,7 @@ def seal(body: str) -> bytes:
 
 
 def unseal(line: bytes) -> str:
-    """Check length, line end and CRC, and return the body.
-
-    Raises
-    ------
-    ProtocolError
-        for anything that is not exactly what :func:`seal` writes.
-    """
+    """Check length, line end and CRC, and return the body. Raises ProtocolError for a line not made by `seal`."""
     if len(line) > MAX_LINE_BYTES:
         raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}")
     if len(line) < 6 or line[-1:] != b"\n" or line[-6:-5] != b"*":
@@ -91,14 +86,14 @@ def unseal(line: bytes) -> str:
 
 
 class Command(msgspec.Struct, frozen=True):
-    """Host to stage: `N<sequence> <VERB> [integers]`."""
+    """Command to the stage: `N<sequence> <VERB> [integers]`."""
 
     sequence: int
     verb: str
     args: tuple[int, ...] = ()
 
     def encode(self) -> bytes:
-        """The sealed line. Raises ProtocolError when a part is out of the protocol's range."""
+        """Return the sealed line. Raises ProtocolError if a value is out of the protocol's range."""
         if not 0 <= self.sequence <= MAX_SEQUENCE:
             raise ProtocolError(f"sequence {self.sequence} is outside 0..{MAX_SEQUENCE}")
         if not re.fullmatch(r"[A-Z]+", self.verb):
@@ -121,14 +116,14 @@ class Command(msgspec.Struct, frozen=True):
 
 
 class Reply(msgspec.Struct, frozen=True):
-    """Stage to host.
+    """Reply of the stage.
 
     `kind` is one of
 
     * `banner`: boot; fields fw, proto
-    * `ok`: command `sequence` accepted (motion) or done (others); fields as the command defines
-    * `error`: command refused with `number`; `sequence` is None when the line could not be read
-    * `done`: motion command `sequence` has ended; a row has fields points, pulses, x, y
+    * `ok`: command `sequence` accepted (motion) or executed (others); fields depend on the command
+    * `error`: command refused with `number`; `sequence` is None if the line could not be read
+    * `done`: motion command `sequence` ended; a row has fields points, pulses, x, y
     * `alarm`: latched fault `number`
     * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits
     """
@@ -139,7 +134,7 @@ class Reply(msgspec.Struct, frozen=True):
     fields: dict[str, str] = {}
 
     def encode(self) -> bytes:
-        """The sealed line."""
+        """Return the sealed line."""
         tag = "-" if self.sequence is None else str(self.sequence)
         head = {
             "banner": "polysight-stage",
@@ -162,7 +157,7 @@ class Reply(msgspec.Struct, frozen=True):
         if kind not in ("banner", "ok", "error", "done", "alarm", "status"):
             raise ProtocolError(f"not a stage reply: {body!r}")
         if (kind in ("error", "alarm")) != bool(re.fullmatch(r"[0-9]{1,3}", number)):
-            raise ProtocolError(f"stage reply without a proper number: {body!r}")
+            raise ProtocolError(f"stage reply without a valid number: {body!r}")
         sequence: int | None = None
         if kind in ("ok", "error", "done"):
             if not rest or not re.fullmatch(r"N([0-9]{1,5}|-)", rest[0]):
@@ -173,12 +168,12 @@ class Reply(msgspec.Struct, frozen=True):
         for word in rest:
             m = _FIELD.fullmatch(word)
             if m is None or m[1] in fields:
-                raise ProtocolError(f"stage reply with a bad field {word!r}: {body!r}")
+                raise ProtocolError(f"stage reply with an invalid field {word!r}: {body!r}")
             fields[m[1]] = m[2]
         return Reply(kind, sequence, int(number) if number else 0, fields)
 
     def integer(self, key: str) -> int:
-        """An integer field. Raises ProtocolError when it is absent or not an integer."""
+        """Return an integer field. Raises ProtocolError if it is missing or not an integer."""
         value = self.fields.get(key)
         if value is None or not _VALUE.fullmatch(value):
             raise ProtocolError(f"stage reply {self.kind!r} needs an integer field {key!r}, got {value!r}")

@@ -1,4 +1,4 @@
-"""Constants and conversions used on both halves. SI inside the maths; elsewhere the unit is in the name."""
+"""Constants and unit conversions. Computations use SI units; other variables have the unit in their name."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ NS_PER_US = 1_000
 
 
 def us_to_ns(us: float) -> int:
-    """Microseconds to whole nanoseconds, rounded."""
+    """Convert microseconds to whole nanoseconds, rounded."""
     return round(us * NS_PER_US)
 
 
 def ms_to_ns(ms: float) -> int:
-    """Milliseconds to whole nanoseconds, rounded."""
+    """Convert milliseconds to whole nanoseconds, rounded."""
     return round(ms * NS_PER_MS)
 
 
 def s_to_ns(s: float) -> int:
-    """Seconds to whole nanoseconds, rounded."""
+    """Convert seconds to whole nanoseconds, rounded."""
     return round(s * NS_PER_S)

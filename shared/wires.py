@@ -1,16 +1,16 @@
-"""Simulated wires: a local socket that carries GPIO edges between processes, each edge with its time.
+"""Simulated wires: GPIO edges with timestamps between processes, over a local socket.
 
-One hub (simulators) relays between the parties: the stage raises the trigger, the Pi makes SYNC_IN pulses, the radars
-listen. Lines of ASCII:
+A hub (`simulators.wires`) relays between its clients: the stage raises the trigger, the Pi sends SYNC_IN pulses, the
+radars listen. The protocol has ASCII lines:
 
     `S <t_ns> <line> <0|1>`                 a line changed at wire time t_ns
-    `M <t_ns> <x_um> <y_um> <vx_um_s>`      the stage is at (x, y) and moves at vx from here on (stage coordinates)
-    `L <line> [<line> ...]`                 party to hub: send me changes of these lines
-    `W`                                     party to hub: send me the M lines too
-    `K`                                     hub to party: your L and W are in force
+    `M <t_ns> <x_um> <y_um> <vx_um_s>`      the stage is at (x, y) and moves at vx from now on (stage coordinates)
+    `L <line> [<line> ...]`                 client to hub: subscribe to changes of these lines
+    `W`                                     client to hub: subscribe to M lines
+    `K`                                     hub to client: confirms L or W
 
-Wire time is the simulated stage's clock. It may run faster than the wall clock; whoever reacts to an edge counts from
-the edge's time, so that intervals in a simulated scan are exact however loaded the machine is.
+Wire time is the simulated stage's clock, which may be faster than the wall clock. Reactions to an edge are scheduled
+relative to the edge's time, so that the intervals of a simulated scan are exact on a busy machine.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ProtocolError
 
 
@@ -32,7 +33,7 @@ class WireEdge(NamedTuple):
 
 
 class WireMotion(NamedTuple):
-    """The stage's position (micrometres, stage coordinates) and x speed (micrometres a second) from `t_ns` on."""
+    """Position (um, stage coordinates) and x speed (um/s) of the stage from `t_ns` on."""
 
     t_ns: int
     x_um: int
@@ -44,7 +45,7 @@ WireMessage = WireEdge | WireMotion
 
 
 def encode(message: WireMessage) -> bytes:
-    """One line of the wire protocol."""
+    """Encode a message as a line of the wire protocol."""
     tag = "S" if isinstance(message, WireEdge) else "M"
     return (" ".join([tag, *map(str, message)]) + "\n").encode("ascii")
 
@@ -64,21 +65,9 @@ def parse(line: str) -> WireMessage:
 
 
 class WireClient:
-    """One party on the simulated wires.
+    """Client of the hub at the Unix socket `path`, subscribed to the lines `listen` and, with `motion`, to M lines.
 
-    Parameters
-    ----------
-    path
-        Unix socket of the hub.
-    listen
-        Lines whose changes are wanted.
-    motion
-        Whether M lines are wanted.
-
-    Raises
-    ------
-    DeviceError
-        when nobody listens at `path` within `timeout_s`.
+    Raises DeviceError if there is no hub within `timeout_s`.
     """
 
     def __init__(self, path: Path, listen: tuple[int, ...] = (), motion: bool = False, timeout_s: float = 10.0) -> None:
@@ -93,9 +82,10 @@ class WireClient:
                 self._socket.close()
                 if time.monotonic() > deadline:
                     raise DeviceError(
-                        f"simulated wires: nobody listens at {path}: {e}",
+                        f"simulated wires: no connection to {path}: {e}",
                         "the simulated rig is not running",
                         "start it first",
+                        code=ErrorCode.NO_ANSWER,
                     ) from None
                 time.sleep(0.02)
         self._buffer = b""
@@ -110,21 +100,21 @@ class WireClient:
             deadline = time.monotonic() + timeout_s
             for _ in range(hello.count(b"\n")):
                 if self._next_line(max(0.0, deadline - time.monotonic())) != "K":
-                    raise ProtocolError(f"simulated wires at {path}: no confirmation")
+                    raise ProtocolError(f"simulated wires at {path}: no confirmation", code=ErrorCode.NO_ANSWER)
 
     def fileno(self) -> int:
-        """File descriptor, for select and poll. :meth:`receive` may hold more than the descriptor shows."""
+        """Return the file descriptor, for select and poll; `receive` may have buffered messages besides."""
         return self._socket.fileno()
 
     def send(self, *messages: WireMessage) -> None:
-        """Send messages in one write. Raises DeviceError when the hub is gone."""
+        """Send messages in one write. Raises DeviceError if the hub is gone."""
         try:
             self._socket.sendall(b"".join(map(encode, messages)))
         except OSError as e:
             raise DeviceError(f"simulated wires at {self._path} broke: {e}", "the simulated rig ended") from None
 
     def receive(self, timeout_s: float | None) -> WireMessage | None:
-        """The next message, or None after `timeout_s`. Raises DeviceError when the hub is gone."""
+        """Return the next message, or None after `timeout_s`. Raises DeviceError if the hub is gone."""
         line = self._next_line(timeout_s)
         return None if line is None else parse(line)
 
@@ -148,5 +138,5 @@ class WireClient:
         return self._pending.pop()
 
     def close(self) -> None:
-        """Leave the wires."""
+        """Close the connection."""
         self._socket.close()

@@ -21,6 +21,7 @@ fi
 if [ "${1-}" = pi ]; then
   command -v qemu-system-aarch64 >/dev/null || lean+=(qemu-system-arm)
   command -v mmdebstrap >/dev/null || lean+=(mmdebstrap)
+  command -v arch-test >/dev/null || lean+=(arch-test)  # mmdebstrap asks it whether programs for ARM run here
   command -v mke2fs >/dev/null || lean+=(e2fsprogs)
   command -v ssh >/dev/null || lean+=(openssh-client)
   [ -e /usr/lib/binfmt.d/qemu-aarch64.conf ] || lean+=(qemu-user-static)

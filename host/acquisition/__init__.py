@@ -1,38 +1,46 @@
-"""A scan as row transactions between the host, the Pi and the capture cards.
+"""Acquisition: record the rows of a plan with the Pi, the radars and the capture cards.
 
-`run_scan` and `resume_scan` take the rows of a plan that are not committed yet: radars armed and cards recording
-(`capture_rig`), the Pi asked for the row (`pi_client`, `row`), what came counted (`take`), pulses that a board missed
-found by arrival times (`missed_pulses`, `slipped_row`), the row committed or taken again. A scan is asked to pause or
-stop through `control`; committed rows go on to processing through `progress`.
+`run_scan` and `resume_scan` record every row that is not committed yet (`scan`, `scan_loop`). For each row (`row`):
+arm the radars and start the cards' records (`capture_rig`), let the Pi run the row (`pi_client`), compare the received
+data with the pulses sent (`take`), find pulses that a board missed by arrival times (`missed_pulses`, `slipped_row`),
+then commit the row or retake it. `ready` holds the checks before a row: homing, disk space, the Pi's configuration.
+`control` pauses and stops a running scan; `progress` queues committed rows for processing and reports time left.
 """
 
 from polysight.host.acquisition.capture_rig import CaptureRig
-from polysight.host.acquisition.control import ControlDesk, StopRequest, Wish, ask, hangups_pass, last_sign_of_life
+from polysight.host.acquisition.control import (
+    ControlFolder,
+    ScanCommand,
+    StopRequest,
+    ignore_hangup,
+    last_alive_s,
+    send_command,
+)
 from polysight.host.acquisition.pi_client import PiClient, RefusedError
-from polysight.host.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult, time_left, usual_row_s
-from polysight.host.acquisition.ready import differences, make_ready
+from polysight.host.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult, time_left, typical_row_s
+from polysight.host.acquisition.ready import make_ready, stage_differences
 from polysight.host.acquisition.scan import resume_scan, run_scan
 from polysight.host.acquisition.take import FaultKind
 
 __all__ = [
     "CaptureRig",
-    "ControlDesk",
+    "ControlFolder",
     "FaultKind",
     "OnProgress",
     "OnRow",
     "PiClient",
     "RefusedError",
+    "ScanCommand",
     "ScanProgress",
     "ScanResult",
     "StopRequest",
-    "Wish",
-    "ask",
-    "differences",
-    "hangups_pass",
-    "last_sign_of_life",
+    "ignore_hangup",
+    "last_alive_s",
     "make_ready",
     "resume_scan",
     "run_scan",
+    "send_command",
+    "stage_differences",
     "time_left",
-    "usual_row_s",
+    "typical_row_s",
 ]

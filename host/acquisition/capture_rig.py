@@ -1,6 +1,6 @@
-"""All recorded boards at once: their cards and their receiving processes.
+"""Capture cards and receiver processes of all recorded boards.
 
-`CaptureRig` starts and stops the records of a row; `record_ending` decides when one board's record has ended.
+`CaptureRig` starts and stops the records of a row; `record_ending` decides if one board's record has ended.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from collections.abc import Collection
 from contextlib import ExitStack, suppress
 from enum import Enum
 from pathlib import Path
-from types import TracebackType
 
 from polysight.host.capture import (
     CardClient,
@@ -27,34 +26,34 @@ from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 
 TAIL_S = 2.0
-"""Silence after which a card sends what does not fill a packet (seen)."""
+"""Silence after which a card sends a last packet that is not full (observed)."""
 GRACE_NS = 200_000_000
-"""Silence after which nothing comes any more, once the card said so: status and data come on different ports."""
-_COMPLETED_LIMIT_S = 0.2  # from a record's stop to its last packet and its status
+"""Silence after which a record that the card reported as completed has ended: status and data use different ports."""
+_COMPLETED_TIMEOUT_S = 0.2  # from a record's stop to its last packet and its status
 
 
 class Ending(Enum):
     """Why a record counts as ended."""
 
-    BYTES = "every expected byte is there"
+    BYTES = "every expected byte has arrived"
     STATUS = "the card reports the record as completed"
-    TAIL = "the record's short last packet came"
-    SILENCE = "nothing came any more"
+    TAIL = "the record's short last packet has arrived"
+    SILENCE = "no data for the configured time"
 
 
 def record_ending(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> Ending | None:
-    """Why one board's record has ended, or None while it has not; whichever is first.
+    """Return why one board's record has ended (the first reason that applies), or None if it has not.
 
     Parameters
     ----------
     progress
-        What its receiver said last.
+        Latest report of its receiver.
     status
-        What its card reported by itself since the record started.
+        Status bits that its card reported since the record started.
     since_ns, now_ns
-        When the last pulse was sent, and now, on the monotonic clock.
+        Time of the last pulse and the present time, monotonic clock.
     silence_ns
-        Silence that ends a record by itself. The card sends its short last packet after 2 s of it (seen).
+        Silence that ends a record.
     """
     if progress.complete:
         return Ending.BYTES
@@ -67,17 +66,12 @@ def record_ending(progress: Progress, status: Status, since_ns: int, now_ns: int
 
 
 class CaptureRig:
-    """Cards and receivers of the boards that are recorded.
-
-    Attributes
-    ----------
-    warnings
-        What is not as asked, but good enough to scan.
+    """Cards and receivers of the recorded boards; `warnings` lists what differs from the request but suffices to scan.
 
     Raises
     ------
     DeviceError
-        when a port is in use, or the receive buffer is too small for two bursts.
+        if a port is in use, or the receive buffer is smaller than two bursts.
     """
 
     def __init__(self, instrument: Instrument) -> None:
@@ -86,7 +80,6 @@ class CaptureRig:
         self.cards: dict[str, CardClient] = {}
         self.receivers: dict[str, ReceiverProcess] = {}
         self._recording = False
-        self._stack = ExitStack()
         with ExitStack() as stack:
             for board in instrument.recorded:
                 card = CardClient(board, instrument.limits.command_timeout_s)
@@ -102,20 +95,20 @@ class CaptureRig:
             if (silence_s := instrument.limits.end_of_record_s) <= TAIL_S:
                 self.warnings.append(
                     f"limits.end_of_record_s is {silence_s:g}: a card sends the last packet after {TAIL_S:g} s of"
-                    " silence, or at the record's stop, but not every card may do the latter; 3 s is safe"
+                    " silence or when the record is stopped, but not every card may do the latter; 3 s is safe"
                 )
             self._stack = stack.pop_all()
 
     def configure(self, names: Collection[str] = ()) -> dict[str, Version]:
-        """Set cards up, all unless named, and stop what they may record; returns FPGA versions. Raises DeviceError."""
-        found = {}
+        """Stop records and configure the named cards (default: all); return FPGA versions. Raises DeviceError."""
+        versions = {}
         for name in names or self.cards:
             card = self.cards[name]
             card.alive()
             card.record_stop()
             card.configure(self._instrument.card)
-            found[name] = card.version()
-        return found
+            versions[name] = card.version()
+        return versions
 
     def begin_row(self, row: int, take: int, points: int, folder: Path) -> None:
         """Arm the receivers, then start the records. Raises DeviceError."""
@@ -129,33 +122,33 @@ class CaptureRig:
 
     @property
     def complete(self) -> bool:
-        """Whether every expected byte of the row is there, on every board."""
-        # Each one is asked, also behind one that is not complete: a process that died is noticed by asking.
+        """True if every expected byte of the row has arrived, on every board."""
+        # Poll every receiver, also behind an incomplete one: polling is how a dead process is noticed.
         found = [receiver.poll() for receiver in self.receivers.values()]
         return all(progress.complete for progress in found)
 
     def reports(self) -> dict[str, Progress]:
-        """How far the row is on every board, asked for."""
+        """Request the progress of every board's receiver."""
         return {name: receiver.report() for name, receiver in self.receivers.items()}
 
     def statuses(self) -> dict[str, Status]:
-        """Status bits each card reported since its record start."""
+        """Status bits that each card reported since its record start."""
         return {name: card.take_status() for name, card in self.cards.items()}
 
-    def row_runs(self, not_before_ns: int) -> None:
-        """No pulse of the row was sent before this time (monotonic clock): what came earlier is left over."""
+    def discard_before(self, time_ns: int) -> None:
+        """Treat data that arrived before this time (monotonic clock) as left over from an earlier record."""
         for receiver in self.receivers.values():
-            receiver.report(not_before_ns)
+            receiver.report(time_ns)
 
     def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:
-        """Stop the records and take the rows: their files are durable when this returns. Raises DeviceError.
+        """Stop the records and return the rows, whose files are durable then. Raises DeviceError.
 
-        `not_before_ns` as in :meth:`row_runs`, known better by now.
+        Data before `not_before_ns` is left over, as in :meth:`discard_before`, with the time that is known by now.
         """
         self.stop_records()
-        deadline = time.monotonic() + _COMPLETED_LIMIT_S
+        deadline = time.monotonic() + _COMPLETED_TIMEOUT_S
         for name, receiver in self.receivers.items():
-            if not receiver.poll().complete:  # of a complete row nothing can follow
+            if not receiver.poll().complete:  # nothing follows a complete row
                 self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()
         return {name: receiver.end_row(statuses[name], not_before_ns) for name, receiver in self.receivers.items()}
@@ -167,7 +160,7 @@ class CaptureRig:
         self._recording = False
 
     def close(self) -> None:
-        """Stop recording where the cards still listen, end the processes, close the sockets. Twice is once."""
+        """Stop records of cards that still reply, end the receiver processes, close the sockets. Safe to repeat."""
         if self._recording:
             self._recording = False
             for card in self.cards.values():
@@ -178,7 +171,5 @@ class CaptureRig:
     def __enter__(self) -> CaptureRig:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -1,9 +1,9 @@
-"""Asking a running scan to stop, pause or go on: by signals, and by files in `<scan>/control/`.
+"""Pause, continue and stop a running scan: by signals and by files in `<scan>/control/`.
 
-Ctrl-C and SIGTERM become a `StopRequest`, which any thread can look at. From outside the terminal a scan is asked by an
-empty file named for the wish. The scan makes that folder when it begins, obeys what it finds there by removing it,
-touches `alive` once a second, and removes the folder at its end. A file's name is written whole or not at all, so there
-is nothing to parse and nothing can be torn; `touch SCAN/control/pause` in a shell does the same. Specification:
+Ctrl-C and SIGTERM set a `StopRequest`, which any thread may read. Other programs send a `ScanCommand` by creating an
+empty file with the command's name in `<scan>/control/`; `touch SCAN/control/pause` in a shell does the same. The scan
+creates that folder when it begins, removes each command file and then obeys it, touches `alive` once a second, and
+removes the folder at its end. File names are atomic, so there is nothing to parse. Specification:
 docs/spec/scan-folder.md.
 """
 
@@ -16,56 +16,56 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ScanError
 
 CONTROL = "control"
 ALIVE = "alive"
-_LOOK_S = 0.2
-_BEAT_S = 1.0
-_TAKEN_LIMIT_S = 5.0
+_POLL_S = 0.2
+_ALIVE_INTERVAL_S = 1.0
+_TIMEOUT_S = 5.0  # for a scan to accept a command
 
 
 class StopRequest:
-    """Counts the requests to stop. Safe from any thread and from signal handlers."""
+    """Counts requests to stop; safe in any thread and in signal handlers."""
 
     def __init__(self) -> None:
         self._count = 0
-        self.paused = False  # whether the next row is not to begin yet
+        self.paused = False  # the next row must not begin yet
 
     def request(self) -> None:
-        """Ask once more."""
+        """Request to stop: the first time after the current row, the second time now."""
         self._count += 1
 
     @property
     def after_row(self) -> bool:
-        """Whether to stop at the next row's end."""
+        """True if the scan must stop at the end of the current row."""
         return self._count >= 1
 
     @property
     def now(self) -> bool:
-        """Whether to stop at once."""
+        """True if the scan must stop immediately."""
         return self._count >= 2
 
 
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
 @contextmanager
-def interrupts_request(stop: StopRequest) -> Iterator[None]:
-    """Within the block, Ctrl-C asks `stop` once a time, and SIGTERM asks for an end at once.
+def stop_on_interrupt(stop: StopRequest) -> Iterator[None]:
+    """Turn Ctrl-C into one stop request and SIGTERM into two; no effect outside the main thread."""
 
-    Outside the main thread signals cannot be caught, and nothing changes.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def ask(number: int, frame: FrameType | None) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         del frame
         stop.request()
         if number == signal.SIGTERM:
             stop.request()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM) if _in_main_thread() else ()
+    before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
     finally:
@@ -74,9 +74,9 @@ def interrupts_request(stop: StopRequest) -> Iterator[None]:
 
 
 @contextmanager
-def hangups_pass() -> Iterator[None]:
-    """Within the block, the end of the terminal (SIGHUP: a lost ssh connection) ends nothing; in the main thread."""
-    if threading.current_thread() is not threading.main_thread():
+def ignore_hangup() -> Iterator[None]:
+    """Ignore SIGHUP, as from a lost ssh connection; no effect outside the main thread."""
+    if not _in_main_thread():
         yield
         return
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -87,8 +87,8 @@ def hangups_pass() -> Iterator[None]:
 
 
 @contextmanager
-def interrupts_wait() -> Iterator[None]:
-    """Within the block, Ctrl-C and SIGTERM are held back from this thread; they come at its end."""
+def delay_interrupts() -> Iterator[None]:
+    """Block SIGINT and SIGTERM in this thread until the block ends."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
@@ -96,24 +96,19 @@ def interrupts_wait() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-class Wish(StrEnum):
-    """What can be asked of a running scan."""
+class ScanCommand(StrEnum):
+    """Commands for a running scan; the values are the names of their files."""
 
-    PAUSE = "pause"  # after the running row, until `continue`
+    PAUSE = "pause"  # after the current row, until `continue`
     CONTINUE = "continue"
-    STOP = "stop"  # end after the running row
-    ABORT = "abort"  # end now
+    STOP = "stop"  # after the current row
+    ABORT = "abort"  # now
 
 
-class ControlDesk:
-    """Takes wishes for a scan that this program runs, from a thread of its own: a slow disk must not stop the scan.
+class ControlFolder:
+    """Serve `<folder>/control` for a scan of this program and pass commands to `stop`.
 
-    Parameters
-    ----------
-    folder
-        The scan folder.
-    stop
-        What hears of the wishes.
+    Runs in a thread of its own, so that a slow disk does not stop the scan.
     """
 
     def __init__(self, folder: Path, stop: StopRequest) -> None:
@@ -122,77 +117,76 @@ class ControlDesk:
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Begin to listen; only who holds the scan's lock may. Again is nothing. What was asked before is forgotten."""
+        """Start to serve, once; the caller must hold the scan's lock. Earlier command files are deleted."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
             self._thread.start()
 
     def _serve(self) -> None:
-        beat_at, cleared = 0.0, False
-        while not self._closed.wait(_LOOK_S):
-            with suppress(OSError):  # a full disk costs the wishes, never the scan
+        next_alive, cleared = 0.0, False
+        while not self._closed.wait(_POLL_S):
+            with suppress(OSError):  # a full disk must not end the scan
                 if not cleared:
                     self._folder.mkdir(exist_ok=True)
                     self._clear()
                     cleared = True
-                if time.monotonic() >= beat_at:
+                if time.monotonic() >= next_alive:
                     (self._folder / ALIVE).touch()
-                    beat_at = time.monotonic() + _BEAT_S
-                for wish in Wish:
-                    self._take(wish)
+                    next_alive = time.monotonic() + _ALIVE_INTERVAL_S
+                for command in ScanCommand:
+                    self._obey(command)
         with suppress(OSError):
             self._clear()
             self._folder.rmdir()
 
-    def _take(self, wish: Wish) -> None:
-        """Obey a wish that is there. It is removed first: what cannot be removed would be obeyed for ever."""
-        path = self._folder / wish
+    def _obey(self, command: ScanCommand) -> None:
+        """Obey a command if its file exists. The file is removed first, or it would be obeyed again and again."""
+        path = self._folder / command
         if not path.exists():
             return
         path.unlink()
-        if wish in (Wish.PAUSE, Wish.CONTINUE):
-            self._stop.paused = wish is Wish.PAUSE
-        elif wish is Wish.ABORT:
+        if command in (ScanCommand.PAUSE, ScanCommand.CONTINUE):
+            self._stop.paused = command is ScanCommand.PAUSE
+        elif command is ScanCommand.ABORT:
             self._stop.request()
             self._stop.request()
-        elif not self._stop.after_row:  # asked twice is still after the row: a double click must not cut it
+        elif not self._stop.after_row:  # a second `stop` (double click) must not abort the row
             self._stop.request()
 
     def _clear(self) -> None:
-        for name in (*Wish, ALIVE):
+        for name in (*ScanCommand, ALIVE):
             (self._folder / name).unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop serving and remove the folder."""
         self._closed.set()
         if self._thread is not None:
-            self._thread.join(_TAKEN_LIMIT_S)
+            self._thread.join(_TIMEOUT_S)
 
-    def __enter__(self) -> ControlDesk:
+    def __enter__(self) -> ControlFolder:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
-def ask(folder: Path, wish: Wish, limit_s: float = _TAKEN_LIMIT_S) -> None:
-    """Ask the scan that runs in `folder`; returns when it has heard.
+def send_command(folder: Path, command: ScanCommand, limit_s: float = _TIMEOUT_S) -> None:
+    """Send a command to the scan that runs in `folder`; return when it has been accepted.
 
     Raises
     ------
     ScanError
-        when no scan program listens there, or it does not take the wish in time; then the wish is withdrawn.
+        if no scan runs there, or it does not accept the command in time; the command is then withdrawn.
     """
-    path = folder / CONTROL / wish
+    path = folder / CONTROL / command
     try:
         path.touch()
     except OSError as e:
         raise ScanError(
-            f"{folder}: nobody can be asked to {wish}: {e.strerror}",
+            f"{folder}: no running scan takes `{command}`: {e.strerror}",
             "no scan runs in this folder, or you may not write to it",
-            f"a scan that was killed goes on with `polysight resume {folder}`",
+            f"if its program was killed, resume the scan with `polysight resume {folder}`",
+            code=ErrorCode.NO_ANSWER,
         ) from None
     deadline = time.monotonic() + limit_s
     while path.exists():
@@ -200,15 +194,16 @@ def ask(folder: Path, wish: Wish, limit_s: float = _TAKEN_LIMIT_S) -> None:
             with suppress(FileNotFoundError):
                 path.unlink()
                 raise ScanError(
-                    f"{folder}: the scan did not hear {wish!s} within {limit_s:g} s, and will not obey it any more",
+                    f"{folder}: the scan did not accept `{command}` within {limit_s:g} s; the command is withdrawn",
                     "its program was killed, or hangs",
                     "press Ctrl-C in its terminal; the emergency stop stops the stage",
+                    code=ErrorCode.NO_ANSWER,
                 )
-        time.sleep(_LOOK_S / 4)
+        time.sleep(_POLL_S / 4)
 
 
-def last_sign_of_life(folder: Path) -> float | None:
-    """When the scan program said last that it lives (seconds, the file system's clock); None when it never did."""
+def last_alive_s(folder: Path) -> float | None:
+    """Return when the scan program last touched `alive` (file system's clock, seconds); None if it never did."""
     try:
         return (folder / CONTROL / ALIVE).stat().st_mtime
     except OSError:

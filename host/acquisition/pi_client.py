@@ -1,7 +1,7 @@
-"""The host's end of the sockets to the Pi: commands with time-out and retry, events without gaps, and the heartbeat.
+"""Client for the Pi: commands with timeout and retry, events without gaps, and the host's heartbeat.
 
-`PiClient` sends commands and reads events; a gap in their sequence is filled from the Pi's journal. `HostHeartbeat`
-tells the Pi that this process lives, from a thread and a socket of its own.
+`PiClient` sends commands and reads events; lost events are fetched from the Pi's journal. `HostHeartbeat` sends
+`Alive` from its own thread and socket.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import msgspec
@@ -21,6 +20,7 @@ import zmq
 
 from polysight.host.capture import take_priority
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ProtocolError, ScanError
 from polysight.shared.faults import PiFault
 from polysight.shared.messages import (
@@ -53,32 +53,23 @@ from polysight.shared.messages import (
     unpack_event,
     unpack_reply,
 )
-from polysight.shared.sockets import Refusals, requester, subscriber
+from polysight.shared.sockets import HandshakeMonitor, requester, subscriber
 
-ATTEMPTS = 3  # to ask a question
-REAL_TIME = 1  # of the heartbeat: below the receiving processes
-_SILENT_BEATS = 10  # more than the Pi waits before it takes a host for dead
-_REPLY_LIMIT_S = 1.0  # then the question was lost, and another one is asked
-AT_WORK: tuple[State, ...] = ("homing", "running", "held", "done")  # which change by themselves
-_REST_LIMIT_S = 10.0
-_LOOK_S = 0.05
+ATTEMPTS = 3  # to send a command
+REAL_TIME = 1  # real-time priority of the heartbeat: below the receiver processes
+_SILENT_BEATS = 10  # more than after which the Pi considers a host dead
+_ALIVE_TIMEOUT_S = 1.0  # for a reply to `Alive`, before it is sent again
+MOVING: tuple[State, ...] = ("homing", "running", "held", "done")  # states that change without a command
+_REST_TIMEOUT_S = 10.0
+_POLL_S = 0.05
 _REPLAY_LIMIT = 1000  # events
 R = TypeVar("R", bound=AnyReply)
 
 
 class HostHeartbeat:
-    """Says `Alive` from a thread and a socket of its own, so that it lives as long as this process, and no longer.
+    """Sends `Alive` for run `scan_id` every `interval_s` while this process lives, in its own thread and socket.
 
-    Parameters
-    ----------
-    context, instrument
-        Where the Pi is.
-    scan_id
-        The run that is begun.
-    interval_s
-        How often.
-    owner
-        As in `BeginRun`.
+    `owner` as in `BeginRun`.
     """
 
     def __init__(
@@ -91,13 +82,13 @@ class HostHeartbeat:
         self._thread.start()
 
     def _beat(self) -> None:
-        take_priority(REAL_TIME)  # where that is not permitted, a busy machine may cost a row, which is taken again
+        take_priority(REAL_TIME)  # without permission for that, a busy machine may cause a retake
         try:
             while not self._stop.wait(self._interval_s):
-                with suppress(zmq.Again):  # nobody to send to: the Pi will notice
+                with suppress(zmq.Again):  # no connection: the Pi will notice the missing heartbeat
                     self._socket.send(self._alive)
                 waited_s = 0.0
-                while not self._stop.is_set() and waited_s < _REPLY_LIMIT_S:
+                while not self._stop.is_set() and waited_s < _ALIVE_TIMEOUT_S:
                     if self._socket.poll(round(self._interval_s * 1e3)):
                         self._socket.recv()
                         break
@@ -106,31 +97,27 @@ class HostHeartbeat:
             self._socket.close()
 
     def stop(self) -> None:
-        """No more."""
+        """Stop sending."""
         self._stop.set()
         self._thread.join()
 
 
 class RefusedError(ScanError):
-    """The Pi did not take a command; `number` is of shared/faults.py."""
+    """The Pi refused a command; `number` is of shared/faults.py."""
 
     def __init__(self, command: str, refusal: Refused) -> None:
-        super().__init__(f"the Pi refused {command}: {refusal.what}", refusal.why, refusal.remedy)
+        what = f"the Pi refused {command}: {refusal.what}"
+        super().__init__(what, refusal.why, refusal.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = refusal.number
 
 
 class PiClient:
-    """Talks to one Pi. Used by one thread.
-
-    Parameters
-    ----------
-    instrument
-        Addresses, keys and limits.
+    """Client of one Pi, for one thread; `instrument` has addresses, keys and limits.
 
     Raises
     ------
     ConfigError
-        when an address needs keys that are not there.
+        if an address needs keys that are missing.
     """
 
     def __init__(self, context: zmq.Context[Any], instrument: Instrument) -> None:
@@ -144,14 +131,14 @@ class PiClient:
         keys = Path(instrument.pi.key_dir)
         self._events = subscriber(context, self._event_address, keys)
         self._commands = requester(context, self._address, keys)
-        self._refusals = Refusals(self._commands)
-        self._owner = secrets.token_hex(16)  # of the runs that this client begins
+        self._handshake = HandshakeMonitor(self._commands)
+        self._owner = secrets.token_hex(16)  # identifies the runs that this client begins
         self._scan_id = ""
         self._last_seq = 0
         self._last_heard_s = time.monotonic()
         self._pending: deque[AnyEvent] = deque()
-        self.gaps_filled = 0  # events that PUB lost and the journal returned
-        self.state: State = "idle"  # of the last heartbeat
+        self.gaps_filled = 0  # events that PUB lost and the journal contained
+        self.state: State = "idle"  # in the last heartbeat
 
     @property
     def event_socket(self) -> zmq.Socket[bytes]:
@@ -159,23 +146,23 @@ class PiClient:
         return self._events
 
     def follow(self, scan_id: str, last_seq: int, on_event: Callable[[AnyEvent], None]) -> None:
-        """Follow the events of a scan: `on_event` takes each one after `last_seq` exactly once, in order."""
+        """Follow the events of a scan: call `on_event` exactly once with each event after `last_seq`, in order."""
         self._scan_id, self._last_seq, self._on_event = scan_id, last_seq, on_event
 
     # --- commands ---
 
     def hello(self) -> HelloReply:
-        """Who is there? Raises DeviceError when nobody answers, ProtocolError for another release."""
+        """Identify the Pi. Raises DeviceError if it does not answer, ProtocolError for another release."""
         return self._ask(Hello(), HelloReply)
 
     def status(self) -> StatusReply:
-        """Everything the Pi knows about itself. Raises DeviceError."""
+        """Return the Pi's status. Raises DeviceError."""
         return self._ask(Status(), StatusReply)
 
     def begin_run(self, run: BeginRun) -> None:
-        """Begin a run, or take it up again; twice is once. Keeps the promise of `run.heartbeat_ms` until its end.
+        """Begin or resume a run and send its heartbeat until the run's end. Safe to repeat.
 
-        A program of the same scan that was killed a moment ago counts as alive for some beats: that is waited for.
+        Waits some heartbeats if the Pi still considers a killed program of the same scan alive.
 
         Raises RefusedError, DeviceError.
         """
@@ -186,11 +173,11 @@ class PiClient:
                 self._ask(run, Accepted)
                 break
             except RefusedError as e:
-                its_own = e.number == PiFault.NOT_READY and self.status().scan_id == run.scan_id
-                if not its_own or time.monotonic() > deadline:
+                same_scan = e.number == PiFault.NOT_READY and self.status().scan_id == run.scan_id
+                if not same_scan or time.monotonic() > deadline:
                     raise
-                time.sleep(_LOOK_S)
-        self._fall_silent()
+                time.sleep(_POLL_S)
+        self._stop_heartbeat()
         if run.heartbeat_ms:
             interval_s = run.heartbeat_ms / 1e3
             self._heartbeat = HostHeartbeat(self._context, self._instrument, run.scan_id, interval_s, self._owner)
@@ -198,15 +185,15 @@ class PiClient:
     def end_run(self, scan_id: str, exit_status: ExitStatus, reason: str) -> None:
         """End the run. Raises RefusedError, DeviceError."""
         self._ask(EndRun(scan_id=scan_id, exit_status=exit_status, reason=reason[:500], owner=self._owner), Accepted)
-        self._fall_silent()
+        self._stop_heartbeat()
 
     def home(self) -> None:
-        """Begin to home the stage. Raises RefusedError, DeviceError."""
+        """Start homing the stage. Raises RefusedError, DeviceError."""
         if self._once(Home(), self._timeout_s) is None and self.status().state not in ("homing", "ready"):
             self._ask(Home(), Accepted)
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
-        """Begin a row. When the reply is lost, it is found out whether the row runs before asking again.
+        """Begin a row. If the reply is lost, check if the row runs before a retry.
 
         Raises RefusedError, DeviceError.
         """
@@ -214,7 +201,7 @@ class PiClient:
         for _ in range(ATTEMPTS):
             reply = self._once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, Accepted):
-                self.state = reply.state  # the heartbeat heard last is older
+                self.state = reply.state  # newer than the last heartbeat
                 return
             status = self.status()
             if status.state in ("running", "held") and (status.row_index, status.take) == (row_index, take):
@@ -222,51 +209,52 @@ class PiClient:
             self._catch_up(status.last_seq)
             if any(_is_of(e, row_index, take) for e in self._pending):
                 return
-        raise self._silent("RunRow")
+        raise self._no_answer("RunRow")
 
     def pulse(self, pulses: int, period_us: float, width_us: float) -> Pulsed:
-        """One burst on SYNC_IN at rest. Sent once: a second one would be more frames than asked for.
+        """Send one burst on SYNC_IN with the stage at rest. No retry: a second burst would add frames.
 
         Raises RefusedError, DeviceError.
         """
         reply = self._once(Pulse(pulses=pulses, period_us=period_us, width_us=width_us), self._timeout_s)
         if not isinstance(reply, Pulsed):
-            raise self._silent("Pulse")
+            raise self._no_answer("Pulse")
         return reply
 
     def abort(self, reason: str) -> None:
-        """Stop the row now; aborting twice does no harm. Raises RefusedError, DeviceError."""
+        """Abort the row now; safe to repeat. Raises RefusedError, DeviceError."""
         self._ask(Abort(reason=reason[:500], owner=self._owner), Accepted)
 
     def come_to_rest(self, reason: str) -> None:
-        """Stop whatever moves, and wait until it stands: a run cannot end before. Raises RefusedError, DeviceError.
+        """Abort the row and wait until the stage stands, which `end_run` needs; do nothing in another host's run.
 
-        What moves for another host's run is left alone.
+        Raises RefusedError, DeviceError.
         """
         if self.status().scan_id != self._scan_id:
             return
         self.abort(reason)
-        deadline = time.monotonic() + _REST_LIMIT_S
-        while self.status().state in AT_WORK and time.monotonic() < deadline:
-            time.sleep(_LOOK_S)
+        deadline = time.monotonic() + _REST_TIMEOUT_S
+        while self.status().state in MOVING and time.monotonic() < deadline:
+            time.sleep(_POLL_S)
 
     def _ask(self, command: AnyCommand, kind: type[R]) -> R:
-        """A command that may be sent twice."""
+        """Send a command with retries; for commands that are safe to repeat."""
         for _ in range(ATTEMPTS):
             reply = self._once(command, self._timeout_s / ATTEMPTS)
             if isinstance(reply, kind):
                 return reply
             if reply is not None:
-                raise ProtocolError(f"the Pi answered {type(command).__name__} with {type(reply).__name__}")
-        raise self._silent(type(command).__name__)
+                what = f"the Pi answered {type(command).__name__} with {type(reply).__name__}"
+                raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
+        raise self._no_answer(type(command).__name__)
 
-    def _once(self, command: AnyCommand, limit_s: float) -> AnyReply | None:
-        """Send once; the reply, or None after `limit_s`. A new request drops the old one (relaxed, correlated REQ)."""
+    def _once(self, command: AnyCommand, timeout_s: float) -> AnyReply | None:
+        """Send once and return the reply, None after the timeout. A new request replaces the old (relaxed REQ)."""
         try:
             self._commands.send(pack(command))
-        except zmq.Again:  # nobody to send to
+        except zmq.Again:  # no connection
             return None
-        if not self._commands.poll(round(limit_s * 1e3)):
+        if not self._commands.poll(round(timeout_s * 1e3)):
             return None
         reply = unpack_reply(self._commands.recv())
         self._last_heard_s = time.monotonic()
@@ -274,31 +262,32 @@ class PiClient:
             raise RefusedError(type(command).__name__, reply)
         return reply
 
-    def _silent(self, command: str) -> DeviceError:
-        if self._refusals.seen():
+    def _no_answer(self, command: str) -> DeviceError:
+        if self._handshake.refused():
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",
                 "the key was revoked or never allowed, or pi.key here is another Pi's",
                 f"on the Pi: `polysight-pi keys --list`; here: the key files in {self._instrument.pi.key_dir}"
                 " (docs/how-to/install.md)",
+                code=ErrorCode.REFUSED_BY_PEER,
             )
         return DeviceError(
             f"the Pi at {self._address} did not answer {command} within {self._timeout_s:g} s ({ATTEMPTS} attempts)",
             "`polysight-pi run` is not running there, the address is wrong, or the CURVE keys do not match",
             "on the Pi: `systemctl status polysight-pi`, `journalctl -u polysight-pi -n 20`; here: check"
-            " pi.command_address (a scan that was begun takes another one with `polysight resume SCAN --config"
-            " instrument.toml`)",
+            " pi.command_address (`polysight resume SCAN --config instrument.toml` resumes a scan with another one)",
+            code=ErrorCode.NO_ANSWER,
         )
 
     # --- events ---
 
     def events(self) -> list[AnyEvent]:
-        """Journalled events of the scan that have come, in order, without waiting; what PUB lost is asked for.
+        """Return the scan's journalled events that have arrived, in order, without waiting; fetch lost ones.
 
         Raises
         ------
         DeviceError
-            when the Pi is silent on both sockets, or its journal lacks what was lost.
+            if the Pi is silent on both sockets, or its journal lacks the lost events.
         """
         while self._events.poll(0):
             parts = self._events.recv_multipart()
@@ -308,15 +297,12 @@ class PiClient:
                 self.state = event.state
             if event.scan_id != self._scan_id or not self._scan_id:
                 continue
-            if isinstance(event, JOURNALLED):
-                if event.seq == self._last_seq + 1:
-                    self._take(event)
-                elif event.seq > self._last_seq:
-                    self._catch_up(event.seq)
+            if isinstance(event, JOURNALLED) and event.seq == self._last_seq + 1:
+                self._take(event)
             elif event.seq > self._last_seq:
                 self._catch_up(event.seq)
         if time.monotonic() - self._last_heard_s > self._silence_s:
-            self._catch_up(self.status().last_seq)  # its heartbeats do not come: does it answer?
+            self._catch_up(self.status().last_seq)  # no heartbeats: check that it answers
         out = list(self._pending)
         self._pending.clear()
         return out
@@ -327,7 +313,7 @@ class PiClient:
         self._on_event(event)
 
     def _catch_up(self, to_seq: int) -> None:
-        """Fetch journalled events from the first one not seen up to `to_seq`."""
+        """Fetch the missing journalled events up to `to_seq`."""
         while self._last_seq < to_seq:
             reply = self._ask(
                 Replay(scan_id=self._scan_id, from_seq=self._last_seq + 1, limit=_REPLAY_LIMIT), ReplayReply
@@ -342,20 +328,21 @@ class PiClient:
                     f"the Pi's journal of scan {self._scan_id} lacks event {before + 1} (it ends at {reply.last_seq})",
                     "the journal on the Pi was removed or damaged",
                     "start a new scan; the committed rows of this one stay valid",
+                    code=ErrorCode.NO_DATA,
                 )
 
     def drain(self) -> None:
-        """Take the events up to the newest one in the Pi's journal. Raises DeviceError."""
+        """Fetch all events in the Pi's journal. Raises DeviceError."""
         self._catch_up(self.status().last_seq)
 
     def close(self) -> None:
-        """Close the sockets."""
-        self._fall_silent()
+        """Stop the heartbeat and close the sockets."""
+        self._stop_heartbeat()
         self._events.close()
-        self._refusals.close()
+        self._handshake.close()
         self._commands.close()
 
-    def _fall_silent(self) -> None:
+    def _stop_heartbeat(self) -> None:
         if self._heartbeat is not None:
             self._heartbeat.stop()
             self._heartbeat = None
@@ -363,9 +350,7 @@ class PiClient:
     def __enter__(self) -> PiClient:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -1,9 +1,8 @@
-"""How a scan proceeds: rows on their way through processing, progress and time left, and the result at its end.
+"""Processing queue, progress, time left and result of a scan.
 
-`ProcessingQueue` hands committed rows to processing, in order, from one worker thread. Capture goes first: the
-receivers are processes of their own with real-time priority or a negative nice value, and this thread has a nice value
-of its own above the program's (`NICE`), so that even where the system grants the receivers nothing the kernel prefers
-them by three to one.
+`ProcessingQueue` passes committed rows to processing, in order, in one worker thread. Capture has priority: receivers
+are processes with real-time priority or a negative nice value, and the worker thread's nice value is `NICE` above the
+program's, so that the kernel prefers the receivers by three to one even if the system grants them no priority.
 """
 
 from __future__ import annotations
@@ -21,18 +20,13 @@ from polysight.shared.messages import ExitStatus
 
 OnRow = Callable[[int], None]
 NICE = 5
-_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a rig that was sped up
+_RECENT_ROWS = 25  # enough for a steady median, few enough to follow a faster rig
 
 
 class ProcessingQueue:
-    """Calls `on_row` with each committed row; without it, rows are only counted as done.
+    """Calls `on_row` with each committed row, if there is one; `limit` rows of this run may wait.
 
-    Parameters
-    ----------
-    on_row
-        Processes one row. What it raises is kept; it stops neither the scan nor the rows after it.
-    limit
-        Rows of this run that may wait before the next one is not begun.
+    An exception of `on_row` is kept for `close`; it stops neither the scan nor later rows.
     """
 
     def __init__(self, on_row: OnRow | None, limit: int) -> None:
@@ -42,45 +36,38 @@ class ProcessingQueue:
         self._own: list[Future[None]] = []
 
     def add_earlier(self, rows: Iterable[int]) -> None:
-        """Rows that were committed before this run: nothing waits for them."""
-        for row in rows:
-            self._submit(row)
+        """Queue rows that were committed before this run; the scan does not wait for them."""
+        if self._on_row is not None:
+            self._all += [self._worker.submit(self._on_row, row) for row in rows]
 
     def add(self, row: int) -> None:
-        """A row was committed."""
-        future = self._submit(row)
-        if future is not None:
-            self._own.append(future)
-
-    def _submit(self, row: int) -> Future[None] | None:
-        if self._on_row is None:
-            return None
-        self._all.append(self._worker.submit(self._on_row, row))
-        return self._all[-1]
+        """Queue a row that was just committed."""
+        self.add_earlier([row])
+        self._own += self._all[-1:]
 
     @property
     def behind(self) -> int:
-        """Rows of this run that are not processed, when they are more than the limit; else 0."""
+        """Number of unprocessed rows of this run if it is above the limit, otherwise 0."""
         self._own = [f for f in self._own if not f.done()]
         return len(self._own) if len(self._own) > self._limit else 0
 
     @property
     def left(self) -> int:
-        """Rows that are not processed, of this run and of earlier ones."""
+        """Number of unprocessed rows, of this run and of earlier ones."""
         return sum(not f.done() for f in self._all)
 
     def wait(self, timeout_s: float) -> None:
-        """Until the oldest row is processed, at most so long."""
+        """Wait until the oldest row is processed, or for the timeout."""
         wait(self._own[:1], timeout_s)
 
     def close(self, now: bool) -> BaseException | None:
-        """Process what waits, or with `now` only end the row in hand; the first error that processing raised."""
+        """Process the queued rows (with `now` only the current one); return the first error of processing."""
         self._worker.shutdown(wait=True, cancel_futures=now)
         return next((f.exception() for f in self._all if not f.cancelled() and f.exception() is not None), None)
 
 
 def _yield_to_capture() -> None:
-    """Give the worker thread a lower priority than the rest of this program, and so than capture."""
+    """Lower the priority of the worker thread below the rest of this program, and so below capture."""
     thread = threading.get_native_id()
     with suppress(OSError):
         setpriority(PRIO_PROCESS, thread, getpriority(PRIO_PROCESS, thread) + NICE)
@@ -88,10 +75,10 @@ def _yield_to_capture() -> None:
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """Where a scan is.
+    """Progress of a scan.
 
-    `phase`: check, connect, home, row, state, held, wait, committed, retake, warning, stop or end. `message` is for
-    people, `state` the row's (docs/spec/row.md).
+    `phase` is check, connect, home, row, state, held, wait, committed, retake, warning, stop or end; `message` is for
+    people; `state` is the row's (docs/spec/row.md).
     """
 
     phase: str
@@ -108,7 +95,7 @@ class ScanProgress:
 
 @dataclass
 class ScanResult:
-    """How a scan ended; `processing_error` is the first error `on_row` raised, after all data is safe."""
+    """Result of a scan; `processing_error` is the first error of `on_row` and does not affect the recorded data."""
 
     folder: ScanFolder
     exit_status: ExitStatus
@@ -122,8 +109,8 @@ class ScanResult:
 OnProgress = Callable[[ScanProgress], None]
 
 
-def usual_row_s(row_seconds: Sequence[float]) -> float:
-    """How long a row takes: the median of the last 25, so that a retake or a wait among them does not count.
+def typical_row_s(row_seconds: Sequence[float]) -> float:
+    """Return the typical duration of a row: the median of the last 25, so that a retake or a wait has no effect.
 
     Parameters
     ----------
@@ -134,15 +121,8 @@ def usual_row_s(row_seconds: Sequence[float]) -> float:
 
 
 def time_left(rows_left: int, row_s: float, elapsed_s: float = 0.0) -> float:
-    """Seconds to the end of a scan.
+    """Return the seconds to the end of a scan with `rows_left` uncommitted rows of `row_s` seconds each.
 
-    Parameters
-    ----------
-    rows_left
-        Rows that are not committed.
-    row_s
-        How long a row takes.
-    elapsed_s
-        Since the last row ended, pauses left out; a row that is overdue counts as one that ends now.
+    `elapsed_s` is the time since the last row ended, without pauses; an overdue row counts as ending now.
     """
     return max(0.0, rows_left * row_s - min(max(elapsed_s, 0.0), row_s))

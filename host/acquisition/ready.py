@@ -1,7 +1,7 @@
-"""What has to be true before a row begins: a homed stage, room on the disk, and the Pi the scan was begun with.
+"""Checks before a row begins: homed stage, free disk space, and a Pi with the same `[stage]` as the rig file.
 
-`make_ready` waits for the first and homes where that is safe. `check_same_stage` compares the Pi's own `[stage]` with
-the rig file's: a Pi that would place rows elsewhere is refused.
+`make_ready` waits for the stage and homes it if that is safe. `check_same_stage` compares the Pi's own `[stage]` with
+the rig file's.
 """
 
 from __future__ import annotations
@@ -12,122 +12,124 @@ from collections.abc import Callable
 from pathlib import Path
 
 from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.pi_client import AT_WORK, PiClient
+from polysight.host.acquisition.pi_client import MOVING, PiClient
 from polysight.host.acquisition.take import ON_REQUEST
 from polysight.host.store import Fact
 from polysight.shared.config import Instrument, Stage
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ScanError
 from polysight.shared.faults import PiFault, explain
 from polysight.shared.messages import HelloReply, StatusReply
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
 
-_HOMING_LIMIT_S = HOMING_LIMIT_S + 30.0  # longer than the Pi, whose reason is the exact one
-STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # homed by hand, after a look: `polysight-pi home`
-UNTOLD = "the Pi does not tell its [stage], so nobody compares it with this rig file's: install this release on the Pi"
+_HOMING_TIMEOUT_S = HOMING_TIMEOUT_S + 30.0  # longer than the Pi's own, which reports the exact reason
+STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)  # a person must look and home: `polysight-pi home`
+STAGE_NOT_REPORTED = (
+    "the Pi does not report its [stage], so it cannot be compared with the rig file's: install this release on the Pi"
+)
 
 
 def make_ready(
-    pi: PiClient, stop: StopRequest, say: Callable[[str, str], None], scan_id: str = "", first: bool = True
+    pi: PiClient, stop: StopRequest, notify: Callable[[str, str], None], scan_id: str = "", first: bool = True
 ) -> bool:
-    """Wait until a row may begin, and home the stage for it where that is safe; False when asked to stop now meanwhile.
+    """Wait until a row may begin, and home the stage if that is safe; return False if asked to stop now.
 
-    The stage is homed before the first row only, when somebody has just asked for a scan and expects it to move, and
-    never out of a stage that was lost or is in alarm: somebody pressed the emergency stop, or has an arm in the way.
+    The stage is homed only before the first row, when the operator expects motion, and never after `STAGE_FAULTS`:
+    somebody pressed the emergency stop, or has an arm in the way.
 
     Parameters
     ----------
-    pi, stop, say
-        The Pi, what may ask to stop, and who is told of homing.
+    pi, stop, notify
+        The Pi, stop requests, and a callback for phase and message.
     scan_id
-        The run that has to be begun; "" for any.
+        Run that the Pi must have begun; "" for any.
     first
-        Whether nothing has moved for this program yet.
+        True if this program has not moved the stage yet.
 
     Raises
     ------
     ScanError
-        when the stage is not ready, and may not be homed or does not become ready by it.
+        if the stage is not ready and must not be homed, or homing fails.
     """
     status = pi.status()
     if status.state == "ready" and status.homed and status.scan_id == (scan_id or status.scan_id):
         return not stop.now
-    check_may_move(status, scan_id, first)
-    if status.state in AT_WORK:
-        say("wait", f"the stage is {status.state!r}; the row begins when it is ready")
+    check_between_rows(status, scan_id, first)
+    if status.state in MOVING:
+        notify("wait", f"the stage is {status.state!r}; the row begins when it is ready")
     else:
-        say("home", "homing the stage")
+        notify("home", "homing the stage")
         pi.home()
-    return _await_ready(pi, stop, scan_id)
+    return _wait_ready(pi, stop, scan_id)
 
 
-def count_lost_steps(pi: PiClient, stop: StopRequest, say: Callable[[str, str], None]) -> tuple[float, float] | None:
-    """Home once more after the last row, against the switches; None where that was not possible, or not wanted.
+def measure_lost_steps(
+    pi: PiClient, stop: StopRequest, notify: Callable[[str, str], None]
+) -> tuple[float, float] | None:
+    """Home again after the last row; return the lost steps in x and y, millimetres, or None if not possible or wanted.
 
-    Returns how far in x and y, millimetres, the switches are from where they were by the count of steps: what the
-    drives have lost since the homing before.
+    Lost steps are the distance between the switches and where the count of steps expects them since the last homing.
 
     Raises
     ------
     ScanError
-        when the stage does not become ready by it.
+        if homing fails.
     """
     if stop.after_row or pi.status().state != "ready":
         return None
-    say("home", "homing the stage once more, to see whether steps were lost")
+    notify("home", "homing the stage again, to measure lost steps")
     pi.home()
-    if not _await_ready(pi, stop, ""):
+    if not _wait_ready(pi, stop, ""):
         return None
     status = pi.status()
     return status.lost_x_mm, status.lost_y_mm
 
 
-def _await_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
-    """Wait until the stage is ready; False when asked to stop now meanwhile. Raises ScanError."""
-    deadline = time.monotonic() + _HOMING_LIMIT_S
+def _wait_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
+    """Wait until the stage is ready; return False if asked to stop now. Raises ScanError."""
+    deadline = time.monotonic() + _HOMING_TIMEOUT_S
     while True:
         status = pi.status()
         if status.state == "ready":
             return not stop.now
-        if status.state not in AT_WORK:
-            check_may_move(status, scan_id, first=False)
+        if status.state not in MOVING:
+            check_between_rows(status, scan_id, first=False)
         if stop.now:
             pi.abort(ON_REQUEST.text)
             return False
         if time.monotonic() > deadline:
             raise ScanError(
-                f"the stage is {status.state!r} {_HOMING_LIMIT_S:.0f} s after homing began",
+                f"the stage is {status.state!r} {_HOMING_TIMEOUT_S:.0f} s after homing began",
                 "the stage stands still, or its switches are not reached",
                 "look at the stage; `journalctl -u polysight-pi -n 20` on the Pi",
+                code=ErrorCode.STAGE_NOT_READY,
             )
         pi.event_socket.poll(100)
         pi.events()
 
 
-def check_may_move(status: StatusReply, scan_id: str, first: bool) -> None:
-    """Raise ScanError where a row could begin only after homing, and somebody has to have a look before that."""
+def check_between_rows(status: StatusReply, scan_id: str, first: bool) -> None:
+    """Raise ScanError if the next row needs homing and a person must look at the stage before that."""
+    problem: tuple[str, str, str] | None = None
     if scan_id and status.scan_id not in ("", scan_id):
-        raise ScanError(
-            f"the Pi has begun another run meanwhile: {status.scan_id}", "another host uses it", "wait for its end"
-        )
-    if scan_id and not status.scan_id:
-        raise ScanError(
-            "the Pi's program was started anew between two rows",
-            "power was lost there, or the program ended",
-            "why it ended: `journalctl -u polysight-pi` on the Pi",
-        )
-    if status.state == "fault" and (not first or status.fault in STAGE_FAULTS):
+        what = f"the Pi has begun another run in the meantime: {status.scan_id}"
+        problem = what, "another host uses it", "wait for its end"
+    elif scan_id and not status.scan_id:
+        why = "power was lost there, or the program ended"
+        problem = "the Pi's program restarted between two rows", why, "see `journalctl -u polysight-pi` on the Pi"
+    elif status.state == "fault" and (not first or status.fault in STAGE_FAULTS):
         e = explain(status.fault)
-        raise ScanError(f"the stage is not ready: {e.what}: {status.reason}", e.why, e.remedy)
-    if not first and (status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)):
-        raise ScanError(
-            f"the stage is {status.state!r} between two rows" + (f": {status.reason}" if status.reason else ""),
-            "its position was lost, homing was stopped, or somebody ended the run at the Pi",
-            "see that nothing is in the way, then `polysight-pi home`",
-        )
+        problem = f"the stage is not ready: {e.what}: {status.reason}", e.why, e.remedy
+    elif not first and (status.state in ("idle", "homed") or (status.state == "ready" and not status.homed)):
+        what = f"the stage is {status.state!r} between two rows" + (f": {status.reason}" if status.reason else "")
+        why = "its position was lost, homing was stopped, or somebody ended the run at the Pi"
+        problem = what, why, "check that nothing is in the way, then `polysight-pi home`"
+    if problem:
+        raise ScanError(*problem, code=ErrorCode.STAGE_NOT_READY)
 
 
 def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
-    """Refuse to go on without space for so many rows and the reserve. Raises ScanError."""
+    """Check that the disk has space for this number of rows and the reserve. Raises ScanError."""
     need = rows * instrument.recorded_row_bytes
     reserve = instrument.limits.free_disk_bytes
     free = shutil.disk_usage(folder).free
@@ -138,17 +140,18 @@ def check_disk(folder: Path, instrument: Instrument, rows: int) -> None:
             "the disk is too full for this scan",
             f"free space, then `polysight resume {folder}`; or lower limits.free_disk_bytes in instrument.toml, and add"
             " --config instrument.toml",
+            code=ErrorCode.DISK_FULL,
         )
 
 
 def pi_fact(hello: HelloReply) -> Fact:
-    """What a manifest keeps of the Pi that drives a scan."""
+    """Return the manifest's description of the Pi."""
     return {"release": hello.pi_release, "firmware": hello.firmware, "backend": hello.backend, "stage": hello.stage}
 
 
-def differences(stage: Stage, hello: HelloReply) -> list[str]:
-    """Each placing key of `[stage]` that the Pi has otherwise, with both values; [] for a Pi that does not tell."""
-    own = stage.placing
+def stage_differences(stage: Stage, hello: HelloReply) -> list[str]:
+    """List the keys of `[stage]` that place rows and differ on the Pi, with both values; [] if it reports none."""
+    own = stage.placement_settings
     return [
         f"stage.{key} is {own[key]:.10g} here and {hello.stage[key]:.10g} on the Pi"
         for key in own
@@ -157,23 +160,24 @@ def differences(stage: Stage, hello: HelloReply) -> list[str]:
 
 
 def check_same_stage(stage: Stage, hello: HelloReply, source: str) -> list[str]:
-    """Refuse a Pi that would place the rows elsewhere; `source` is where `stage` is from.
+    """Check that the Pi places rows where `stage` does; `source` names the origin of `stage`.
 
     Returns
     -------
     list of str
-        Warnings: that the Pi is of a release that does not tell.
+        A warning if the Pi's release does not report its `[stage]`.
 
     Raises
     ------
     ScanError
-        naming each key with both values.
+        with both values of each key that differs.
     """
-    if differing := differences(stage, hello):
+    if differing := stage_differences(stage, hello):
         raise ScanError(
             f"host and Pi place rows differently: {'; '.join(differing)}",
             f"the rig file of the Pi is not that of {source}; rows of both would be two coordinate systems in one scan",
             "copy the right [stage] to the other machine and `sudo systemctl restart polysight-pi`; rows taken with"
             " other values belong to another scan",
+            code=ErrorCode.STAGE_DIFFERS,
         )
-    return [] if hello.stage else [UNTOLD]
+    return [] if hello.stage else [STAGE_NOT_REPORTED]

@@ -1,7 +1,7 @@
-"""A scan from the first row that is not committed to the last: `run_scan` and `resume_scan`.
+"""Start or resume a scan: `run_scan` and `resume_scan`.
 
-Every row is a transaction (docs/spec/scan-folder.md): taken, checked by count, made durable, and only then a line in
-the manifest. Whatever ends the program at any time, `resume_scan` goes on from there.
+Every row is a transaction (docs/spec/scan-folder.md): it is recorded, checked by count, made durable, and only then
+added to the manifest. After a crash or power loss at any time, `resume_scan` continues with the first missing row.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from pathlib import Path
 import zmq
 
 from polysight.host.acquisition.capture_rig import CaptureRig
-from polysight.host.acquisition.control import StopRequest, interrupts_wait
+from polysight.host.acquisition.control import StopRequest, delay_interrupts
 from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult
-from polysight.host.acquisition.ready import check_same_stage, differences, pi_fact
+from polysight.host.acquisition.ready import check_same_stage, pi_fact, stage_differences
 from polysight.host.acquisition.scan_loop import RunningScan
 from polysight.host.calibration import copy_into_scan
 from polysight.host.radar import RadarControl, radar_control
@@ -29,11 +29,10 @@ from polysight.host.store import (
     utc_now,
 )
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ScanError
 from polysight.shared.messages import HelloReply, is_simulated
 from polysight.shared.raster import check_burst_fits, plan_raster
-
-__all__ = ["OnRow", "ScanProgress", "ScanResult", "resume_scan", "run_scan"]
 
 
 def run_scan(
@@ -46,35 +45,35 @@ def run_scan(
     stop: StopRequest | None = None,
     radars: RadarControl | None = None,
 ) -> ScanResult:
-    """Make a new scan folder and scan the rig into it.
+    """Create a scan folder and record a scan into it.
 
     Parameters
     ----------
     instrument
         The rig, the grid and the limits.
     folder
-        Scan folder to make.
+        Scan folder to create.
     on_row
-        Called with each committed row's index, in order, from one worker thread of low priority.
+        Called with each committed row's index, in order, in a low-priority worker thread.
     progress
-        Called from the calling thread.
+        Called in the calling thread.
     keep_incomplete
-        Commit a row that stays incomplete after all retakes, masked, instead of failing.
+        Commit a row that is incomplete after all retakes, masked, instead of failing.
     stop
-        Asked to stop once: after this row; twice: now. Ctrl-C asks, where this runs in the main thread.
+        Requested once: stop after the current row; twice: now. In the main thread, Ctrl-C requests.
     radars
-        What arms the radars for each row; that of the rig file when None. Closed at the end.
+        Arms the radars for each row; default: as the rig file says. Closed at the end.
 
     Raises
     ------
     PolysightError
-        naming the hop that failed and what to do; the manifest says the same, and all committed rows are safe.
+        with the hop that failed and what to do, also in the manifest; all committed rows are safe.
     """
     plan = plan_raster(instrument.grid)
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
     with ExitStack() as stack:
         pi, rig, hello = _connect(stack, instrument, progress)
-        untold = check_same_stage(instrument.stage, hello, "this scan")
+        warnings = check_same_stage(instrument.stage, hello, "this scan")
         simulated = is_simulated(hello.backend)
         scan = ScanFolder.create(
             folder,
@@ -82,17 +81,12 @@ def run_scan(
             plan,
             simulated=simulated,
             scan_id=new_scan_id(),
-            extra={
-                "pi": pi_fact(hello),
-                "calibration": copy_into_scan(instrument, folder, simulated),
-            },
+            extra={"pi": pi_fact(hello), "calibration": copy_into_scan(instrument, folder, simulated)},
         )
         writer = stack.enter_context(scan.writer())
         radars = stack.enter_context(radars or radar_control(instrument))
         stop = stop or StopRequest()
-        running = RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop)
-        running.result.warnings += untold
-        return running.run()
+        return RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop).run(warnings)
 
 
 def resume_scan(
@@ -105,11 +99,10 @@ def resume_scan(
     radars: RadarControl | None = None,
     rig_now: Instrument | None = None,
 ) -> ScanResult:
-    """Go on with a scan at its first row that is not committed; committed rows are compared with their digests.
+    """Resume a scan at its first missing row, after comparing committed rows with their digests.
 
-    A row that is not what was committed is taken again. `rig_now` says how the Pi and the boards are reached from now
-    on, and the limits; in all else it has to be the rig that the scan was begun with
-    (:func:`polysight.host.store.scan_folder.check_same_scan`).
+    A row that differs from its digest is taken again. `rig_now` may change addresses and limits; everything else must
+    be equal to the rig that the scan was begun with (:func:`polysight.host.store.check_same_scan`).
 
     Parameters and errors as :func:`run_scan`. `on_row` is called for the rows committed earlier too.
     """
@@ -127,28 +120,25 @@ def resume_scan(
                 f"{folder} is a scan that is {kind}, and the Pi's backend is {hello.backend!r}",
                 "simulated and measured rows must never be mixed in one scan",
                 "start the Pi with the backend the scan was begun with, or make a new scan",
+                code=ErrorCode.MISMATCH,
             )
         if not hello.stage or any(fact.get("pi", {}).get("stage") for fact in scan.facts("scan_started")):
-            untold = check_same_stage(scan.instrument.stage, hello, f"{folder}")
-        else:  # its rows lie where that Pi had them, whatever the host's rig file says
-            untold = [f"when the scan began nobody compared: {d}" for d in differences(scan.instrument.stage, hello)]
+            warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")
+        else:  # the earlier rows were placed by that Pi, not by the host's rig file
+            found = stage_differences(scan.instrument.stage, hello)
+            warnings = [f"not compared when the scan began: {d}" for d in found]
         missing = scan.plan.rows - len(scan.committed())
         fact = {"fact": "scan_resumed", "resumed_utc": utc_now(), "rows_missing": missing, "pi": pi_fact(hello)}
-        told = {} if rig_now is None else {"rig": connection_of(rig_now)}
-        writer.append({**fact, **told})
+        writer.append({**fact, **({} if rig_now is None else {"rig": connection_of(rig_now)})})
         scan.reload()
         radars = stack.enter_context(radars or radar_control(scan.instrument))
         stop = stop or StopRequest()
         running = RunningScan(scan, writer, pi, rig, radars, on_row, progress, keep_incomplete, stop)
-        running.result.warnings += withdrawn + untold
-        return running.run()
+        return running.run(withdrawn + warnings)
 
 
 def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProgress | None) -> list[str]:
-    """Take back the commit of every row whose files are not what was committed, so that it is taken again.
-
-    Returns what to tell about it. Raises DeviceError.
-    """
+    """Withdraw every committed row whose files differ from their digests; return warnings. Raises DeviceError."""
     rows = scan.committed()
     if progress is not None:
         progress(ScanProgress("check", f"comparing {len(rows)} committed rows with their digests", scan.plan.rows, 0))
@@ -163,13 +153,13 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
 def _connect(
     stack: ExitStack, instrument: Instrument, progress: OnProgress | None
 ) -> tuple[PiClient, CaptureRig, HelloReply]:
-    """Reach the Pi and every card, so that a scan folder is made only when everybody answers."""
+    """Connect to the Pi and every card, before a scan folder is created."""
     if progress is not None:
-        progress(ScanProgress("connect", "reaching the Pi and the capture cards", instrument.grid.rows, 0))
-    # A context's plain end waits for ever for a socket that nobody closed, such as one whose making was interrupted.
+        progress(ScanProgress("connect", "connecting to the Pi and the capture cards", instrument.grid.rows, 0))
+    # Context.term() would wait forever for a socket that was never closed, as after an interrupt in PiClient().
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     stack.callback(context.destroy, linger=0)
-    with interrupts_wait():
+    with delay_interrupts():
         pi = stack.enter_context(PiClient(context, instrument))
     hello = pi.hello()
     rig = stack.enter_context(CaptureRig(instrument))

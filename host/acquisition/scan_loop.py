@@ -1,4 +1,4 @@
-"""The scan that runs: row after row, each waited for, taken, settled; and its end, whichever it is."""
+"""Main loop of a scan: wait for, record and commit every missing row, then record how the scan ended."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 from polysight.host.acquisition.capture_rig import CaptureRig
-from polysight.host.acquisition.control import StopRequest, interrupts_request
+from polysight.host.acquisition.control import StopRequest, stop_on_interrupt
 from polysight.host.acquisition.pi_client import PiClient
 from polysight.host.acquisition.progress import (
     OnProgress,
@@ -16,23 +16,23 @@ from polysight.host.acquisition.progress import (
     ScanProgress,
     ScanResult,
     time_left,
-    usual_row_s,
+    typical_row_s,
 )
-from polysight.host.acquisition.ready import check_disk, check_may_move, count_lost_steps, make_ready
+from polysight.host.acquisition.ready import check_between_rows, check_disk, make_ready, measure_lost_steps
 from polysight.host.acquisition.row import RowState, RowTaker, RowTransaction
-from polysight.host.acquisition.take import ON_REQUEST, Take, commit_row, gave_up, reasons, reject_row
+from polysight.host.acquisition.take import ON_REQUEST, Take, commit_row, reasons, reject_row, retakes_exhausted
 from polysight.host.radar import RadarControl
 from polysight.host.store import EVENTS, EventWriter, Fact, ManifestWriter, ScanFolder, read_events, utc_now
 from polysight.shared.errors import PolysightError, advice
 from polysight.shared.messages import AnyEvent, BeginRun, RowStarted, RunStarted
 from polysight.shared.raster import Row
 
-_LOOK_S = 0.05
-_LOST_MM = 0.05  # told as a warning from here on: 9 degrees of phase at 77 GHz
+_POLL_S = 0.05
+_LOST_STEPS_WARNING_MM = 0.05  # 9 degrees of phase at 77 GHz
 
 
 class RunningScan:
-    """A scan that runs: everything is connected, the folder is locked."""
+    """A running scan; needs connected devices and a locked folder."""
 
     def __init__(
         self,
@@ -53,36 +53,36 @@ class RunningScan:
         self._queue = ProcessingQueue(on_row, scan.instrument.limits.rows_waiting)
         self._committed = set(scan.committed())
         self._row_seconds: list[float] = []
-        self._row_began: float | None = None  # monotonic, moved on by what is no time of a row; None between rows
-        self._current = (-1, 0, 0)
+        self._row_began: float | None = None  # monotonic, plus pauses; None between rows
+        self._current = (-1, 0, 0)  # row, take, points
         self._state = ""
-        self._told_stop = False
-        self._was_ready = False  # the stage was, in this run
+        self._stop_announced = False
+        self._was_ready = False  # the stage, in this run
         self._remedy: Fact = {}  # of the error that ended the scan
-        self._lost: Fact = {}  # what homing after the last row found
-        self.result = ScanResult(scan, "fail", "ended unexpectedly", warnings=list(rig.warnings))
+        self._lost_steps: Fact = {}
+        self.result = ScanResult(scan, "fail", "ended unexpectedly")
 
-    def run(self) -> ScanResult:
-        """Take every missing row, and write down how it ended.
+    def run(self, warnings: list[str]) -> ScanResult:
+        """Record every missing row and how the scan ended; `warnings` are put into the result.
 
-        Raises what :func:`polysight.host.acquisition.scan.run_scan` does.
+        Raises PolysightError as :func:`polysight.host.acquisition.scan.run_scan`.
         """
-        for warning in self.result.warnings:
-            self._say("warning", warning)
+        for warning in self._rig.warnings + warnings:
+            self._warn(warning)
         begun = False
         events = EventWriter(self._scan.path / EVENTS)
         try:
-            with interrupts_request(self._stop):
+            with stop_on_interrupt(self._stop):
                 self._pi.follow(self._scan.scan_id, events.last_seq, events.append)
                 self._pi.begin_run(self._begin_run(events.last_seq))
                 begun = True
-                self._pi.drain()  # what an earlier program missed belongs to its takes, not to ours
-                self._tell_lost(self._pi.events())
+                self._pi.drain()  # events of an earlier program's takes
+                self._warn_of_lost_events(self._pi.events())
                 events.sync()
                 self._queue.add_earlier(sorted(self._committed))
-                self._keep_radar_report({})
+                self._write_radar_report({})
                 self._rows(events)
-                self._count_lost_steps()
+                self._check_lost_steps()
                 self._end(begun)
                 events.sync()
         except BaseException as e:
@@ -95,10 +95,10 @@ class RunningScan:
         return self.result
 
     def _fail(self, e: BaseException, begun: bool) -> None:
-        """An error ends the scan: bring the rig to rest, write down why, and add to the error what is safe."""
+        """Bring the rig to rest after an error, record the reason, and add to the error which rows are safe."""
         self.result.exit_status = "abort" if isinstance(e, KeyboardInterrupt) else "fail"
         safe = f"{len(self._committed)} of {self._plan.rows} rows are safe"
-        resume = f"`polysight resume {self._scan.path}` goes on from there"
+        resume = f"`polysight resume {self._scan.path}` continues from there"
         if isinstance(e, PolysightError):
             e.remedy = advice(e.remedy, safe, "" if f"polysight resume {self._scan.path}" in e.remedy else resume)
             self._remedy = {"why": e.why, "remedy": e.remedy}
@@ -106,9 +106,9 @@ class RunningScan:
         else:
             e.add_note(advice(safe, resume))
             self.result.reason = f"{type(e).__name__}: {e}"
-        with interrupts_request(self._stop):
+        with stop_on_interrupt(self._stop):
             if begun:
-                with suppress(PolysightError):  # what failed first is what is told
+                with suppress(PolysightError):  # the first error is the one to report
                     self._pi.come_to_rest(self.result.reason[:500])
             with suppress(PolysightError):
                 self._end(begun)
@@ -126,20 +126,18 @@ class RunningScan:
             heartbeat_ms=i.pi.host_heartbeat_ms,
         )
 
-    def _tell_lost(self, events: list[AnyEvent]) -> None:
-        """Say so when the Pi's journal ended before our event log."""
+    def _warn_of_lost_events(self, events: list[AnyEvent]) -> None:
+        """Warn if the Pi's journal is shorter than the scan's event log."""
         for event in events:
             if isinstance(event, RunStarted) and event.lost:
-                warning = (
+                self._warn(
                     f"the Pi's journal of this scan ends {event.lost} events before {self._scan.path / EVENTS}: it was"
-                    f" removed, damaged or cut by a power loss; nothing is missing here, the scan goes on with event"
+                    f" removed, damaged or cut by a power loss; nothing is missing here, the scan continues with event"
                     f" {event.seq}"
                 )
-                self.result.warnings.append(warning)
-                self._say("warning", warning)
 
     def _rows(self, events: EventWriter) -> None:
-        """Take every row that is not committed, in order."""
+        """Record every missing row, in order."""
         todo = [row for row in self._plan if row.index not in self._committed]
         check_disk(self._scan.path, self._instrument, len(todo))
         takes = takes_so_far(self._scan)
@@ -152,7 +150,7 @@ class RunningScan:
             self._scan.path,
             self._stop,
             self._point,
-            self._say,
+            self._notify,
         )
         for row in todo:
             if self._stop.after_row:
@@ -163,7 +161,7 @@ class RunningScan:
                 break
             self._row_seconds.append(time.monotonic() - self._row_began)
             self._row_began = None
-            self._say("committed", f"row {row.index} committed")
+            self._notify("committed", f"row {row.index} committed")
         left = self._plan.rows - len(self._committed)
         if left == 0:
             self.result.exit_status, self.result.reason = "success", "every row is committed"
@@ -171,30 +169,27 @@ class RunningScan:
             self.result.exit_status = "abort"
             self.result.reason = f"stopped on request, {left} of {self._plan.rows} rows are missing"
 
-    def _count_lost_steps(self) -> None:
-        """Home after the last row, and say what the drives have lost. What fails here ends no scan: it is whole."""
+    def _check_lost_steps(self) -> None:
+        """Measure lost steps by homing after the last row; a failure is only a warning, the scan is complete."""
         if not (self._instrument.stage.home_after_scan and self._was_ready and self.result.exit_status == "success"):
             return
         try:
-            lost_mm = count_lost_steps(self._pi, self._stop, self._say)
+            lost_mm = measure_lost_steps(self._pi, self._stop, self._notify)
         except PolysightError as e:
-            warning = f"every row is committed; lost steps were not counted: {e.what}"
-        else:
-            self._lost = {"lost_mm": lost_mm} if lost_mm else {}
-            if lost_mm is None or max(map(abs, lost_mm)) < _LOST_MM:
-                return
-            warning = (
-                f"the drives lost {lost_mm[0]:.3f} mm in x and {lost_mm[1]:.3f} mm in y since the homing before:"
-                " rows may be displaced; look at belts, screws and drivers, and scan again"
+            self._warn(f"every row is committed; lost steps were not measured: {e.what}")
+            return
+        self._lost_steps = {"lost_mm": lost_mm} if lost_mm else {}
+        if lost_mm and max(map(abs, lost_mm)) >= _LOST_STEPS_WARNING_MM:
+            self._warn(
+                f"the drives lost {lost_mm[0]:.3f} mm in x and {lost_mm[1]:.3f} mm in y since the last homing:"
+                " rows may be displaced; check belts, screws and drivers, and scan again"
             )
-        self.result.warnings.append(warning)
-        self._say("warning", warning)
 
     def _row(self, row: Row, first_take: int, taker: RowTaker, events: EventWriter) -> None:
-        """Take a row until it is whole or the retakes are used up; commit it. Returns uncommitted when aborted."""
+        """Record and commit a row, with retakes; return without commit if asked to stop."""
         last_take = first_take + self._instrument.limits.row_retakes
         for number in range(first_take, last_take + 1):
-            transaction = RowTransaction(self._entered)
+            transaction = RowTransaction(self._on_state)
             try:
                 take = self._take(row, number, taker, transaction)
                 if take is None:
@@ -208,38 +203,38 @@ class RunningScan:
                 raise
             faults = take.faults(self._instrument.burst.pulses)
             if number == last_take:
-                raise gave_up(take, faults, self._scan, number - first_take + 1)
-            check_may_move(self._pi.status(), self._scan.scan_id, first=False)
+                raise retakes_exhausted(take, faults, self._scan, number - first_take + 1)
+            check_between_rows(self._pi.status(), self._scan.scan_id, first=False)
             if take.silent_boards:
-                self._rig.configure(take.silent_boards)  # a card that was without power has forgotten how
+                self._rig.configure(take.silent_boards)  # a card that lost power has lost its configuration
             self.result.retakes += 1
-            self._say("retake", f"row {row.index} is taken again: {reasons(faults)}")
+            self._notify("retake", f"row {row.index} is taken again: {reasons(faults)}")
 
     def _take(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
-        """Wait until the row may begin, and take it; None when asked to stop before it began."""
+        """Wait until the row may begin, and record it; return None if asked to stop before it began."""
         check_disk(self._scan.path, self._instrument, 1)
         if not self._wait_while_paused() or not self._wait_for_processing():
             return None
-        with self._clock_stopped():
-            ready = make_ready(self._pi, self._stop, self._say, self._scan.scan_id, first=not self._was_ready)
+        with self._untimed():
+            ready = make_ready(self._pi, self._stop, self._notify, self._scan.scan_id, first=not self._was_ready)
         if not ready:
             return None
         self._was_ready = True
         self._current = (row.index, number, row.points)
-        self._say("row", f"row {row.index}" + (f", take {number}" if number > 1 else ""))
+        self._notify("row", f"row {row.index}" + (f", take {number}" if number > 1 else ""))
         try:
             return taker.take(row, number, transaction)
         finally:
-            self._keep_radar_report({"row": row.index, "take": number})
+            self._write_radar_report({"row": row.index, "take": number})
 
-    def _keep_radar_report(self, of: Fact) -> None:
-        """Write what the radars told since the last time, if they tell anything."""
-        if told := self._radars.report():
-            self._writer.append({"fact": "radars", **of, **told})
+    def _write_radar_report(self, of: Fact) -> None:
+        """Add the radars' report since the last one to the manifest, if there is one."""
+        if report := self._radars.report():
+            self._writer.append({"fact": "radars", **of, **report})
 
     @contextmanager
-    def _clock_stopped(self) -> Iterator[None]:
-        """What happens within is no time of a row: the next one does not take it. Waiting for processing is."""
+    def _untimed(self) -> Iterator[None]:
+        """Exclude the block from the row's duration, unlike waiting for processing."""
         began = time.monotonic()
         try:
             yield
@@ -248,38 +243,38 @@ class RunningScan:
                 self._row_began += time.monotonic() - began
 
     def _wait_while_paused(self) -> bool:
-        """Until nobody wants a pause any more; the manifest says from when to when. False when asked to stop."""
+        """Wait for the end of a pause and record it in the manifest; return False if asked to stop."""
         if not self._stop.paused:
             return not self._stop.now
         self._writer.append({"fact": "scan_paused", "paused_utc": utc_now()})
-        self._say("wait", "paused on request; the next row begins when the scan is told to go on")
-        with self._clock_stopped():
+        self._notify("wait", "paused on request; `continue` begins the next row")
+        with self._untimed():
             while self._stop.paused:
                 if self._stop.after_row:
                     return False
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
                 self._pi.events()
         self._writer.append({"fact": "scan_continued", "continued_utc": utc_now()})
-        self._say("wait", "going on")
+        self._notify("wait", "continued")
         return not self._stop.after_row
 
     def _wait_for_processing(self) -> bool:
-        """Until processing has caught up; nothing is lost by waiting. False when asked to stop meanwhile."""
-        told = False
+        """Wait until processing has caught up; return False if asked to stop."""
+        waited = False
         while waiting := self._queue.behind:
             if self._stop.after_row:
                 return False
-            if not told:
-                self._say("wait", f"{waiting} rows wait to be processed; the next one begins when they are fewer")
-            told = True
-            self._queue.wait(_LOOK_S)
+            if not waited:
+                self._notify("wait", f"{waiting} rows wait to be processed; the next one begins when they are fewer")
+            waited = True
+            self._queue.wait(_POLL_S)
             self._pi.events()
-        return not (self._stop.now or (told and self._stop.after_row))
+        return not (self._stop.now or (waited and self._stop.after_row))
 
     def _settle(self, take: Take, last: bool, transaction: RowTransaction, events: EventWriter) -> bool:
-        """Commit the take, or reject it and say why. Whether it is committed."""
+        """Commit or reject the take; return True if it is committed."""
         row, faults = take.row.index, take.faults(self._instrument.burst.pulses)
-        keep = last and self._keep_incomplete and take.bursts_are_whole and not self._stop.now
+        keep = last and self._keep_incomplete and take.all_pulses_sent and not self._stop.now
         if faults and not keep:
             reject_row(self._scan, self._writer, take, [ON_REQUEST] if self._stop.now else faults)
             transaction.to(RowState.REJECTED)
@@ -290,11 +285,11 @@ class RunningScan:
         self._queue.add(row)
         if faults:
             self.result.incomplete_rows.append(row)
-            self._say("warning", f"row {row} is kept incomplete: {reasons(faults)}")
+            self._notify("warning", f"row {row} is kept incomplete: {reasons(faults)}")
         return True
 
     def _end(self, begun: bool) -> None:
-        """Write how the scan ended, and tell the Pi."""
+        """Add `scan_ended` to the manifest and end the Pi's run."""
         status, reason = self.result.exit_status, self.result.reason
         self._writer.append(
             {
@@ -302,14 +297,14 @@ class RunningScan:
                 "exit_status": status,
                 "reason": reason,
                 **self._remedy,
-                **self._lost,
+                **self._lost_steps,
                 "rows_committed": len(self._committed),
                 "events_refetched": self._pi.gaps_filled,
                 "ended_utc": utc_now(),
             }
         )
         waiting = f"; {self._queue.left} rows wait to be processed" if self._queue.left else ""
-        self._say("end", reason + waiting)
+        self._notify("end", reason + waiting)
         if not begun:
             return
         try:
@@ -318,38 +313,43 @@ class RunningScan:
         except PolysightError as e:
             if status != "success":
                 raise
-            self.result.warnings.append(f"the Pi could not be told that the scan ended: {e.what}")
+            self.result.warnings.append(f"the Pi's run could not be ended: {e.what}")
 
     def _point(self, points: int) -> None:
-        if self._stop.after_row and not self._stop.now and not self._told_stop:
-            self._told_stop = True
-            self._say("stop", "the scan ends after this row; Ctrl-C once more ends it now")
-        self._say("row", "", points)
+        if self._stop.after_row and not self._stop.now and not self._stop_announced:
+            self._stop_announced = True
+            self._notify("stop", "the scan ends after this row; Ctrl-C once more ends it now")
+        self._notify("row", "", points)
 
-    def _say(self, phase: str, message: str, points: int = 0) -> None:
+    def _warn(self, warning: str) -> None:
+        self.result.warnings.append(warning)
+        self._notify("warning", warning)
+
+    def _notify(self, phase: str, message: str, points: int = 0) -> None:
+        """Report progress, if a callback was given; drop the callback if it fails."""
         if self._progress is None:
             return
         rows, committed = self._plan.rows, len(self._committed)
         remaining = None
         if self._row_seconds:
             elapsed_s = time.monotonic() - self._row_began if self._row_began is not None else 0.0
-            remaining = time_left(rows - committed, usual_row_s(self._row_seconds), elapsed_s)
+            remaining = time_left(rows - committed, typical_row_s(self._row_seconds), elapsed_s)
         row, take, row_points = self._current
-        told = ScanProgress(phase, message, rows, committed, row, take, points, row_points, remaining, self._state)
+        report = ScanProgress(phase, message, rows, committed, row, take, points, row_points, remaining, self._state)
         try:
-            self._progress(told)
-        # A terminal that is gone, or a log on a full disk, is no reason to end a row.
+            self._progress(report)
+        # A closed terminal, or a log on a full disk, must not end the row.
         except Exception as e:  # noqa: BLE001
             self._progress = None
-            self.result.warnings.append(f"progress is told no more: {type(e).__name__}: {e}")
+            self.result.warnings.append(f"progress is no longer reported: {type(e).__name__}: {e}")
 
-    def _entered(self, state: RowState) -> None:
+    def _on_state(self, state: RowState) -> None:
         self._state = str(state)
-        self._say("state", "")
+        self._notify("state", "")
 
 
 def takes_so_far(scan: ScanFolder) -> dict[int, int]:
-    """The highest take of every row that was ever begun, so that no take number is used twice."""
+    """Return the highest take number of every row that was begun, so that none is used twice."""
     begun = [(f["row"], f["take"]) for kind in ("row_committed", "row_rejected") for f in scan.facts(kind)]
     events = read_events(scan.path / EVENTS).events
     begun += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]

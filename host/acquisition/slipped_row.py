@@ -1,4 +1,4 @@
-"""A row of which a board missed pulses: its frames found by arrival time, and its files written anew in their order."""
+"""Repair a row in which a board missed pulses: place frames by arrival time and rewrite the row's files."""
 
 from __future__ import annotations
 
@@ -11,111 +11,95 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.acquisition.missed_pulses import PlacedFrames, earliest_pulse, place_frames, slipped_frames
+from polysight.host.acquisition.missed_pulses import PlacedFrames, place_frames, slipped_frames, time_before_first_pulse
 from polysight.host.capture import PACKETS, RowCapture, read_index, read_packets, write_index, write_packets
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 from polysight.shared.messages import Capture
 from polysight.shared.raster import Row
 
-HEADERS_BYTES = 14  # of `card.packet_bytes`: what is not payload (docs/spec/dca1000.md)
+HEADERS_BYTES = 14  # of `card.packet_bytes` are not payload (docs/spec/dca1000.md)
 _SHOWN = 4
 Gap = tuple[int, int]
 
 
-class ToldCapture(NamedTuple):
-    """A capture event, and when the host read it (monotonic clock, ns)."""
+class ReceivedCapture(NamedTuple):
+    """A capture event and the time at which the host read it (monotonic clock, ns)."""
 
     event: Capture
-    told_ns: int
+    received_ns: int
 
 
-def find_frames(path: Path, row: Row, told: list[ToldCapture], rig: Instrument) -> PlacedFrames:
-    """Where the frames of a row that lacks some belong.
+def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instrument) -> PlacedFrames:
+    """Place the frames of a row that has fewer frames than pulses.
 
-    Parameters
-    ----------
-    path
-        The row's file; its index is beside it.
-    row
-        The row, for its points.
-    told
-        Its capture events.
-    rig
-        For burst, frames and packets.
-
-    Raises
-    ------
-    DataError
-        when the index is not readable.
+    `path` is the row's file, with its index beside it; `events` are the row's capture events. Raises DataError if the
+    index is not readable.
     """
-    times = _times(path, row, told, rig)
+    times = _times(path, row, events, rig)
     if times is None:
-        nothing = np.full(0, -1, dtype=np.int64)
-        return PlacedFrames(
-            nothing, [], row.points * rig.burst.pulses, "the capture events of the row are not complete"
-        )
+        none = np.full(0, -1, dtype=np.int64)
+        return PlacedFrames(none, [], row.points * rig.burst.pulses, "capture events of the row are missing")
     return place_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES)
 
 
-def find_slip(path: Path, row: Row, told: list[ToldCapture], rig: Instrument) -> PlacedFrames | None:
-    """Where the frames of a row that seems whole belong, when they are not at their pulses; else None.
+def find_slip(path: Path, row: Row, events: list[ReceivedCapture], rig: Instrument) -> PlacedFrames | None:
+    """Place the frames of a row with a frame for every pulse; None if no frame is found to have slipped.
 
     Parameters and errors as :func:`find_frames`.
     """
-    times = _times(path, row, told, rig)
+    times = _times(path, row, events, rig)
     return slipped_frames(*times, rig.frame_bytes, rig.card.packet_bytes - HEADERS_BYTES) if times else None
 
 
-def first_pulse_ns(told: list[ToldCapture]) -> int | None:
-    """A time before the row's first pulse, monotonic clock, by its capture events; None where they do not tell."""
-    events = [t for t in sorted(told, key=lambda t: t.event.point) if t.event.pulses]
+def first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
+    """Return a time before the row's first pulse (monotonic clock) from its capture events; None if undetermined."""
+    events = sorted((e for e in events if e.event.pulses), key=lambda e: e.event.point)
     if not events or events[0].event.point != 0:
         return None
-    first, last = [t.event.first_pulse_ns for t in events], [t.event.last_pulse_ns for t in events]
+    return time_before_first_pulse(*_event_times(events))
+
+
+def _event_times(events: list[ReceivedCapture]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the time of each pulse (Pi's clock), int64 [burst, pulse], and of each event's receipt, int64 [burst]."""
+    first, last = [e.event.first_pulse_ns for e in events], [e.event.last_pulse_ns for e in events]
     sent = np.linspace(first, last, events[0].event.pulses, axis=1, dtype=np.int64)
-    return earliest_pulse(sent, np.array([t.told_ns for t in events], dtype=np.int64))
+    return sent, np.array([e.received_ns for e in events], dtype=np.int64)
 
 
 def _times(
-    path: Path, row: Row, told: list[ToldCapture], rig: Instrument
+    path: Path, row: Row, events: list[ReceivedCapture], rig: Instrument
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]] | None:
-    """When each pulse was sent, when each event was told, and the row's arrivals; None without all of the events."""
-    pulses = rig.burst.pulses
-    events = [t for t in sorted(told, key=lambda t: t.event.point) if t.event.pulses == pulses]
-    if [t.event.point for t in events] != list(range(row.points)):
+    """Return pulse times, event times and the row's arrivals; None if an event is missing."""
+    events = sorted((e for e in events if e.event.pulses == rig.burst.pulses), key=lambda e: e.event.point)
+    if [e.event.point for e in events] != list(range(row.points)):
         return None
-    _, arrivals = read_index(path.with_suffix(".idx"))
-    first, last = [t.event.first_pulse_ns for t in events], [t.event.last_pulse_ns for t in events]
-    sent = np.linspace(first, last, pulses, axis=1, dtype=np.int64)
-    return sent, np.array([t.told_ns for t in events], dtype=np.int64), arrivals
+    return *_event_times(events), read_index(path.with_suffix(".idx"))[1]
 
 
 def describe(placed: PlacedFrames, pulses: int) -> str:
-    """What was missed, for people; `pulses` in a burst."""
+    """Describe missed pulses and lost frames in a sentence; `pulses` is the number in a burst."""
     count = placed.pulses - placed.slots.size
     if count == 0:
-        return (
-            f"frames are not at their pulses: it saw edges on SYNC_IN that were not sent; {placed.uncertain} are lost"
-        )
+        return f"frames are not at their pulses: spurious edges on SYNC_IN; {placed.uncertain} frames are lost"
     places = [f"position {s // pulses} pulse {s % pulses}" for s in placed.missed[:_SHOWN]]
     more = ["..."] if len(placed.missed) > _SHOWN else []
-    found = f"missed {count} SYNC_IN pulses ({', '.join(places + more) or 'where is not certain'})"
-    return found + (f", and {placed.uncertain} frames beside them cannot be placed" if placed.uncertain else "")
+    found = f"missed {count} SYNC_IN pulses ({', '.join(places + more) or 'positions uncertain'})"
+    return found + (f", and {placed.uncertain} frames near them cannot be placed" if placed.uncertain else "")
 
 
-def write_in_place(path: Path, capture: RowCapture, placed: PlacedFrames, frame_bytes: int) -> RowCapture:
-    """Write a slipped row anew, each frame in the place of its pulse and everything else masked; durable on return.
+def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_bytes: int) -> RowCapture:
+    """Rewrite a slipped row with each frame at its pulse and everything else masked; durable on return.
 
-    The index keeps the arrivals as they were, and gains `pulses_missed` and `frames`: runs of frames as [number
-    received, number of its pulse, how many].
+    The index keeps its arrivals and gains `pulses_missed` and `frames`: runs of frames as [number of the first frame
+    received, number of its pulse, length].
 
     Raises
     ------
     DeviceError
-        when the disk fails.
+        if the disk fails.
     DataError
-        when the index is not readable.
+        if the index is not readable.
     """
     facts, arrivals = read_index(path.with_suffix(".idx"))
     received = np.fromfile(path, dtype=np.uint8)
@@ -135,8 +119,8 @@ def write_in_place(path: Path, capture: RowCapture, placed: PlacedFrames, frame_
             os.fsync(f.fileno())
     except OSError as e:
         raise DeviceError(f"{path}: cannot be made durable: {e.strerror}", "the disk is full or fails") from None
-    told = {"missing": missing, "located": True, "reason": "", "pulses_missed": placed.missed, "frames": runs}
-    index_crc = write_index(path.with_suffix(".idx"), {**facts, **told}, arrivals)
+    changed = {"missing": missing, "located": True, "reason": "", "pulses_missed": placed.missed, "frames": runs}
+    index_crc = write_index(path.with_suffix(".idx"), {**facts, **changed}, arrivals)
     return msgspec.structs.replace(
         capture,
         missing=missing,
@@ -150,7 +134,7 @@ def write_in_place(path: Path, capture: RowCapture, placed: PlacedFrames, frame_
 
 
 def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
-    """Keep all payload with the row's packets, for the row's file will not hold it as it came; returns the CRC-32."""
+    """Store the payload as received in the row's packet file, before the row's file is rewritten; return its CRC-32."""
     if not path.exists():
         return 0
     evidence, log = read_packets(path, received)
@@ -158,7 +142,7 @@ def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
 
 
 def _runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
-    """Runs of placed frames that follow each other: first received, its slot, how many."""
+    """Return runs of consecutive placed frames: first frame, its slot, length."""
     kept = np.flatnonzero(slots >= 0)
     if not kept.size:
         return []
@@ -168,7 +152,7 @@ def _runs(slots: NDArray[np.int64]) -> list[tuple[int, int, int]]:
 
 
 def _outside(ranges: list[Gap], start: int, stop: int) -> list[Gap]:
-    """What of [start, stop) lies in none of the ranges, which are sorted and may touch."""
+    """Return the parts of [start, stop) outside the ranges, which are sorted and may touch."""
     out = []
     for a, b in ranges:
         if b > start and a < stop:

@@ -26,7 +26,7 @@ from ophyd_async.core import (
     soft_signal_r_and_setter,
 )
 
-from polysight.host.acquisition import ControlDesk, ScanProgress, ScanResult, StopRequest, run_scan
+from polysight.host.acquisition import ControlFolder, ScanProgress, ScanResult, StopRequest, run_scan
 from polysight.host.store import MANIFEST, ScanFolder
 from polysight.shared.config import load_instrument
 from polysight.shared.errors import ConfigError, ScanError
@@ -160,7 +160,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
 
     def _scan(self, folder: Path, loop: asyncio.AbstractEventLoop) -> ScanResult:
         """The scan, in a thread of its own."""
-        with ControlDesk(folder, self._stop) as desk:
+        with ControlFolder(folder, self._stop) as desk:
 
             def told(progress: ScanProgress) -> None:
                 if progress.phase != "connect":

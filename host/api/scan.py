@@ -21,8 +21,8 @@ from polysight.host.products import (
     full_dataset,
     image_dataset,
     patch_dataset,
+    ranges_text,
     read_processed,
-    runs,
     write_netcdf,
     write_zarr,
 )
@@ -343,7 +343,7 @@ class Scan:
         try:
             rows = self.rows
             told = f"{len(rows.committed)} of {rows.planned} rows"
-            told += f" (missing {runs(rows.missing)})" if rows.missing else ""
+            told += f" (missing {ranges_text(rows.missing)})" if rows.missing else ""
         except DataError:
             told = "number of rows not known"
         simulated = "SIMULATED, " if self.simulated else ""

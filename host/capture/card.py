@@ -1,7 +1,7 @@
-"""Control of one DCA1000 over UDP: starting, stopping and resetting it, and the addresses in its EEPROM.
+"""Control of one DCA1000 over UDP: start, stop and reset it, and program the addresses in its EEPROM.
 
-The socket is never connected: replies leave the card from source port 1024, whatever port the command went to. A
-command is sent again only where twice does no harm. When nothing comes back, the error names the hop that is silent.
+The socket is never connected: replies come from the card's port 1024, whatever port the command went to. Only commands
+that are safe to repeat are retried. If no reply comes before the timeout, the error names the hop that does not work.
 `program_eeprom` writes new addresses and a new MAC address, which take effect when the card is next switched on.
 """
 
@@ -14,12 +14,12 @@ import struct
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Code, Reply, Status, Version
 from polysight.host.capture.network import bind_udp, no_route, silent_card
 from polysight.shared.config import Board, Card
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError, ProtocolError
 
 ATTEMPTS = 3
@@ -30,21 +30,21 @@ _OTHER_MAC = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:
 
 
 class CardClient:
-    """One capture card, addressed as its board says.
+    """Client of one capture card.
 
     Parameters
     ----------
     board
         Name, addresses and ports.
     timeout_s
-        Limit of a command, all attempts together.
+        Timeout of a command, all attempts together.
     kernel_root
-        Where `proc` and `sys` are, for the diagnosis of a silent card.
+        Folder with `proc` and `sys`, for the diagnosis of a silent card.
 
     Raises
     ------
     DeviceError
-        when the command port is in use or the host address is not this machine's.
+        if the command port is in use or the host address is not this machine's.
     """
 
     def __init__(self, board: Board, timeout_s: float, kernel_root: Path = Path("/")) -> None:
@@ -57,19 +57,19 @@ class CardClient:
         self.strangers = 0  # datagrams that were neither replies nor status of this card
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when the card reports a status by itself."""
+        """Return the descriptor that becomes readable when the card reports a status."""
         return self._socket.fileno()
 
     def alive(self) -> None:
-        """Ask whether the card is there. Raises DeviceError naming the silent hop."""
+        """Check that the card replies; otherwise raise DeviceError with the first hop that does not work."""
         self._command(Code.ALIVE)
 
     def version(self) -> Version:
-        """The card's FPGA version. Raises DeviceError."""
+        """Return the card's FPGA version. Raises DeviceError."""
         return dca1000.decode_version(self._exchange(Code.VERSION, b"", ATTEMPTS).status)
 
     def configure(self, card: Card, lanes: int = 4) -> None:
-        """Raw capture of `lanes` LVDS lanes to ethernet, 16 bit, and the pace of its packets. Raises DeviceError."""
+        """Configure raw 16-bit capture of `lanes` LVDS lanes to Ethernet, and the packet delay. Raises DeviceError."""
         self._command(Code.CONFIGURE_FPGA, dca1000.configure_fpga_data(lanes))
         self._command(Code.CONFIGURE_PACKET, dca1000.configure_packet_data(card.packet_bytes, card.packet_delay_us))
 
@@ -82,31 +82,22 @@ class CardClient:
         self._command(Code.RESET_RADAR)
 
     def write_eeprom(self, body: bytes) -> Status:
-        """Send the 18 bytes of command 0x04, once; returns the status bits the card reported meanwhile.
+        """Send the 18 bytes of command 0x04; return the status bits that the card reports. For `program_eeprom`.
 
-        Not sent again when no reply comes: it may be writing. Callers use :func:`program_eeprom`.
-        Raises DeviceError when the card refuses or is silent.
+        No retry: the card may be writing. Raises DeviceError when the card refuses or is silent.
         """
         self._status = Status(0)
         self._check(self._exchange(Code.CONFIGURE_EEPROM, body, 1), Code.CONFIGURE_EEPROM)
-        self._receive(EEPROM_REPORT_S)  # a failure is reported by itself, and may come after the reply
+        self._receive(EEPROM_REPORT_S)  # a failure is a separate message, perhaps after the reply
         return self.take_status()
 
     def record_start(self) -> None:
-        """Start a record.
-
-        Not simply sent again when no reply comes, because the record may run already: stopped first.
-
-        Raises
-        ------
-        DeviceError
-            when the card refuses or is silent.
-        """
+        """Start a record; before a retry it is stopped, because it may run already. Raises DeviceError."""
         for attempt in range(ATTEMPTS):
             self.take_status()
-            self._status = Status(0)  # what still waited is of the record before
+            self._status = Status(0)  # of the previous record
             reply = self._try(Code.RECORD_START, b"", self._timeout_s / ATTEMPTS)
-            self._status &= ~Status.RECORD_COMPLETED  # so is this, before the reply
+            self._status &= ~Status.RECORD_COMPLETED  # before the reply: of the previous record
             if reply is not None:
                 self._check(reply, Code.RECORD_START)
                 return
@@ -115,21 +106,21 @@ class CardClient:
         raise self._silent(Code.RECORD_START, ATTEMPTS)
 
     def record_stop(self) -> None:
-        """Stop the record. A card that does not record may refuse; that is no error. Raises DeviceError when silent."""
+        """Stop the record; a card that does not record may refuse. Raises DeviceError if there is no reply."""
         self._exchange(Code.RECORD_STOP, b"", ATTEMPTS)
 
     def wait_completed(self, limit_s: float) -> None:
-        """After a stop: until the card has reported the record as completed, at most so long.
+        """After a stop, wait until the card reports the record as completed, or for the limit.
 
-        It sends the rest of the record as a short packet before that, both after the reply to the stop. What is not
-        waited for would be taken for the next record's.
+        Before that status, but after the reply to the stop, the card sends the rest of the record as a short packet,
+        which must not be taken for the next record's.
         """
         deadline = time.monotonic() + limit_s
         while Status.RECORD_COMPLETED not in self.take_status() and (left := deadline - time.monotonic()) > 0:
             select.select([self._socket], [], [], left)
 
     def take_status(self) -> Status:
-        """Status bits the card reported by itself since the last record start, without waiting."""
+        """Return the status bits that the card reported since the last record start, without waiting."""
         while self._receive(0.0) is not None:
             pass
         return self._status
@@ -141,9 +132,7 @@ class CardClient:
     def __enter__(self) -> CardClient:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _command(self, code: Code, data: bytes = b"") -> None:
@@ -155,6 +144,7 @@ class CardClient:
                 f"{self._name()} refused {code.name} with status {reply.status}",
                 "the card is in another state than expected, or its switches select another mode",
                 "power-cycle the card, and check its mode switches (docs/spec/dca1000.md)",
+                code=ErrorCode.REFUSED_BY_PEER,
             )
 
     def _exchange(self, code: Code, data: bytes, attempts: int) -> Reply:
@@ -167,7 +157,7 @@ class CardClient:
     def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
         """Send once and wait for the reply to this code."""
         while self._receive(0.0) is not None:
-            pass  # replies that came too late for an earlier attempt
+            pass  # late replies to an earlier attempt
         try:
             self._socket.sendto(dca1000.encode_request(code, data), self._address)
         except OSError as e:
@@ -183,7 +173,7 @@ class CardClient:
         return None
 
     def _receive(self, limit_s: float) -> Reply | None:
-        """The next reply, or None after `limit_s`. Status messages are noted on the way, strangers are counted."""
+        """Return the next reply, None after the timeout; collect status bits and count foreign datagrams."""
         deadline = time.monotonic() + limit_s
         while True:
             left = max(0.0, deadline - time.monotonic())
@@ -209,20 +199,20 @@ class CardClient:
         return f"capture card of {self.board.name} at {self.board.card_address}:{self.board.command_port}"
 
     def _silent(self, code: Code, attempts: int) -> DeviceError:
-        """The error for a card that does not answer, with the hop that is silent as far as it can be told."""
-        tried = f"{attempts} attempts" if attempts > 1 else "asked once"
+        """Return the error for a card that does not answer, with the hop that does not work, if known."""
+        tried = f"{attempts} attempts" if attempts > 1 else "1 attempt"
         what = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({tried})"
         return silent_card(self.board, what, self._kernel_root)
 
 
 @dataclass(frozen=True)
 class EepromSettings:
-    """What command 0x04 writes. It takes effect when the card is next switched on.
+    """Settings in the EEPROM; they take effect when the card is next switched on.
 
     Raises
     ------
     ConfigError
-        when a card with these settings could not be reached.
+        if a card with these settings could not be reached.
     """
 
     host_address: str
@@ -254,24 +244,24 @@ class EepromSettings:
 
     @staticmethod
     def of_board(board: Board, card_mac: str = DEFAULT_MAC) -> EepromSettings:
-        """The settings a board of the rig file needs. Cards on one network need different MAC addresses."""
+        """Return the settings for a board of the rig file. Cards on one network need different MAC addresses."""
         return EepromSettings(board.host_address, board.card_address, card_mac, board.command_port, board.data_port)
 
     @property
     def confirmation(self) -> str:
-        """What must be repeated before anything is written: the address the card will have."""
+        """The text that confirms writing: the card's new address."""
         return self.card_address
 
     def encode(self) -> bytes:
-        """The 18 bytes of the command: host, card and MAC address, each with its bytes reversed, and the ports."""
+        """Return the 18 bytes of the command: host, card and MAC address with reversed bytes, and the ports."""
         parts = (self._address(self.host_address).packed, self._address(self.card_address).packed, self._mac())
         return b"".join(part[::-1] for part in parts) + _PORTS.pack(self.command_port, self.data_port)
 
     def text(self) -> str:
-        """The settings for people."""
+        """Describe the settings in a sentence."""
         return (
             f"card {self.card_address} ({self.card_mac}) answers to {self.host_address}:{self.command_port} and sends"
-            f" data to port {self.data_port}, from when it is next switched on"
+            f" data to port {self.data_port} after it is next switched on"
         )
 
     def _mac(self) -> bytes:
@@ -285,33 +275,35 @@ class EepromSettings:
 
     @staticmethod
     def _wrong(what: str, remedy: str = "correct the board in instrument.toml") -> ConfigError:
-        return ConfigError(f"EEPROM settings refused: {what}", "a card with them could not be reached", remedy)
+        why = "a card with them could not be reached"
+        return ConfigError(f"EEPROM settings refused: {what}", why, remedy, code=ErrorCode.VALUE_INVALID)
 
 
 def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -> None:
-    """Write the settings into the card that `card` reaches now.
+    """Write the settings to the EEPROM of a card.
 
     Parameters
     ----------
     card
         Client of the card at its present address and ports.
     settings
-        What it shall have after its next power-up.
+        Settings after the next power-up.
     confirmed
-        Must be `settings.confirmation`, as typed by whoever asks for it.
+        Must be equal to `settings.confirmation`, as typed by the user.
 
     Raises
     ------
     ConfigError
-        when the confirmation is another; nothing was sent.
+        if the confirmation differs; nothing was sent.
     DeviceError
-        when the card is silent, refuses, or reports an EEPROM failure.
+        if the card is silent, refuses, or reports an EEPROM failure.
     """
     if confirmed != settings.confirmation:
         raise ConfigError(
             f"EEPROM not written: confirmed with {confirmed!r}, not {settings.confirmation!r}",
             settings.text(),
             f"repeat the card's new address, {settings.confirmation}, to write it",
+            code=ErrorCode.VALUE_INVALID,
         )
     card.alive()
     status = card.write_eeprom(settings.encode())
@@ -320,4 +312,5 @@ def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -
             f"card at {card.board.card_address} reports an EEPROM failure after {Code.CONFIGURE_EEPROM.name}",
             "the EEPROM could not be written",
             "write it again before switching the card off; its addresses may be damaged",
+            code=ErrorCode.REFUSED_BY_PEER,
         )

@@ -1,4 +1,4 @@
-"""The DCA1000's bytes: requests, replies, asynchronous status and data packet headers. No sockets here.
+"""Formats of the DCA1000: requests, replies, asynchronous status and data packet headers, without sockets.
 
 Specification: docs/spec/dca1000.md. Everything is little-endian.
 """
@@ -9,12 +9,13 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ProtocolError
 
 REQUEST_MAGIC = 0xA55A
 FOOTER = 0xEEAA
 MAX_REQUEST_DATA = 504
-CARD_SOURCE_PORT = 1024  # replies and data leave the card from here, whatever port it listens on
+CARD_SOURCE_PORT = 1024  # of replies and data, whatever port the card listens on
 PACKET_HEADER_BYTES = 10
 MAX_PAYLOAD_BYTES = 1456
 MAX_PACKET_BYTES = PACKET_HEADER_BYTES + MAX_PAYLOAD_BYTES
@@ -60,12 +61,12 @@ class Status(IntFlag):
 
 
 LOST_BEFORE_PACKETS = Status.DDR_FULL | Status.LVDS_BUFFER_FULL
-"""On these bits the card dropped data before it numbered the packets: bytes are gone without a gap in the counters."""
+"""Status bits that report data dropped before the packets were numbered: bytes are lost without a counter gap."""
 
 
 @dataclass(frozen=True)
 class Reply:
-    """Eight bytes from the card: the answer to a command, or (code STATUS) an asynchronous status."""
+    """Eight bytes from the card: the reply to a command, or (code STATUS) an asynchronous status."""
 
     code: int
     status: int
@@ -91,83 +92,86 @@ class Counters:
     sequence: int
 
     def after(self, size: int, packets: int) -> Counters:
-        """The counters so many bytes and packets later."""
+        """Return the counters `size` bytes and `packets` packets later."""
         return Counters(
             (self.byte_count + size) % (1 << BYTE_COUNT_BITS), (self.sequence + packets) % (1 << SEQUENCE_BITS)
         )
 
 
 def encode_request(code: int, data: bytes = b"") -> bytes:
-    """A request as sent to the card. Raises ProtocolError when `data` is longer than the card takes."""
+    """Encode a request to the card. Raises ProtocolError if `data` is longer than the card takes."""
     if len(data) > MAX_REQUEST_DATA:
-        raise ProtocolError(f"request data of {len(data)} bytes is longer than {MAX_REQUEST_DATA}")
+        what = f"request data of {len(data)} bytes is longer than {MAX_REQUEST_DATA}"
+        raise ProtocolError(what, code=ErrorCode.VALUE_INVALID)
     return _HEAD.pack(REQUEST_MAGIC, code, len(data)) + data + _FOOTER.pack(FOOTER)
 
 
 def decode_request(raw: bytes) -> tuple[int, bytes]:
-    """(code, data) of a request. Raises ProtocolError when the bytes are not a request."""
+    """Decode a request to (code, data). Raises ProtocolError if the bytes are not a request."""
+    what = f"not a DCA1000 request of {len(raw)} bytes: {raw[:16].hex(' ')}"
     if len(raw) < _HEAD.size + _FOOTER.size:
-        raise ProtocolError(f"request of {len(raw)} bytes is shorter than its frame")
+        raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
     magic, code, size = _HEAD.unpack_from(raw)
     data = raw[_HEAD.size : -_FOOTER.size]
     if magic != REQUEST_MAGIC or _FOOTER.unpack(raw[-_FOOTER.size :])[0] != FOOTER or size != len(data):
-        raise ProtocolError(f"not a DCA1000 request: {raw[:16].hex(' ')}")
+        raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
     return code, data
 
 
 def encode_reply(code: int, status: int) -> bytes:
-    """A reply as the card sends it."""
+    """Encode a reply as the card sends it."""
     return _REPLY.pack(REQUEST_MAGIC, code, status, FOOTER)
 
 
 def decode_reply(raw: bytes) -> Reply:
-    """A reply or asynchronous status. Raises ProtocolError when the bytes are not one."""
-    if len(raw) != _REPLY.size:
-        raise ProtocolError(f"reply of {len(raw)} bytes, expected {_REPLY.size}: {raw[:16].hex(' ')}")
-    magic, code, status, footer = _REPLY.unpack(raw)
-    if magic != REQUEST_MAGIC or footer != FOOTER:
-        raise ProtocolError(f"not a DCA1000 reply: {raw.hex(' ')}")
-    return Reply(code, status)
+    """Decode a reply or asynchronous status. Raises ProtocolError if the bytes are not one."""
+    if len(raw) == _REPLY.size:
+        magic, code, status, footer = _REPLY.unpack(raw)
+        if magic == REQUEST_MAGIC and footer == FOOTER:
+            return Reply(code, status)
+    what = f"not a DCA1000 reply of {_REPLY.size} bytes: {len(raw)} bytes, {raw[:16].hex(' ')}"
+    raise ProtocolError(what, code=ErrorCode.MESSAGE_INVALID)
 
 
 def configure_fpga_data(lanes: int = 4, timer: int = 30) -> bytes:
-    """Body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), capture, ethernet, 16 bit, timer."""
+    """Encode the body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), Ethernet, 16 bit, timer."""
     if lanes not in (2, 4):
-        raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}")
+        raise ProtocolError(f"the card captures 2 or 4 LVDS lanes, not {lanes}", code=ErrorCode.VALUE_INVALID)
     return bytes([1, 1 if lanes == 4 else 2, 1, 2, 3, timer])
 
 
 def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:
-    """Body of 0x0B: packet size, delay between packets in 8 ns ticks, zero. 1470 and 25 us is `be 05 35 0c 00 00`."""
+    """Encode the body of 0x0B: packet size, delay in 8 ns ticks, zero. 1470 and 25 us gives `be 05 35 0c 00 00`."""
     ticks = round(delay_us * DELAY_TICKS_PER_US)
     if not 0 <= ticks <= 0xFFFF:
-        raise ProtocolError(f"packet delay of {delay_us} us is {ticks} ticks of 8 ns, outside 0..65535")
+        what = f"packet delay of {delay_us} us is {ticks} ticks of 8 ns, outside 0..65535"
+        raise ProtocolError(what, code=ErrorCode.VALUE_INVALID)
     return struct.pack("<HHH", packet_bytes, ticks, 0)
 
 
 def decode_version(status: int) -> Version:
-    """FPGA version from the status word of the reply to 0x0E: bits 0-6 major, 7-13 minor, 14 playback."""
+    """Decode the FPGA version in the status of the reply to 0x0E: bits 0-6 major, 7-13 minor, 14 playback."""
     return Version(status & 0x7F, (status >> 7) & 0x7F, bool(status >> 14 & 1))
 
 
 def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
-    """A data packet; both counters wrap."""
+    """Encode a data packet; both counters wrap."""
     count = byte_count & ((1 << BYTE_COUNT_BITS) - 1)
     return _PACKET.pack(sequence & 0xFFFFFFFF, count & 0xFFFFFFFF, count >> 32) + payload
 
 
 def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
-    """(sequence, byte count); the byte count is the number of payload bytes before this packet.
+    """Decode (sequence, byte count); the byte count is the number of payload bytes before this packet.
 
-    Raises ProtocolError when there is no payload.
+    Raises ProtocolError if there is no payload.
     """
     if len(packet) <= PACKET_HEADER_BYTES:
-        raise ProtocolError(f"data packet of {len(packet)} bytes holds no payload")
+        raise ProtocolError(f"data packet of {len(packet)} bytes has no payload", code=ErrorCode.MESSAGE_INVALID)
     sequence, low, high = _PACKET.unpack_from(packet)
     return sequence, low | high << 32
 
 
 def counter_difference(counter: int, origin: int, bits: int) -> int:
-    """`counter - origin` of the card's counters, which wrap after so many bits; nearest to zero."""
+    """Return `counter - origin` of counters that wrap after `bits` bits; nearest to zero."""
     half = 1 << (bits - 1)
     return (counter - origin + half) % (2 * half) - half

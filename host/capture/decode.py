@@ -1,4 +1,4 @@
-"""From the card's bytes to complex IF samples."""
+"""Decode the card's bytes to complex IF samples."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Mask = NDArray[np.bool_] | Sequence[tuple[int, int]] | None
@@ -20,17 +21,17 @@ def row_words(
     rx: int = 4,
     swap_iq: bool = False,
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
-    """A 4-lane recording in its own order, without a copy: what `polysight.host.sync` takes.
+    """Return the words of a 4-lane recording in their own order, without a copy, as `polysight.host.sync` takes them.
 
-    Parameters, `valid` and errors as of :func:`decode_row`; the words are int16 [frame, sample, 2, rx], I before Q.
-    Those of frames that are not valid mean nothing.
+    Parameters, `valid` and errors as of :func:`decode_row`; the words are int16 [frame, sample, 2, rx], I before Q,
+    undefined for invalid frames.
     """
     words = _words(payload, frames * samples * rx * 2).reshape(frames, samples, 2, rx)
     return words[:, :, ::-1] if swap_iq else words, valid_frames(mask, frames, samples * rx * 4)
 
 
 def raw_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
-    """The words behind complex frames [rx, frame, sample] in ADC counts: int16 [frame, sample, 2, rx]."""
+    """Encode complex frames [rx, frame, sample] in ADC counts as words: int16 [frame, sample, 2, rx]."""
     rx, count, samples = frames.shape
     out = np.empty((count, samples, 2, rx), np.int16)
     for part, values in enumerate((frames.real, frames.imag)):
@@ -51,25 +52,25 @@ def decode_row(
     Parameters
     ----------
     payload
-        Bytes as sent, int16 little-endian, at least frames x samples x rx x 4 of them; more are ignored.
+        Bytes as sent, int16 little-endian, at least frames x samples x rx x 4; more are ignored.
     mask
-        What is missing: bool per byte (True = missing), or byte ranges (start, stop), or None.
+        Missing bytes: bool per byte (True = missing), or byte ranges (start, stop), or None.
     frames, samples, rx
         Frames of one chirp, ADC samples of a chirp, RX antennas.
     swap_iq
-        True when the recording has Q first.
+        True if the recording has Q first.
 
     Returns
     -------
     samples
-        complex64 [rx, frame, sample], ADC counts. Frames with any missing byte are zero.
+        complex64 [rx, frame, sample], ADC counts; zero for frames with a missing byte.
     valid
-        bool [frame], False where a byte of the frame is missing.
+        bool [frame], False for frames with a missing byte.
 
     Raises
     ------
     DataError
-        when the payload is shorter than frames x samples x rx say.
+        if the payload is shorter than the shape requires.
     """
     words, valid = row_words(payload, mask, frames, samples, rx, swap_iq)
     out = np.empty((rx, frames, samples), dtype=np.complex64)
@@ -87,7 +88,8 @@ def decode_two_lane(
     `samples` must be even. Returns complex64 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
     """
     if samples % 2:
-        raise DataError(f"a 2-lane chirp has an even number of samples, not {samples}", "wrong number of samples given")
+        what = f"a 2-lane chirp has an even number of samples, not {samples}"
+        raise DataError(what, "wrong number of samples given", code=ErrorCode.VALUE_INVALID)
     words = _words(payload, chirps * samples * rx * 2).reshape(chirps, rx, samples // 2, 2, 2)
     first, second = (1, 0) if swap_iq else (0, 1)
     out = np.empty((rx, chirps, samples), dtype=np.complex64)
@@ -99,7 +101,7 @@ def decode_two_lane(
 def decode_real(
     payload: bytes | memoryview | NDArray[np.uint8], lanes: int, chirps: int, samples: int, rx: int = 4
 ) -> NDArray[np.float32]:
-    """Decode a recording of real samples: with 4 lanes every RX a sample, with 2 a whole chirp of RX0, then RX1...
+    """Decode a recording of real samples: with 4 lanes sample by sample, with 2 a whole chirp of RX0, then RX1...
 
     Returns float32 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
     """
@@ -117,7 +119,7 @@ def decode_adjacent(
     rx: int = 4,
     swap_iq: bool = False,
 ) -> NDArray[np.complex64]:
-    """Decode a recording in which I and Q of a sample stand side by side: `I0 Q0 I1 Q1`.
+    """Decode a recording with adjacent I and Q of each sample: `I0 Q0 I1 Q1`.
 
     With 2 lanes a whole chirp of RX0, then RX1...; with 4 lanes every RX of a sample, then the next sample. Returns
     complex64 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
@@ -134,13 +136,14 @@ def decode_adjacent(
 
 
 def valid_frames(mask: Mask, frames: int, frame_bytes: int) -> NDArray[np.bool_]:
-    """Bool [frame]: whether every byte of the frame is there. `mask` as in :func:`decode_row`."""
+    """Return bool [frame], True if no byte of the frame is missing. `mask` as in :func:`decode_row`."""
     valid = np.ones(frames, dtype=np.bool_)
     if mask is None:
         return valid
     if isinstance(mask, np.ndarray):
         if mask.size < frames * frame_bytes:
-            raise DataError(f"mask of {mask.size} bytes is shorter than {frames} frames of {frame_bytes} bytes")
+            what = f"mask of {mask.size} bytes is shorter than {frames} frames of {frame_bytes} bytes"
+            raise DataError(what, code=ErrorCode.MISMATCH)
         return np.logical_not(np.any(mask[: frames * frame_bytes].reshape(frames, frame_bytes), axis=1))
     for start, stop in mask:
         if stop > start:
@@ -155,5 +158,6 @@ def _words(payload: bytes | memoryview | NDArray[np.uint8], count: int) -> NDArr
             f"recording of {raw.size} bytes is shorter than the {count * 2} bytes its shape needs",
             "truncated file, or wrong numbers of frames, samples or RX",
             "check the chirp and burst of the rig file the recording was made with",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     return raw[: count * 2].view("<i2")

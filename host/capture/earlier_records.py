@@ -1,6 +1,6 @@
-"""What the records before tell about a row: where it may start, and which counters are theirs.
+"""Knowledge from earlier records: possible start counters of a row's record, and the counters that earlier ones used.
 
-`CounterView` holds the counters of a row's packets relative to a reference; `record_search.py` decides with both.
+`CounterView` has the counters of a row's packets relative to a reference; `record_search.py` uses both.
 """
 
 from __future__ import annotations
@@ -19,56 +19,34 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Span:
-    """Counters of an earlier record: packets that carry them are left over.
-
-    `sure`: packets of that record came, or its place is certain. Otherwise it may never have been sent. `missing`: byte
-    ranges of it that did not come, of a record whose place was certain; None: any of it may still come.
-    """
+    """Counters of an earlier record: packets with these counters are left over."""
 
     start: Counters
     size: int
-    sure: bool = True
-    missing: tuple[tuple[int, int], ...] | None = None
+    sure: bool = True  # packets of the record came, or its place is certain; otherwise perhaps never sent
+    missing: tuple[tuple[int, int], ...] | None = None  # byte ranges still missing; None: any of it may still come
 
 
 @dataclass(frozen=True)
 class Past:
-    """What the records before tell about this one.
+    """Knowledge about the record of a row from the records before it."""
 
-    Attributes
-    ----------
-    base
-        Where the record before this one started, when that was certain.
-    ends
-        The sizes in bytes that it may have had: this record starts behind one of them. One of a located record.
-    spans
-        Counters of earlier records.
-    joint, joined
-        Where a whole record ended whose start was not believed, and how many of them followed without a seam.
-    unseen
-        Whether a record may have been sent of which nothing came, and it is not known where.
-    guessed
-        Whether `base` is not certain: only where its record ended is.
-    anew
-        How many whole records, one behind the other, began with the counters of a card that was just switched on.
-    """
-
-    base: Counters | None = None
-    ends: tuple[int, ...] = ()
-    spans: tuple[Span, ...] = ()
-    joint: Counters | None = None
-    joined: int = 0
-    unseen: bool = False
-    guessed: bool = False
-    anew: int = 0
+    base: Counters | None = None  # start of the previous record, if certain
+    ends: tuple[int, ...] = ()  # its possible sizes, bytes; this record starts behind one of them
+    spans: tuple[Span, ...] = ()  # counters of earlier records
+    joint: Counters | None = None  # end of a complete record with a doubtful start
+    joined: int = 0  # number of doubtful records that followed each other without a gap
+    unseen: bool = False  # a record may have been sent, at an unknown place, of which nothing came
+    guessed: bool = False  # `base` is uncertain, only the end of its record is known
+    anew: int = 0  # number of consecutive complete records with the first counters of a card just switched on
 
     @staticmethod
     def ending_at(start: Counters) -> Past:
-        """The record before ended here for certain."""
+        """Knowledge if the previous record certainly ended here."""
         return Past(start, (0,))
 
     def starts_after(self, strays: PacketLog) -> Past:
-        """The same after packets that came between two records: some of them may be of a record nobody knows."""
+        """Return the knowledge after packets between two records, which may be of an unknown record."""
         if strays.count == 0 or self.base is None or self._knows(strays):
             return self
         return replace(self, base=None, ends=())
@@ -93,7 +71,7 @@ class CounterView:
         self.line = self.ahead - full * self.steps
 
     def inside(self, spans: tuple[Span, ...], sure: bool) -> Flags:
-        """Whether each has counters of one of these records."""
+        """Bool [packet], True for counters of one of these records."""
         found = np.zeros(self.sizes.size, dtype=np.bool_)
         for span in spans:
             if span.sure is sure:
@@ -101,7 +79,7 @@ class CounterView:
         return found
 
     def came_before(self, spans: tuple[Span, ...]) -> Flags:
-        """Whether each has counters that came already: a copy on a slow path, or a card that began anew."""
+        """Bool [packet], True for counters that came already: a late copy, or the card has restarted."""
         found = np.zeros(self.sizes.size, dtype=np.bool_)
         for span in spans:
             if span.sure and span.missing is not None:
@@ -112,33 +90,33 @@ class CounterView:
         return found
 
     def _of(self, span: Span) -> tuple[Flags, Counts]:
-        """Whether each has counters of a record, and how many bytes it lies behind that one's start."""
+        """Bool [packet], True for counters of a record; int64 [packet], bytes behind that record's start."""
         ahead = counter_differences(self._counts, span.start.byte_count, BYTE_COUNT_BITS)
         steps = counter_differences(self._sequences, span.start.sequence, SEQUENCE_BITS)
         return (ahead >= 0) & (ahead < span.size) & (ahead == self.full * steps), ahead
 
     def at(self, base: int, line: int) -> Counters:
-        """The counters so many bytes from the reference, on a line."""
+        """Return the counters `base` bytes behind the reference, on a line."""
         return self.reference.after(base, (base - line) // self.full)
 
 
 def line_of(end: int, full: int) -> int:
-    """The line of a record that starts behind one of `end` bytes, relative to that one's start."""
+    """Return the line of a record that follows a record of `end` bytes, relative to the start of that record."""
     return end - full * -(-end // full)
 
 
 def full_payload(log: PacketLog) -> int:
-    """Payload of a full packet: the card's usual one, unless the packets of a longer row show another."""
+    """Return the payload of a full packet: the card's default, unless the packets of a longer row show another."""
     sizes = log.sizes
     if log.expected < MAX_PAYLOAD_BYTES or sizes.size == 0 or (sizes == MAX_PAYLOAD_BYTES).any():
         return MAX_PAYLOAD_BYTES
-    _, one = np.unique(log.byte_counts, return_index=True)  # a network may bring one packet many times
+    _, one = np.unique(log.byte_counts, return_index=True)  # without duplicates
     values, counts = np.unique(sizes[one], return_counts=True)
     return int(values[counts == counts.max()].max()) if counts.max() > 2 else MAX_PAYLOAD_BYTES
 
 
 def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
-    """`counters - origin` of the card's counters, int64 [n], which wrap after so many bits; nearest to zero."""
+    """Return `counters - origin`, int64 [n], of counters that wrap after `bits` bits; nearest to zero."""
     spare = 64 - bits
     wrapped = (counters.astype(np.uint64) - np.uint64(origin)) << np.uint64(spare)  # the counter's top bit is the sign
     return wrapped.view(np.int64) >> np.int64(spare)

@@ -1,8 +1,8 @@
-"""What is in a recording of a DCA1000: shape, range profile, clipping, missing antennas, order of I and Q.
+"""Inspect a recording of a DCA1000: layout, range profile, clipping, missing antennas, order of I and Q.
 
-What is not known is guessed from the statistics, and called a guess: of all layouts that fit, the one whose spectra
-have the least disorder is taken. A file of whole packets, headers included, is recognised and placed by byte count
-first. `inspect_pcap.py` reads packet captures; `polysight.host.jobs.look` prints and plots the report.
+An unknown layout is guessed (and called a guess): of all layouts that fit, the one whose spectra have the least
+disorder. A file of whole packets, with headers, is recognised and placed by byte count first. `pcap.py` reads packet
+captures; `polysight.host.jobs.look` prints and plots the report. `kind_of` recognises other kinds of files.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import MAX_PACKET_BYTES, MAX_PAYLOAD_BYTES, Status
-from polysight.host.capture.file_kinds import MAGIC
 from polysight.host.capture.layouts import (
     SAMPLES_TRIED,
     Guess,
@@ -29,40 +28,62 @@ from polysight.host.capture.layouts import (
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed, place_record
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 MOST_BYTES = 256 << 20
-"""How much of a file is read: eleven rows of the published scan."""
-_LOOKED_AT = 16  # headers that tell whether a file holds whole packets
+"""Part of a file that is read: eleven rows of the published scan."""
+_HEADERS_READ = 16  # to recognise a file of whole packets
 _FULL_SCALE = 32767  # ADC counts
 _MUCH_DC = 0.05 * _FULL_SCALE
-_CLEARLY = 0.08  # so much less disorder in another layout contradicts the one that was given
+_CLEARLY = 0.08  # difference in disorder by which another layout contradicts the given one
 _WHITE = 0.94  # of the disorder of white noise
 _UNIFORM = 0.45 * _FULL_SCALE  # standard deviation of values that fill the whole range
+MAGIC = {
+    b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
+    b"PK\x03\x04": "an archive (zip)", b"\x1f\x8b": "compressed (gzip)", b"\x89HDF": "HDF5",
+    b"BZh": "compressed (bzip2)", b"\xfd7zXZ": "compressed (xz)", b"\x93NUMPY": "a numpy array",
+    b"RIFF": "sound or video (RIFF)", b"MATLAB 5.0": "a MATLAB file",
+}  # fmt: skip
+
+
+def kind_of(head: bytes) -> str:
+    """Describe the kind of file that begins with these bytes: `a picture (PNG)`, `text`, or `unknown bytes`."""
+    for magic, kind in MAGIC.items():
+        if head.startswith(magic):
+            return kind
+    if not head:
+        return "empty"
+    text = head.decode("utf-8", "ignore")
+    return "text" if len(text.encode()) > len(head) - 4 and _printable(text) else "unknown bytes"
+
+
+def _printable(text: str) -> bool:
+    return all(c.isprintable() or c.isspace() for c in text)
 
 
 def is_mirrored(power: NDArray[np.float64]) -> bool:
-    """Whether a complex spectrum, float64 [bin], lies at negative frequencies: I and Q are in the other order.
+    """True if a complex spectrum, float64 [bin], is at negative frequencies: I and Q are swapped.
 
-    Where IF up to 0.9 sample rates is kept (complex 1x) the upper half is no proof; much more power in the last quarter
-    than in the first is, because returns come from near. The bins next to zero are left out.
+    For complex 1x (IF up to 0.9 sample rates) power in the upper half is no proof, so the last quarter is compared with
+    the first: returns come from near. The bins next to zero are left out.
     """
     n, rim = power.size, 3
     return bool(power[n - n // 4 : n - rim].sum() > 4 * power[rim + 1 : n // 4 + 1].sum())
 
 
 def is_offset_binary(words: NDArray[np.int16]) -> bool:
-    """Whether the values spread far less once their sign bit is turned round."""
+    """True if inverting the sign bit reduces the spread of the values clearly."""
     some = words[: 1 << 20]
     return bool(some.size and (some ^ np.int16(-0x8000)).std() < some.std() / 4)
 
 
 def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
-    """The packets of a file that holds full packets one after another, the last perhaps short; none of any other.
+    """Return the packets of a file of consecutive full packets, the last perhaps short; [] for any other file.
 
-    Some programs write packets to a file as they come: each 1456 bytes of payload then begin with ten of counters.
+    Some programs write packets as they come: 1456 bytes of payload, each behind ten bytes of counters.
     """
-    count = min(_LOOKED_AT, payload.size // MAX_PACKET_BYTES)
+    count = min(_HEADERS_READ, payload.size // MAX_PACKET_BYTES)
     if count < 2:
         return []
     some = payload[: count * MAX_PACKET_BYTES].reshape(count, MAX_PACKET_BYTES)
@@ -75,16 +96,17 @@ def packets_in_file(payload: NDArray[np.uint8]) -> list[bytes]:
 
 
 def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
-    """Place a record whose length is not known: it reaches from the lowest to the highest byte count.
+    """Place a record of unknown length, from the lowest to the highest byte count.
 
-    Returns its bytes, uint8 [n], and what became of the packets. Raises DataError when they are not of one record.
+    Returns its bytes, uint8 [n], and the result. Raises DataError if the packets are not of one record.
     """
     counts = [dca1000.decode_packet_header(p)[1] for p in packets]
     ahead = [dca1000.counter_difference(c, counts[0], dca1000.BYTE_COUNT_BITS) for c in counts]
     ends = [a + len(p) - dca1000.PACKET_HEADER_BYTES for a, p in zip(ahead, packets, strict=True)]
     size = max(ends) - min(ahead)
     if size > 1 << 34:
-        raise DataError(f"byte counts span {size} bytes: more than one record, or corrupted packets")
+        what = f"byte counts span {size} bytes: more than one record, or corrupted packets"
+        raise DataError(what, code=ErrorCode.FILE_DAMAGED)
     log = PacketLog(size)
     for packet in packets:
         log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
@@ -94,7 +116,7 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of a recording beforehand; what is None is guessed."""
+    """Known properties of a recording; None is guessed."""
 
     lanes: int | None = None
     is_complex: bool | None = None
@@ -105,23 +127,23 @@ class Known:
 
     @staticmethod
     def of_shape(shape: Shape, q_first: bool | None = False) -> Known:
-        """Everything, for a recording of this layout."""
+        """Return all properties of a recording in this layout."""
         return Known(shape.lanes, shape.is_complex, shape.samples, shape.rx, q_first, shape.adjacent)
 
     @staticmethod
     def of_instrument(rig: Instrument) -> Known:
-        """What a rig file makes the card send; I first, as mmWave Studio configures it."""
+        """Return the properties of a rig's recordings; I first, as mmWave Studio configures it."""
         return Known.of_shape(Shape.of_instrument(rig))
 
 
 @dataclass
 class Report:
-    """What a recording holds.
+    """Content of a recording.
 
     `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
-    float64 [samples], or half as many of real samples. `rx_profile_db` is the same of every antenna over the same
-    median. `rx_rms` and `rx_dc` are one value an antenna, ADC counts. `guessed` names what was not given. `guesses` are
-    the layouts that agree with what was given, likeliest first. `not_a_capture` says why the file is none.
+    float64 [samples], or half as many for real samples. `rx_profile_db` is the same for every antenna over the same
+    median. `rx_rms` and `rx_dc` are one value per antenna, ADC counts. `guessed` names properties that were not given,
+    `guesses` are the layouts that fit, likeliest first, `not_a_capture` is the reason why the file is no recording.
     """
 
     path: Path
@@ -151,7 +173,7 @@ class Report:
 
 @dataclass
 class CardReport:
-    """What a packet capture says about the card: replies (code, status), FPGA version, status, the record."""
+    """A card in a packet capture: replies (code, status), FPGA version, status, the record."""
 
     address: str
     replies: list[tuple[str, int]]
@@ -163,22 +185,28 @@ class CardReport:
 
 
 def inspect_bin(path: Path, known: Known = Known()) -> Report:
-    """Inspect a payload file; says so when it does not hold what is known of it.
+    """Inspect a payload file; remark on properties that contradict `known`.
 
-    Raises DataError when it is absent, or shorter than one chirp.
+    Raises DataError if the file is missing or shorter than one chirp.
     """
     try:
         size = path.stat().st_size
         payload = np.fromfile(path, dtype=np.uint8, count=MOST_BYTES)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read: {e.strerror}", "the path is wrong", "give a recording") from None
+        raise unreadable(path, e) from None
     packets = packets_in_file(payload)
     report = inspect_payload(path, place_packets(packets)[0] if packets else payload, known)
     if packets:
-        report.remarks.append("whole packets, not payload: read by their counters, which a program must cut off first")
+        report.remarks.append("whole packets, not payload: programs must remove the counters of each packet first")
     if size > MOST_BYTES:
-        report.remarks.append(f"only the first {MOST_BYTES >> 20} MiB of {size >> 20} MiB were looked at")
+        report.remarks.append(f"only the first {MOST_BYTES >> 20} MiB of {size >> 20} MiB were read")
     return report
+
+
+def unreadable(path: Path, e: OSError) -> DataError:
+    """Return the error for a recording that cannot be read."""
+    what = f"{path}: cannot be read: {e.strerror}"
+    return DataError(what, "the path is wrong", "give a recording", code=ErrorCode.FILE_UNREADABLE)
 
 
 def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Report:
@@ -188,14 +216,15 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Rep
     shapes = candidates(lanes, is_complex, samples, rx, payload.size, known.adjacent)
     if not shapes:
         raise DataError(
-            f"{path}: {payload.size} bytes are not even one chirp of {samples or min(SAMPLES_TRIED)} samples x {rx} RX",
+            f"{path}: {payload.size} bytes are less than a chirp of {samples or min(SAMPLES_TRIED)} samples x {rx} RX",
             "empty or truncated file",
             "record again; `polysight inspect` needs at least one chirp",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     words = payload[: payload.size // 2 * 2].view("<i2")
     remarks = []
     if is_offset_binary(words):
-        remarks.append("offset binary, not two's complement: read with its sign bit turned round")
+        remarks.append("offset binary, not two's complement: read with inverted sign bits")
         words = words ^ np.int16(-0x8000)
     values = words.view(np.uint8)
     guesses = guess_shapes(values, shapes)
@@ -208,7 +237,7 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Rep
     cube = decode(values, shape, q_first)
     power = spectra(cube).mean(axis=1)
     profile, each = _over_median(power)
-    # Without the bins that a constant offset fills through the window, on both sides of zero.
+    # Without the bins that a constant offset fills, on both sides of zero.
     peak = 2 + int(np.argmax(profile[2:-1] if shape.is_complex else profile[2:]))
     report = Report(
         path=path,
@@ -233,13 +262,13 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], known: Known) -> Rep
         not_a_capture=_not_a_capture(payload, words, guesses),
     )
     if mirrored != q_first and shape.is_complex:
-        report.remarks.append("most power is at negative frequencies: I and Q seem to be in the other order")
+        report.remarks.append("most power is at negative frequencies: I and Q seem to be swapped")
     report.remarks += remarks + _remarks(report)
     return report
 
 
 def _contradiction(values: NDArray[np.uint8], shape: Shape) -> list[str]:
-    """What is said when another layout of the same bytes fits far better than the one taken."""
+    """Return a remark if another layout fits clearly better than the given one."""
     others = [s for s in candidates(None, None, None, shape.rx, values.size) if s != shape]
     better = guess_shapes(values, [shape, *others])[0].shape
     gain = spectral_disorder(values, shape) - spectral_disorder(values, better)
@@ -247,7 +276,7 @@ def _contradiction(values: NDArray[np.uint8], shape: Shape) -> list[str]:
 
 
 def _not_a_capture(payload: NDArray[np.uint8], words: NDArray[np.int16], guesses: list[Guess]) -> str:
-    """Why these bytes were not written by a card; "" when they may have been."""
+    """Return why these bytes were not written by a card; "" if they may have been."""
     head = payload[:8].tobytes()
     for magic, kind in MAGIC.items():
         if head.startswith(magic):
@@ -260,21 +289,20 @@ def _not_a_capture(payload: NDArray[np.uint8], words: NDArray[np.int16], guesses
     # The entropy of a periodogram of white noise is Euler's 1 - 0.577 short of that of equal bins.
     white = min(g.disorder / (1 - 0.423 / np.log(g.shape.bins)) for g in guesses) > _WHITE
     if white and some.std() > _UNIFORM:
-        return "its values fill the whole range evenly, and have no spectrum in any layout: compressed or random bytes"
+        return "its values are uniformly distributed and white in every layout: compressed or random bytes"
     return ""
 
 
 def _is_text(raw: bytes) -> bool:
-    """Whether bytes with a byte order mark are printable in UTF-16."""
+    """True if bytes with a byte order mark are printable in UTF-16."""
     try:
-        text = raw[: len(raw) // 2 * 2].decode("utf-16")
+        return _printable(raw[: len(raw) // 2 * 2].decode("utf-16"))
     except UnicodeDecodeError:
         return False
-    return all(c.isprintable() or c.isspace() for c in text)
 
 
 def _over_median(power: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean over antennas, and every antenna, in dB over the median of the mean. `power` is [rx, bin]."""
+    """Return the mean over antennas, and every antenna, in dB over the median of the mean. `power` is [rx, bin]."""
     mean = power.mean(axis=0)
     floor = max(float(np.median(mean)), 1e-12)
     return 10 * np.log10(np.maximum(mean, 1e-12) / floor), 10 * np.log10(np.maximum(power, 1e-12) / floor)
@@ -285,15 +313,13 @@ def _remarks(r: Report) -> list[str]:
     if r.bytes and max(r.rx_rms) == 0:
         found.append("every sample is zero: nothing was recorded")
     elif silent := [k for k, v in enumerate(r.rx_rms) if v < 0.01 * max(r.rx_rms)]:
-        found.append(f"RX {', '.join(map(str, silent))} hold no signal: antennas off, or another lane layout")
+        found.append(f"RX {', '.join(map(str, silent))} have no signal: antennas off, or another lane layout")
     if r.clipped:
         found.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
     if r.left_over_bytes:
-        found.append(f"{r.left_over_bytes} bytes after the last whole chirp: truncated, or another shape")
+        found.append(f"{r.left_over_bytes} bytes after the last complete chirp: truncated, or another layout")
     if r.rx_dc and max(r.rx_dc) > _MUCH_DC:
-        found.append(
-            f"constant offset of {max(r.rx_dc):.0f} counts: not what this radar's high-pass filter lets through"
-        )
+        found.append(f"constant offset of {max(r.rx_dc):.0f} counts, which this radar's high-pass filter would remove")
     if r.peak_db < 10 and max(r.rx_rms) > 0:
-        found.append("no clear peak in the range profile: noise, or another shape than guessed")
+        found.append("no clear peak in the range profile: noise, or a wrong layout")
     return found

@@ -1,4 +1,4 @@
-"""Layouts of recorded samples: what a DCA1000 writes for each radar, and which of them a recording looks like."""
+"""Layouts of recorded samples that a DCA1000 writes for each radar, and a guess of a recording's layout."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from polysight.shared.config import Instrument
 Samples = NDArray[np.complex64] | NDArray[np.float32]
 SAMPLES_TRIED = (256, 512, 128, 1024, 64)
 DRAW = 0.02
-"""Layouts whose disorder differs by less are not told apart: the likelier one is taken."""
+"""Difference in disorder below which layouts are not distinguished: the likelier one is taken."""
 MOST_CHIRPS = 4096  # enough for the statistics
 _CHIRPS_TRIED = 512
-_PRIOR = 0.9  # of a layout's prior likelihood, that of the next one in the order of `candidates`
+_PRIOR = 0.9  # ratio of prior likelihoods of consecutive layouts of `candidates`
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Shape:
 
     @staticmethod
     def of_instrument(rig: Instrument) -> Shape:
-        """What a rig file makes the card send."""
+        """Return the layout of a rig's recordings."""
         return Shape(4, rig.chirp.if_mode.startswith("complex"), rig.chirp.samples)
 
     @property
@@ -56,7 +56,7 @@ class Shape:
 
 
 def decode(payload: NDArray[np.uint8], shape: Shape, q_first: bool = False, most: int = MOST_CHIRPS) -> Samples:
-    """The first chirps in a layout: complex64 or float32 [rx, chirp, sample]."""
+    """Decode the first chirps in a layout: complex64 or float32 [rx, chirp, sample]."""
     chirps = min(payload.size // shape.chirp_bytes, most)
     if not shape.is_complex:
         return decode_real(payload, shape.lanes, chirps, shape.samples, shape.rx)
@@ -75,7 +75,7 @@ def candidates(
     payload_bytes: int,
     adjacent: bool | None = None,
 ) -> list[Shape]:
-    """Every layout that agrees with what is known and fits into the payload, the likeliest first."""
+    """Return every layout that fits the payload and the given properties, the likeliest first."""
     shapes = (
         Shape(k, c, n, rx, a)
         for n, a, c, k in product(
@@ -90,7 +90,7 @@ def candidates(
 
 @dataclass(frozen=True)
 class Guess:
-    """A layout, its disorder, and how likely it is among those tried (they sum to 1)."""
+    """A layout, its disorder, and its likelihood among those tried (sum 1)."""
 
     shape: Shape
     disorder: float
@@ -98,10 +98,9 @@ class Guess:
 
 
 def guess_shapes(payload: NDArray[np.uint8], shapes: list[Shape]) -> list[Guess]:
-    """The layouts, likeliest first.
+    """Rank the layouts, likeliest first.
 
-    The likelihood falls by e for each :data:`DRAW` of disorder, and a little with each place in the order of `shapes`;
-    it compares the layouts that were tried and no others.
+    The likelihood falls by e for each :data:`DRAW` of disorder, and a little with each place in the order of `shapes`.
     """
     disorder = np.array([spectral_disorder(payload, shape) for shape in shapes])
     weight = np.exp(-(disorder - disorder.min()) / DRAW) * _PRIOR ** np.arange(len(shapes))
@@ -110,10 +109,10 @@ def guess_shapes(payload: NDArray[np.uint8], shapes: list[Shape]) -> list[Guess]
 
 
 def spectral_disorder(payload: NDArray[np.uint8], shape: Shape) -> float:
-    """Entropy of the chirps' spectra over its largest value, 0..1: the right layout has the fewest bins occupied.
+    """Return the relative entropy of the chirps' spectra, 0..1; the right layout occupies the fewest bins.
 
-    The mean of every chirp is removed, or a constant would make any layout look ordered. Values in the wrong place
-    alternate between antennas, between I and Q, or between chirps, which spreads a tone over several lines.
+    The mean of every chirp is removed, or a constant would make any layout look ordered. In a wrong layout, values
+    alternate between antennas, I and Q, or chirps, which spreads a tone over several lines.
     """
     power = spectra(decode(payload, shape, most=_CHIRPS_TRIED), remove_mean=True)
     share = power / np.maximum(power.sum(axis=-1, keepdims=True), 1e-12)
@@ -121,7 +120,7 @@ def spectral_disorder(payload: NDArray[np.uint8], shape: Shape) -> float:
 
 
 def spectra(cube: Samples, remove_mean: bool = False) -> NDArray[np.float64]:
-    """Power spectra, Hann window: float64 [rx, chirp, bin], half as many bins for real samples."""
+    """Return power spectra, Hann window: float64 [rx, chirp, bin], half as many bins for real samples."""
     if remove_mean:
         cube = cube - cube.mean(axis=-1, keepdims=True)
     windowed = cube * np.hanning(cube.shape[-1])

@@ -1,9 +1,8 @@
-"""UDP sockets for the capture cards, and the network path to a card that does not answer.
+"""UDP sockets for the capture cards, and diagnosis of the network path to a card that does not answer.
 
-A socket is bound with a clear error, and its receive buffer is read back, because the kernel may grant less than was
-asked for. `recvmmsg` fetches many packets with one system call into one block of memory, so that the cost of a packet
-is its copy. `silent_hop` finds the first hop to a silent card that does not work (address, route, link, card), and the
-errors of silent cards and radars say it.
+`bind_udp` and `enlarge_receive_buffer` make the socket; the kernel may grant a smaller buffer than requested.
+`BatchReceiver` fetches many packets with one `recvmmsg` call into one block of memory, so that a packet costs one copy.
+`silent_hop` finds the first hop that does not work (address, route, link, card), for `silent_card` and `silent_radar`.
 """
 
 from __future__ import annotations
@@ -25,14 +24,15 @@ from numpy.typing import NDArray
 from polysight.host.capture.dca1000 import MAX_PAYLOAD_BYTES, Status
 from polysight.host.capture.receiver import RowCapture
 from polysight.shared.config import Board
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 
 SO_RCVBUFFORCE = 33  # Linux; may exceed net.core.rmem_max, needs CAP_NET_ADMIN
 SO_MEMINFO = 55  # Linux: nine 32-bit words about the socket's memory
-KERNEL_BYTES_A_PACKET = 2304  # what the kernel charges a receive buffer for a full packet (measured)
+KERNEL_BYTES_A_PACKET = 2304  # of a receive buffer that a full packet occupies (measured)
 _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
-_STRIDE = 1536  # room for the largest packet and for seeing that one is too long
+_STRIDE = 1536  # bytes per packet: more than the largest, to detect longer ones
 _MSG_DONTWAIT = socket.MSG_DONTWAIT if hasattr(socket, "MSG_DONTWAIT") else 0x40
 _GATEWAY, _UP = 0x2, 0x1  # flags in /proc/net/route
 _ARP_COMPLETE = 0x2  # flag in /proc/net/arp
@@ -64,12 +64,12 @@ class _Message(ctypes.Structure):
 
 
 def bind_udp(address: str, port: int, what: str) -> socket.socket:
-    """A bound, non-blocking, unconnected UDP socket.
+    """Return a bound, non-blocking, unconnected UDP socket; `what` names it in errors.
 
     Raises
     ------
     DeviceError
-        when the port is taken or the address is not this machine's; `what` says whose socket it is.
+        if the port is in use or the address is not this machine's.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
@@ -82,20 +82,22 @@ def bind_udp(address: str, port: int, what: str) -> socket.socket:
                 f"{what}: {address}:{port} (UDP) is in use",
                 "another program receives from this card, perhaps an earlier one that still runs",
                 f"`ss -ulnp 'sport = :{port}'` shows it; stop it",
+                code=ErrorCode.BUSY,
             ) from None
         if e.errno == errno.EADDRNOTAVAIL:
             raise DeviceError(
                 f"{what}: {address} is not an address of this machine",
                 "the network interface to the cards is down or has another address",
                 f"`ip address add {address}/24 dev <interface>`, or correct host_address in instrument.toml"
-                " (a scan that was begun: `polysight resume SCAN --config instrument.toml`)",
+                " (for a scan to resume: `polysight resume SCAN --config instrument.toml`)",
+                code=ErrorCode.VALUE_INVALID,
             ) from None
         raise DeviceError(f"{what}: cannot bind {address}:{port} (UDP): {e.strerror}", "", "check host_address") from e
     return sock
 
 
 def enlarge_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
-    """Ask for a receive buffer and return what the kernel grants, in the kernel's accounting halved back to payload."""
+    """Request a receive buffer; return the granted size, bytes."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted_bytes)
     if granted_bytes(sock) < wanted_bytes and sys.platform == "linux":
         with contextlib.suppress(PermissionError):
@@ -104,13 +106,13 @@ def enlarge_receive_buffer(sock: socket.socket, wanted_bytes: int) -> int:
 
 
 def granted_bytes(sock: socket.socket) -> int:
-    """The receive buffer in force. Linux reports twice the request, because it counts its own overhead in it."""
+    """Return the size of the receive buffer; Linux reports twice the request, for its overhead."""
     size = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     return size // 2 if sys.platform == "linux" else size
 
 
 def kernel_drops(sock: socket.socket) -> int:
-    """Packets the kernel dropped at this socket since it was opened; 0 where the system does not tell."""
+    """Return the number of packets that the kernel dropped at this socket; 0 if the system does not report it."""
     try:
         return struct.unpack("9I", sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36))[_MEMINFO_DROPS]
     except (OSError, struct.error):
@@ -118,22 +120,14 @@ def kernel_drops(sock: socket.socket) -> int:
 
 
 class BatchReceiver:
-    """Receives up to `batch` packets at a time into one preallocated block.
-
-    Attributes
-    ----------
-    packets
-        uint8 [batch, 1536]: the packets of the last :meth:`receive`, header included.
-    lengths
-        uint32 [batch]: bytes of each.
-    """
+    """Receives up to `batch` packets at a time into one preallocated block."""
 
     def __init__(self, sock: socket.socket, source_address: str, batch: int = 256) -> None:
         self._socket = sock
         self._source = int.from_bytes(socket.inet_aton(source_address), sys.byteorder)
-        self.packets: NDArray[np.uint8] = np.zeros((batch, _STRIDE), dtype=np.uint8)
-        self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)
-        self.strangers = 0  # packets that did not come from the card's address
+        self.packets: NDArray[np.uint8] = np.zeros((batch, _STRIDE), dtype=np.uint8)  # of the last `receive`
+        self.lengths: NDArray[np.uint32] = np.zeros(batch, dtype=np.uint32)  # bytes of each, with header
+        self.strangers = 0  # packets from another address than the card's
         self._names = np.zeros((batch, 16), dtype=np.uint8)  # struct sockaddr_in of each packet
         self._sources = self._names[:, 4:8].view(np.uint32)[:, 0]
         self._vectors = (_IoVec * batch)()
@@ -149,10 +143,7 @@ class BatchReceiver:
         self._recvmmsg = getattr(ctypes.CDLL(None, use_errno=True), "recvmmsg", None)
 
     def receive(self) -> int:
-        """Fetch what is waiting, without waiting; returns the number of packets from the card.
-
-        Strangers' packets are counted and removed.
-        """
+        """Fetch the pending packets; return the number from the card. Packets from elsewhere are counted, removed."""
         n = self._fetch()
         if n == 0:
             return 0
@@ -179,7 +170,7 @@ class BatchReceiver:
         return n
 
     def _fetch_one(self) -> int:
-        """The portable way: one packet a call."""
+        """Fetch one packet, where `recvmmsg` is missing."""
         try:
             size, sender = self._socket.recvfrom_into(memoryview(self.packets[0]))
         except BlockingIOError:
@@ -190,28 +181,28 @@ class BatchReceiver:
 
 
 def usable_packets(buffer_bytes: int) -> int:
-    """How many full packets a receive buffer holds: the kernel charges about 2304 bytes of memory for each."""
+    """Return the number of full packets that a receive buffer holds."""
     return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET
 
 
 def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int, rmem_max: Path = _RMEM_MAX) -> str:
-    """A warning when the kernel granted less than was asked for; "" when it did not.
+    """Return a warning if the kernel granted less than requested, otherwise "".
 
     Parameters
     ----------
     name
         Board, for the message.
     granted, wanted
-        Bytes of the receive buffer, read back and asked for.
+        Granted and requested bytes of the receive buffer.
     burst_bytes
-        Data of one burst. A buffer that does not hold two cannot bridge a pause of the receiver.
+        Data of one burst; the buffer must hold two, to bridge a pause of the receiver.
     rmem_max
-        Where the kernel says its limit.
+        File with the kernel's limit.
 
     Raises
     ------
     DeviceError
-        when the buffer holds less than two bursts; the remedy is the command that lifts the limit.
+        if the buffer holds less than two bursts; the remedy is the command that raises the limit.
     """
     enough = max(wanted, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
     remedy = f"`sysctl -w net.core.rmem_max={enough}`, and the same in /etc/sysctl.d/ to keep it"
@@ -224,6 +215,7 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
             f"{name}: the kernel grants a receive buffer of {granted} bytes, less than two bursts of {burst_bytes}",
             limit if granted < wanted else "card.receive_buffer_bytes asks for no more",
             remedy if granted < wanted else f"card.receive_buffer_bytes = {enough} in instrument.toml; {remedy}",
+            code=ErrorCode.VALUE_INVALID,
         )
     if granted < wanted:
         return f"{name}: receive buffer of {granted} bytes granted, {wanted} asked for ({limit}); {remedy}"
@@ -231,7 +223,7 @@ def check_receive_buffer(name: str, granted: int, wanted: int, burst_bytes: int,
 
 
 class Hop(Enum):
-    """The first hop on the way to a silent card that does not work."""
+    """Reason why a card does not answer: the first hop that does not work."""
 
     ROUTE = "no route"
     LINK = "no link"
@@ -241,14 +233,9 @@ class Hop(Enum):
 
 
 def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
-    """The hop that keeps a card at this address from answering.
+    """Find the first hop to a card (IPv4 address) that does not work.
 
-    Parameters
-    ----------
-    card_address
-        IPv4 address of the card.
-    root
-        Where `proc/net/route`, `proc/net/arp` and `sys/class/net` are. What cannot be read is passed over.
+    `root` is the folder with `proc/net/route`, `proc/net/arp` and `sys/class/net`; unreadable files are skipped.
     """
     if card_address.startswith("127."):
         return Hop.UNKNOWN  # loopback is in none of these tables
@@ -264,9 +251,9 @@ def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
 
 
 def route_interface(address: str, root: Path = _ROOT) -> str | None:
-    """The interface whose own subnet holds this address, "" when there is none, None when it cannot be told.
+    """Return the interface in whose subnet the address lies, "" if there is none, None if unknown.
 
-    A route over a gateway is none: a capture card is reached without a router, or not at all.
+    Routes over a gateway do not count: capture cards are not reached through a router.
     """
     try:
         lines = (root / "proc/net/route").read_text(encoding="ascii").splitlines()[1:]
@@ -286,12 +273,12 @@ def route_interface(address: str, root: Path = _ROOT) -> str | None:
 
 
 def has_link(interface: str, root: Path = _ROOT) -> bool | None:
-    """Whether the interface has a carrier; None when it cannot be told."""
+    """True if the interface has a carrier; None if unknown."""
     folder = root / "sys/class/net" / interface
     try:
         return (folder / "carrier").read_text(encoding="ascii").strip() == "1"
     except OSError:
-        pass  # an interface that is down has no readable carrier
+        pass  # `carrier` of an interface that is down is not readable
     try:
         return False if (folder / "operstate").read_text(encoding="ascii").strip() == "down" else None
     except OSError:
@@ -299,7 +286,7 @@ def has_link(interface: str, root: Path = _ROOT) -> bool | None:
 
 
 def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
-    """Whether a device answered for this address on the local network; None when the kernel does not know."""
+    """True if a device answered for this address on the local network; None if the kernel does not know."""
     try:
         lines = (root / "proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
     except OSError:
@@ -312,71 +299,64 @@ def neighbour_answers(address: str, root: Path = _ROOT) -> bool | None:
 
 
 def silent_card(board: Board, what: str, root: Path = _ROOT) -> DeviceError:
-    """The error for a card that does not answer: `what` happened, and which hop is silent as far as it can be told."""
+    """Return the error for a card that does not answer: `what` happened, and the hop that does not work, if known."""
     hop, interface = silent_hop(board.card_address, root), route_interface(board.card_address, root)
     if hop is Hop.ROUTE:
         return no_route(board, what)
-    if hop is Hop.LINK:
-        return DeviceError(
-            what,
-            f"no link: network interface {interface} has no carrier, the cable is out or the card has no power",
-            f"check the card's power, the cable and the ethernet LEDs; `ip link show {interface}` must say LOWER_UP",
-        )
-    if hop is Hop.NEIGHBOUR:
-        return DeviceError(
-            what,
-            f"the link is up, but no device has the address {board.card_address}: another card is on this cable, or its"
-            " EEPROM holds another address",
-            "check card_address in instrument.toml (a scan that was begun takes it with `polysight resume SCAN --config"
-            " instrument.toml`); with the card's EEPROM switch off it has its default address",
-        )
-    return DeviceError(
-        what,
-        "the card is mute: a device is there, but its program does not answer; wrong command port, or its replies go to"
-        " another host address"
-        if hop is Hop.CARD
-        else "the card is off, or listens at another address or port",
+    why = "the card is off, or listens at another address or port"
+    remedy = (
         f"the card answers to the host address and ports in its EEPROM: it must send to {board.host_address}"
-        f" port {board.command_port}; `ss -ulnp` shows who else listens there",
+        f" port {board.command_port}; `ss -ulnp` shows other programs that listen there"
     )
+    if hop is Hop.LINK:
+        why = f"no link: network interface {interface} has no carrier, the cable is out or the card has no power"
+        remedy = f"check the card's power, the cable and the LEDs; `ip link show {interface}` must contain LOWER_UP"
+    elif hop is Hop.NEIGHBOUR:
+        why = (
+            f"the link is up, but no device has the address {board.card_address}: another card is on this cable, or its"
+            " EEPROM holds another address"
+        )
+        remedy = (
+            "check card_address in instrument.toml (for a scan to resume: `polysight resume SCAN --config"
+            " instrument.toml`); with the card's EEPROM switch off it has its default address"
+        )
+    elif hop is Hop.CARD:
+        why = (
+            "the card is mute: a device has its address, but its program does not answer; wrong command port, or its"
+            " replies go to another host address"
+        )
+    return DeviceError(what, why, remedy, code=ErrorCode.NO_ANSWER)
 
 
 def no_route(board: Board, what: str) -> DeviceError:
-    """The error for a card that lies in no subnet of this machine."""
+    """Return the error for a card that is in no subnet of this machine."""
     return DeviceError(
         what,
         f"no route: no network interface of this machine is in the subnet of {board.card_address}",
-        f"`ip address add {board.host_address}/24 dev <interface>`; `ip route get {board.card_address}` shows the route"
-        " in use",
+        f"`ip address add {board.host_address}/24 dev <interface>`; `ip route get {board.card_address}` shows the"
+        " present route",
+        code=ErrorCode.NO_ANSWER,
     )
 
 
 def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
-    """The error for a card that answers commands but of which no data came, with the likeliest cause.
-
-    `row` is what the receiver got; its strangers and its card status tell more.
-    """
+    """Return the error for a card that replies but sends no data, with the likeliest cause from the capture `row`."""
     what = f"no data from {board.name} (card {board.card_address} to {board.host_address}:{board.data_port})"
-    if row is not None and row.strangers:
-        return DeviceError(
-            what,
-            f"{row.strangers} packets came from another address than {board.card_address}",
-            "two boards may have each other's ports; check card_address and data_port in instrument.toml, then"
-            " `polysight resume SCAN --config instrument.toml`",
-        )
+    remedy = "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), the data port in the EEPROM"
     status = Status(row.card_status) if row is not None else Status(0)
-    if Status.NO_LVDS_DATA in status:
-        why = "the card answers, and reports that the radar sends nothing over LVDS: it is not streaming"
+    if row is not None and row.strangers:
+        why = f"{row.strangers} packets came from another address than {board.card_address}"
+        remedy = (
+            "two boards may have each other's ports; check card_address and data_port in instrument.toml, then"
+            " `polysight resume SCAN --config instrument.toml`"
+        )
+    elif Status.NO_LVDS_DATA in status:
+        why = "the card replies, and reports that the radar sends nothing over LVDS: it is not streaming"
     elif Status.NO_HEADER in status:
-        why = "the card answers, and reports LVDS data without the header it waits for: it is set to another mode"
+        why = "the card replies, and reports LVDS data without a header: it is set to another mode"
     else:
         why = (
-            "the card answers, but the radar is not streaming (not armed, or SYNC_IN does not reach it), or the card"
+            "the card replies, but the radar is not streaming (not armed, or SYNC_IN does not reach it), or the card"
             " sends its data to another address or port"
         )
-    return DeviceError(
-        what,
-        why,
-        "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), and the data port in the card's"
-        " EEPROM",
-    )
+    return DeviceError(what, why, remedy, code=ErrorCode.NO_DATA)

@@ -1,4 +1,4 @@
-"""What a row's packets tell about the card's next record: where it may start, and which counters are of this one."""
+"""Update the knowledge for the card's next record (`Past`) with the packets of a row."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from polysight.host.capture.earlier_records import Past, Span
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.record_search import SWITCHED_ON, Found, later_packets
 
-_REMEMBERED = 4  # earlier records whose leftovers are known by their counters
-_GAPS = 64  # of a record that are remembered one by one
+_REMEMBERED = 4  # earlier records whose counters are kept
+_GAPS = 64  # largest number of gaps of a record that are kept
 
 
 def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_bytes: int) -> Past:
-    """What is known for the next record.
+    """Return the knowledge for the next record.
 
-    `located` is false also where the card said that it dropped data: then only a short last packet tells its end.
+    `located` is also False if the card reported dropped data: then only a short last packet marks the record's end.
     """
     e, full = log.expected, found.full
     if found.base is None:
@@ -33,7 +33,7 @@ def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_by
     short = bool((log.sizes[found.own][ends == stop] < full).all())
     if found.restarted:
         return Past(base, tuple(sorted({stop, e})), _remember(past.spans, Span(base, e)))
-    if more:  # where the last of them ended is not known
+    if more:  # the end of the last of them is unknown
         return Past(spans=_remember(past.spans, Span(base, max(stop, e))), unseen=True)
     if found.certain:
         frames = range(-(-stop // frame_bytes) * frame_bytes, e + 1, frame_bytes) if frame_bytes > 1 else range(0)
@@ -49,12 +49,12 @@ def past_after(past: Past, found: Found, log: PacketLog, located: bool, frame_by
         spans = (*spans, Span(end, first + e - stop, sure=False))
     anew = past.anew + 1 if found.doubtful and base == SWITCHED_ON else 0
     known = Past(spans=spans, joint=end if joined else None, joined=joined, unseen=past.unseen, anew=anew)
-    # A short packet ends its record, wherever that began; one cut short on its way leads to a line without packets.
+    # A short packet ends its record, wherever that began. One truncated on the way leads to a line without packets.
     return replace(known, base=base, ends=(stop,), guessed=True) if short and not found.doubtful else known
 
 
 def _outstanding(found: Found, log: PacketLog) -> tuple[tuple[int, int], ...] | None:
-    """Byte ranges of a located record that did not come; None where they are too many to remember."""
+    """Return the missing byte ranges of a located record; None if they are too many to keep."""
     came = (found.own | found.old) & (found.offsets >= 0) & (found.offsets < log.expected)
     starts, stops = found.offsets[came], (found.offsets + log.sizes)[came]
     order = np.argsort(starts, kind="stable")
@@ -65,15 +65,12 @@ def _outstanding(found: Found, log: PacketLog) -> tuple[tuple[int, int], ...] | 
 
 
 def _more_records(found: Found, stop: int, expected: int) -> bool:
-    """Whether packets have counters behind the record's end: the card has sent another one, nobody knows of what size.
-
-    Or it began anew: packets that are of no record known.
-    """
+    """True if packets have counters behind the record's end: another record of unknown size, or the card restarted."""
     return bool(later_packets(found, ~(found.own | found.early | found.old), stop, expected).any())
 
 
 def _after_nothing(past: Past, expected: int, full: int, frame_bytes: int) -> Past:
-    """Nothing came: the record may have been sent or not."""
+    """Return the knowledge after a row without packets, whose record may have been sent or not."""
     if past.base is None or len(past.ends) != 1 or past.guessed:
         return Past(spans=past.spans, unseen=True)
     end = past.ends[0]

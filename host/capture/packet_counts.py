@@ -1,4 +1,4 @@
-"""What became of a row's packets, by name: every packet is counted once, and every anomaly under its own name."""
+"""Count a row's packets by result: placed, duplicate, left over and so on; every packet is counted once."""
 
 from __future__ import annotations
 
@@ -17,33 +17,30 @@ Flags = NDArray[np.bool_]
 
 @dataclass
 class PacketCounts:
-    """Packets of one row by what became of them: every packet is in exactly one of the first eight.
-
-    The others say more about some of them.
-    """
+    """Packets of one row by result: every packet is in exactly one of the first eight; the others are subsets."""
 
     placed: int = 0
-    duplicates: int = 0  # every byte was there already, and the same
-    conflicting: int = 0  # other bytes than another packet of the same counters: both are masked where they overlap
-    leftover: int = 0  # of a record before this one
-    restarted: int = 0  # came after the card began anew within the row: its counters fell back to their beginning
-    outside: int = 0  # after the record's last expected byte, or not kept for want of memory
+    duplicates: int = 0  # every byte was there already, and equal
+    conflicting: int = 0  # other bytes than a packet with equal counters: masked where they overlap
+    leftover: int = 0  # of an earlier record
+    restarted: int = 0  # after the card restarted within the row and reset its counters
+    outside: int = 0  # behind the record's last expected byte, or not kept for lack of memory
     disagreeing: int = 0  # byte count and sequence contradict each other
     malformed: int = 0  # no payload, or longer than the card's packets
     late: int = 0  # placed, after a packet that follows it
-    late_by_bytes: int = 0  # how far the latest of them was behind
-    short: int = 0  # placed, not full; a healthy record has one at most, its last
-    before_pulses: int = 0  # leftover, known by having come before the row's first pulse
-    clock_jumps: int = 0  # times at which the clock of the arrivals went backwards
+    late_by_bytes: int = 0  # largest delay of these, bytes
+    short: int = 0  # placed, not full; normally only the last of a record
+    before_pulses: int = 0  # leftover, identified by arrival before the row's first pulse
+    clock_jumps: int = 0  # number of times the arrival clock went backwards
 
 
 def count_packets(
     log: PacketLog, found: Found, past: Past, placed: Flags, duplicate: Flags, conflicting: Flags
 ) -> PacketCounts:
-    """Count a row's packets by what became of them. `placed`, `duplicate`, `conflicting`: bool [packet], disjoint.
+    """Count a row's packets. `placed`, `duplicate`, `conflicting`: bool [packet], disjoint.
 
-    Of a row in which the card began anew, those before are `placed` and those after `restarted`, whichever of them the
-    search took for the record: nothing of such a row is believed, unless its start was foretold.
+    If the card restarted within the row, packets before the restart count as `placed` and later ones as `restarted`,
+    whichever of them the search took for the record: such a row is masked, unless its start was known.
     """
     before, anew = _restart(log, found, past, conflicting)
     placed, duplicate = (placed | before) & ~anew, duplicate & ~anew & ~before
@@ -51,7 +48,7 @@ def count_packets(
     left = (found.early | found.old) & ~(anew | before)
     rest = ~(placed | duplicate | conflicting | left | anew)
     beyond = (found.offsets >= log.expected) & (found.steps > 0) & (found.offsets < 2 * log.expected)
-    outside = rest & (found.own | beyond)  # behind the row's last byte, or not kept
+    outside = rest & (found.own | beyond)
     left |= rest & ~outside & (found.offsets < 0) & (found.steps < 0)
     return PacketCounts(
         placed=int(placed.sum()),
@@ -68,10 +65,10 @@ def count_packets(
 
 
 def _restart(log: PacketLog, found: Found, past: Past, conflicting: Flags) -> tuple[Flags, Flags]:
-    """Packets of the row before and after the card began anew within it, bool [packet] each; all false if it did not.
+    """Select the row's packets before and after a restart of the card, bool [packet] each; none without a restart.
 
-    After a reset the first packet has sequence 1 and byte count 0. Such counters say nothing of a row that begins with
-    them, so they must come behind other packets of the row, or behind their likes with other bytes.
+    After a reset the first packet has sequence 1 and byte count 0. A row may also begin with these counters, so a
+    restart needs other packets of the row before them, or packets with the same counters and other bytes.
     """
     nothing, index = np.zeros(log.count, dtype=np.bool_), np.arange(log.count)
     counts = log.byte_counts
@@ -83,7 +80,7 @@ def _restart(log: PacketLog, found: Found, past: Past, conflicting: Flags) -> tu
         return switched_on & (index < first) & ~found.old, switched_on & (index >= first)
     packets = CounterView(log, past.base or Counters(0, 0), found.full)
     again = found.again if found.again is not None else nothing
-    switched_on &= again | ~packets.inside(past.spans, sure=True)  # else left over of a record that is remembered
+    switched_on &= again | ~packets.inside(past.spans, sure=True)  # otherwise left over from a known record
     if found.located:
         return nothing, switched_on & ~found.own & (index > np.argmax(found.own))
     before = _before_restart(packets, past, ~(found.early | found.old | again | switched_on), log.expected)
@@ -92,7 +89,7 @@ def _restart(log: PacketLog, found: Found, past: Past, conflicting: Flags) -> tu
 
 
 def _before_restart(packets: CounterView, past: Past, live: Flags, expected: int) -> Flags:
-    """Which packets are the row's by all that was known before: where it was to start, else most of them together."""
+    """Select the row's packets before a restart: at its expected start, or if that is unknown, the largest group."""
     if past.base is None:
         lines, many = np.unique(packets.line[live], return_counts=True)
         return live & np.isin(packets.line, lines[(many == many.max(initial=0)) & (many > 1)][:1])

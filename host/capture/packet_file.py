@@ -1,7 +1,7 @@
-"""`<row>.pkt`: every packet of a row with its header and arrival, so that the row can be placed again.
+"""Packet file of a row (`<row>.pkt`): header and arrival of every packet, so that the row can be placed again.
 
-Payload that lies in the row's file as it came is not kept twice; what does not (left over, conflicting, more than the
-row has) is at the end of this one. Format: docs/spec/scan-folder.md.
+Payload that is in the row's file is not stored twice; other payload (left over, conflicting, more than the row has) is
+at the end of the packet file. Format: docs/spec/scan-folder.md.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.placement import Placed
 from polysight.host.capture.segment import damaged, write_durably
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_bounded
 
 PACKETS = ".pkt"  # suffix, beside the row's file
 FORMAT = 1
 RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
-"""Packets of one size that follow each other: counters of the first, how many, payload of each, and where that is.
+"""Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
 
-`place`: offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
+`place` is an offset in the row's file; or, below zero, `-1 - offset` in this file's own payload.
 """
-BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets that had come by then
+BATCH = np.dtype("<i8")  # pairs: time (CLOCK_MONOTONIC of the host, ns), packets received by then
 _MOST_RUN_BYTES = 256 << 20  # of batches and runs
 Bytes = NDArray[np.uint8]
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """What placing a row needs beside its packets."""
+    """Inputs for placing a row, beside its packets; as of :func:`polysight.host.capture.placement.place_record`."""
 
     expected: int
     frame_bytes: int
@@ -44,9 +45,9 @@ class Evidence(msgspec.Struct, frozen=True):
 
 
 def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
-    """Write a row's packets durably; returns the file's CRC-32. Without `placed` all of the payload goes in here.
+    """Write a row's packets durably and return the file's CRC-32; without `placed`, with all of the payload.
 
-    Raises DeviceError when the disk fails.
+    Raises DeviceError if the disk fails.
     """
     kept = log.kept
     sizes, sequences, counts = log.sizes[:kept], log.sequences[:kept], log.byte_counts[:kept]
@@ -81,19 +82,12 @@ def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed
 
 
 def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
-    """What was observed of a row: its packets, and what was known beside them.
-
-    Parameters
-    ----------
-    path
-        `<row>.pkt`.
-    row
-        uint8: the bytes of the row's file, which hold most of the payload.
+    """Read a row's packet file `path`; `row` (uint8) are the bytes of the row's file, with most of the payload.
 
     Raises
     ------
     DataError
-        when the file is absent or damaged, or does not belong to the row.
+        if the file is missing or damaged, or does not belong to the row.
     """
     try:
         line, _, tail = read_bounded(path, PacketLog.most_kept(row.size) + _MOST_RUN_BYTES).partition(b"\n")
@@ -104,19 +98,20 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
         runs = np.frombuffer(tail[size : size + RUN.itemsize * head["runs"]], dtype=RUN)
         own = np.frombuffer(tail[size + runs.nbytes :], dtype=np.uint8)
         if (np.diff(batches[:, 1], prepend=0) < 0).any():
-            raise ValueError("packets went away between two batches")
+            raise ValueError("the number of packets decreases between two batches")
         log = _restored(evidence.expected, runs, batches, row, own)
         whole = (head["packets"], head["own_bytes"]) == (int(batches[-1, 1]) if len(batches) else 0, own.size)
         if not whole or log.count != head["kept"] or head["format"] != FORMAT:
-            raise ValueError("it does not hold what it says")
+            raise ValueError("its counts are wrong")
         log.malformed = int(head["malformed"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError, msgspec.ValidationError) as e:
-        raise DataError(f"{path}: not a readable packet log: {e}", *damaged(path)) from None
+        what = f"{path}: not a readable packet log: {e}"
+        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
     return evidence, log
 
 
 def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """int64 [packet]: where in the row's file its payload lies as it came; -1 where it does not."""
+    """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
     at = placed.at[: sizes.size].copy()
     at[at + sizes > placed.expected] = -1
     for start, stop in placed.conflicts:
@@ -125,11 +120,11 @@ def _in_the_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _restored(expected: int, runs: NDArray[Any], batches: NDArray[np.int64], row: Bytes, own: Bytes) -> PacketLog:
-    """The log again. Raises ValueError where payload is missing."""
+    """Restore the packet log. Raises ValueError if payload is missing."""
     many, sizes = runs["packets"].astype(np.int64), runs["size"].astype(np.int64)
     payload_bytes = sum((many * sizes).tolist())  # each product fits 48 bits; their sum need not fit 64
     if expected != row.size or not PacketLog.would_keep(expected, payload_bytes) or (sizes == 0).any():
-        raise ValueError("it is of another row, or of more payload than a receiver keeps")
+        raise ValueError("it is of another row, or has more payload than a receiver keeps")
     nth = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
     each = np.repeat(sizes, many)
     parts = []

@@ -1,7 +1,7 @@
-"""Every packet of one row as it came: header, arrival, payload in the order of arrival. Nothing is decided here.
+"""Log of all packets of one row: header, arrival time and payload in the order of arrival.
 
-`PacketLog.add` is what happens to a packet while the row runs: its header and its payload are copied once each. Where
-it belongs is decided at the row's end from all of them (`placement.py`), and can be decided again from `<row>.pkt`.
+While the row runs, `PacketLog.add` only copies header and payload once. Packets are placed at the row's end, from all
+of them (`placement.py`), and can be placed again from `<row>.pkt`.
 """
 
 from __future__ import annotations
@@ -15,19 +15,14 @@ from polysight.host.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, P
 
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
-_SPARE_BYTES = 1 << 20  # of payload beyond the row: a few packets left over, without growing
-_MOST = 4  # rows' worth of payload that is kept; two network paths double it
+_SPARE_BYTES = 1 << 20  # of payload beyond the row, for left-over packets
+_MOST = 4  # largest kept payload, in rows; two network paths double it
 
 
 class PacketLog:
-    """The packets of one row in the order of their arrival.
+    """The packets of one row of `expected` bytes in the order of their arrival.
 
-    Parameters
-    ----------
-    expected
-        Bytes of the row.
-    memory
-        uint8 to gather payload in, from an earlier log; new memory when it is None or too small.
+    `memory`, uint8, is reused for the payload if it is large enough.
 
     Attributes
     ----------
@@ -38,16 +33,16 @@ class PacketLog:
     payload
         uint8: payload of the first `kept` packets, one after another.
     kept
-        Packets whose payload is there: all, unless far more came than the row has.
+        Packets with stored payload: all, unless far more came than the row has.
     payload_bytes
-        Bytes of payload that came.
+        Bytes of payload received.
     """
 
     def __init__(self, expected: int, memory: Bytes | None = None) -> None:
         self.expected = expected
         if memory is None or memory.size < expected + _SPARE_BYTES:
             memory = np.empty(expected + _SPARE_BYTES, dtype=np.uint8)
-        memory[:expected].fill(0)  # so that the pages are there before the first packet
+        memory[:expected].fill(0)  # allocate the pages before the first packet
         self.payload = memory
         packets = 2 * expected // MAX_PAYLOAD_BYTES + 256
         self._heads = np.zeros((packets, PACKET_HEADER_BYTES), dtype=np.uint8)
@@ -55,19 +50,13 @@ class PacketLog:
         self._batches = np.zeros((packets, 2), dtype=np.int64)
         self.count = self.kept = self.malformed = self.payload_bytes = 0
         self._filled = self._noted = 0
-        self._quiet_ns = 0  # when the socket was last found empty since the last batch
+        self._quiet_ns = 0  # last time since the last batch at which the socket was empty
 
     def add(self, packets: Bytes, lengths: NDArray[np.integer], t_ns: int) -> None:
         """Log packets in the order of their arrival.
 
-        Parameters
-        ----------
-        packets
-            uint8 [n, at least the longest length]: header and payload.
-        lengths
-            integer [n]: bytes of each packet.
-        t_ns
-            When they were fetched, monotonic clock.
+        `packets` is uint8 [n, >= longest length] with header and payload, `lengths` integer [n] bytes, `t_ns` the time
+        of reception, monotonic clock.
         """
         sizes = lengths.astype(np.int64) - PACKET_HEADER_BYTES
         good = (sizes > 0) & (sizes <= MAX_PAYLOAD_BYTES)
@@ -90,7 +79,7 @@ class PacketLog:
         self._note(t_ns)
 
     def note_quiet(self, t_ns: int) -> None:
-        """Nothing waited in the socket at this time."""
+        """Record that the socket was empty at this time."""
         self._quiet_ns = t_ns
 
     def _copy(self, packets: Bytes, sizes: Counts) -> None:
@@ -102,7 +91,7 @@ class PacketLog:
             self._filled += to.size
 
     def _room_for(self, more: int) -> bool:
-        """Whether payload of so many bytes can be kept; memory grows up to a few rows' worth."""
+        """True if `more` bytes of payload can be kept; memory grows up to `_MOST` rows."""
         if self._filled + more <= self.payload.size:
             return True
         size = min(2 * self.payload.size + more, _MOST * (self.expected + _SPARE_BYTES))
@@ -115,12 +104,12 @@ class PacketLog:
 
     @staticmethod
     def would_keep(expected: int, payload_bytes: int) -> bool:
-        """Whether so much payload of a row is ever kept."""
+        """True if a log keeps this much payload of a row of `expected` bytes."""
         return payload_bytes <= PacketLog.most_kept(expected)
 
     @staticmethod
     def most_kept(expected: int) -> int:
-        """Payload of a row of `expected` bytes that is kept at most."""
+        """Return the largest payload that is kept of a row of `expected` bytes."""
         return _MOST * (expected + _SPARE_BYTES)
 
     def _note(self, t_ns: int) -> None:
@@ -135,7 +124,7 @@ class PacketLog:
 
     @property
     def batches(self) -> Counts:
-        """int64 [n, 2]: time (monotonic, ns), packets that had come by then. Where these do not grow: socket empty."""
+        """int64 [n, 2]: time (monotonic, ns), packets received by then; without growth, the socket was empty."""
         return self._batches[: self._noted]
 
     @property
@@ -157,24 +146,24 @@ class PacketLog:
 
     @property
     def arrivals_ns(self) -> Counts:
-        """int64 [packet]: when each had come at the latest."""
+        """int64 [packet]: latest possible arrival time of each."""
         return np.repeat(self.batches[:, 0], np.diff(self.batches[:, 1], prepend=0))
 
     @property
     def last_is_short(self) -> bool:
-        """Whether the last packet is smaller than the one before it: a record may have ended."""
+        """True if the last packet is smaller than the one before it: a record may have ended."""
         return self.count > 1 and bool(self._sizes[self.count - 1] < self._sizes[self.count - 2])
 
     @property
     def last_arrival_ns(self) -> int:
-        """When the last batch came; 0 before the first."""
+        """Arrival time of the last batch; 0 before the first."""
         return int(self._batches[self._noted - 1, 0]) if self._noted else 0
 
     @staticmethod
     def restore(
         expected: int, sequences: Counts, byte_counts: Counts, sizes: Counts, batches: Counts, payload: Bytes
     ) -> PacketLog:
-        """A log as it was, from what a file holds. Arrays as the properties give them."""
+        """Restore a log from a file; arrays as of the properties."""
         log = PacketLog(0, payload if payload.size >= _SPARE_BYTES else None)
         log.expected, log.count, log.kept = expected, len(sizes), len(sizes)
         log._heads = np.zeros((len(sizes), PACKET_HEADER_BYTES), dtype=np.uint8)
@@ -187,5 +176,5 @@ class PacketLog:
 
 
 def _doubled(array: NDArray[Any], more: int) -> NDArray[Any]:
-    """The array with room for as many again, and `more`."""
+    """Return the array with space for twice as many entries, and `more`."""
     return np.concatenate([array, np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)])

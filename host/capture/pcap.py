@@ -1,4 +1,4 @@
-"""What is in a packet capture of a DCA1000: the card's replies and its record, placed as live data is.
+"""Inspect a packet capture of a DCA1000: the replies of the card and its record, placed as live data is.
 
 `read_pcap` reads the UDP datagrams of a classic pcap file of Ethernet packets; a pcapng file is refused, with the
 command that converts it. `inspect_pcap` splits them into replies and data packets, and inspects the record of one card.
@@ -15,7 +15,8 @@ import numpy as np
 
 from polysight.host.capture import dca1000
 from polysight.host.capture.dca1000 import Code, Status
-from polysight.host.capture.inspect import CardReport, Known, Report, inspect_payload, place_packets
+from polysight.host.capture.inspect import CardReport, Known, Report, inspect_payload, place_packets, unreadable
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, ProtocolError
 from polysight.shared.files import read_bounded
 
@@ -36,22 +37,22 @@ class Datagram(NamedTuple):
 
 
 def is_pcap(head: bytes) -> bool:
-    """Whether a file that begins with these four bytes is a pcap or pcapng file, in either byte order."""
+    """True if a file that begins with these four bytes is a pcap or pcapng file, in either byte order."""
     return len(head) >= 4 and any(struct.unpack_from(f"{order}I", head)[0] in (*_MAGIC, _PCAPNG) for order in "<>")
 
 
 def read_pcap(path: Path) -> Iterator[Datagram]:
-    """The UDP datagrams of a file, in order; other packets are passed over.
+    """Yield the UDP datagrams of a file, in order; other packets are skipped.
 
     Raises
     ------
     DataError
-        when the file is not a classic pcap file of Ethernet packets, or ends within a packet.
+        if the file is not a classic pcap file of Ethernet packets, or ends within a packet.
     """
     try:
         raw = read_bounded(path, _MOST_BYTES)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read: {e.strerror}", "the path is wrong", "give a capture file") from None
+        raise unreadable(path, e) from None
     for order in "<>":
         if len(raw) >= 24 and (tick := _MAGIC.get(struct.unpack_from(order + "I", raw)[0])) is not None:
             break
@@ -61,19 +62,21 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
             f"{path}: not a pcap file",
             "it is pcapng" if newer else "another kind of file",
             f"`editcap -F pcap {path.name} converted.pcap` makes one" if newer else "record with `tcpdump -w`",
+            code=ErrorCode.FILE_FOREIGN,
         )
     link = struct.unpack_from(order + "I", raw, 20)[0]
     if link != _ETHERNET:
-        raise DataError(f"{path}: link type {link}, expected {_ETHERNET} (Ethernet)", "recorded on `-i any`?")
+        what = f"{path}: link type {link}, expected {_ETHERNET} (Ethernet)"
+        raise DataError(what, "recorded on `-i any`?", code=ErrorCode.FILE_FOREIGN)
     header = struct.Struct(order + "IIII")
     position = 24
     while position < len(raw):
-        if position + header.size > len(raw):
-            raise DataError(f"{path}: ends within a packet header at byte {position}", "truncated file", _AGAIN)
+        kept = header.unpack_from(raw, position)[2] if position + header.size <= len(raw) else 0
+        if position + header.size + kept > len(raw):
+            what = f"{path}: ends within the packet at byte {position}"
+            raise DataError(what, "truncated file", _AGAIN, code=ErrorCode.FILE_DAMAGED)
         seconds, ticks, kept, _ = header.unpack_from(raw, position)
         position += header.size
-        if position + kept > len(raw):
-            raise DataError(f"{path}: ends within a packet at byte {position}", "truncated file", _AGAIN)
         found = _udp(raw[position : position + kept])
         position += kept
         if found is not None:
@@ -81,7 +84,7 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
 
 
 def _udp(frame: bytes) -> tuple[tuple[str, int], tuple[str, int], bytes] | None:
-    """Source, destination and payload of an Ethernet frame with an unfragmented IPv4 UDP datagram."""
+    """Return source, destination and payload of an Ethernet frame with an unfragmented IPv4 UDP datagram, or None."""
     at, kind = 14, int.from_bytes(frame[12:14], "big")
     if kind == _VLAN:
         at, kind = 18, int.from_bytes(frame[16:18], "big")
@@ -96,30 +99,24 @@ def _udp(frame: bytes) -> tuple[tuple[str, int], tuple[str, int], bytes] | None:
 
 
 def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> Report:  # noqa: B008 - immutable
-    """Inspect a packet capture that holds one record of a card.
+    """Inspect a packet capture (of `tcpdump -w`) with one record of a card.
 
-    Parameters
-    ----------
-    path
-        A file as `tcpdump -w` writes it.
-    known
-        What is known of the recording.
-    card_address
-        Which card, where several were recorded.
+    `known` is the known layout of the recording, `card_address` selects one of several cards.
 
     Raises
     ------
     DataError
-        when the file is no packet capture, holds nothing from a card, or several cards and none was chosen.
+        if the file is no packet capture, has nothing from a card, or several cards and none was selected.
     """
     card, packets = _from_card(path, card_address)
     data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]
     if not data:
         if not card.replies:
             raise DataError(
-                f"{path}: nothing from a DCA1000{f' at {card_address}' if card_address else ''} in it",
+                f"{path}: contains nothing from a DCA1000{f' at {card_address}' if card_address else ''}",
                 "another capture, or another card",
                 "record on the card's interface",
+                code=ErrorCode.NO_DATA,
             )
         return _empty(path, card)
     payload, card.record = place_packets([d.payload for d in data])
@@ -134,7 +131,7 @@ def inspect_pcap(path: Path, known: Known = Known(), card_address: str = "") -> 
 
 
 def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram]]:
-    """What a card said by its replies, and every other datagram that it sent. Raises DataError for several cards."""
+    """Return a card's replies and its other datagrams. Raises DataError for several cards."""
     card, packets = CardReport("", [], "", Status(0), None, 0, 0.0), []
     for datagram in read_pcap(path):
         if datagram.source[1] != dca1000.CARD_SOURCE_PORT or card_address not in ("", datagram.source[0]):
@@ -144,6 +141,7 @@ def _from_card(path: Path, card_address: str) -> tuple[CardReport, list[Datagram
                 f"{path}: holds packets of {card.address} and {datagram.source[0]}",
                 "several cards were recorded at once",
                 f"choose one: --card {card.address}",
+                code=ErrorCode.VALUES_CONFLICT,
             )
         card.address = datagram.source[0]
         try:

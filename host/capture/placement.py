@@ -1,8 +1,8 @@
-"""Where every packet's payload belongs in its row, decided when the row has ended, so that survivors are bit-exact.
+"""Place the payload of a row's packets when the row has ended, bit-exact.
 
-`find_record` says which packets are the row's and where it starts; here their payload is put in place, what overlaps is
-compared, and what is missing is listed. What cannot be located for certain is masked as a whole: data is original or
-masked, never invented. The model: docs/spec/placement.md.
+`find_record` selects the row's packets and its start; `place_record` puts their payload in place, compares overlapping
+packets and lists missing bytes. A row that cannot be located with certainty is masked as a whole: data is original or
+masked, never guessed. The model: docs/spec/placement.md.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Gap = tuple[int, int]
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-_ANEW = "the card began anew"
+_RESTARTED = "the card restarted"
 
 
 @dataclass(frozen=True)
 class Losses:
-    """Bytes that did not come, by where: before the first packet, in gaps between packets, after the last one."""
+    """Missing bytes: before the first packet, in gaps between packets, after the last one."""
 
     head_bytes: int = 0
     gaps: int = 0
@@ -39,52 +39,29 @@ class Losses:
 
 @dataclass(frozen=True)
 class Placed:
-    """What became of one record.
+    """Result of placing one record."""
 
-    Attributes
-    ----------
-    missing
-        Byte ranges (start, stop) that are not there for certain: sorted, not touching.
-    losses
-        The same by kind. Of a record that is not located it is only what the counters say.
-    located
-        Whether every byte's place is certain. When it is not, `missing` is the whole record and `reason` says why.
-    conflicts
-        Byte ranges of which packets brought different bytes; they are missing.
-    holes
-        Byte ranges below the furthest byte that did not come or are in conflict, in the order in which the card sent.
-    slipped
-        Whether it is only not located because frames may be missing before any byte of it: missed triggers.
-    at
-        int64 [packet]: offset of its payload in the row; -1 of those that are not in it.
-    arrivals
-        int64 [n, 2]: time (monotonic, ns), bytes up to which the row had come by then. Where they do not grow, the
-        socket was found empty then.
-    past
-        What is known for the next record.
-    """
-
-    expected: int
-    received: int
-    missing: list[Gap]
-    located: bool
-    reason: str
+    expected: int  # bytes
+    received: int  # bytes
+    missing: list[Gap]  # byte ranges (start, stop) that are missing or uncertain: sorted, not touching
+    located: bool  # the place of every byte is certain; if not, `missing` is the whole record
+    reason: str  # why it is not located
     counts: PacketCounts
-    losses: Losses
-    past: Past
-    at: Counts
-    arrivals: Counts
-    conflicts: list[Gap] = field(default_factory=list)
-    holes: list[Gap] = field(default_factory=list)
-    slipped: bool = False
+    losses: Losses  # missing bytes by kind; for a record that is not located, by its counters only
+    past: Past  # knowledge for the next record
+    at: Counts  # int64 [packet]: offset of its payload in the row, -1 outside the row
+    arrivals: Counts  # int64 [n, 2]: time (monotonic, ns), bytes received by then; no growth: the socket was empty
+    conflicts: list[Gap] = field(default_factory=list)  # byte ranges with different bytes in two packets; missing
+    holes: list[Gap] = field(default_factory=list)  # missing ranges below the furthest byte, in the card's order
+    slipped: bool = False  # not located only because frames may be missing (missed triggers)
 
     @property
     def complete(self) -> bool:
-        """Whether every byte is there and nothing more came."""
+        """True if every byte is there and nothing more came."""
         return self.located and not self.missing
 
     def facts(self) -> dict[str, Any]:
-        """What a row's index says of it (docs/spec/scan-folder.md)."""
+        """Return the entries of the row's index (docs/spec/scan-folder.md)."""
         return {
             "expected": self.expected,
             "received": self.received,
@@ -98,7 +75,7 @@ class Placed:
 
     @property
     def next_start(self) -> Counters | None:
-        """Counters with which the card's next record starts; None unless that is certain."""
+        """Counters at the start of the card's next record; None if uncertain."""
         base, ends = self.past.base, self.past.ends
         return base.after(ends[0], -(-ends[0] // self._full)) if base is not None and len(ends) == 1 else None
 
@@ -107,7 +84,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class Preview:
-    """How far a row is while it runs: bytes in place, whether all are, whether the furthest packet is a short one."""
+    """Progress of a running row: bytes in place, all bytes in place, the furthest packet is a short one."""
 
     received: int
     complete: bool
@@ -117,22 +94,22 @@ class Preview:
 def place_record(
     log: PacketLog, frame_bytes: int = 1, past: Past | None = None, not_before_ns: int = 0, dropped_by_card: str = ""
 ) -> tuple[Placed, Bytes]:
-    """Place one row's packets. Returns what became of them, and the row: uint8 [expected], zero where masked bytes are.
+    """Place one row's packets; return the result and the row: uint8 [expected], zero where masked.
 
     Parameters
     ----------
     log
-        The packets. Its memory may be that of the row returned.
+        The packets; the returned row may share its memory.
     frame_bytes
-        Bytes of one frame: a record that ends a whole number of frames early has missed triggers, and where is not
-        known. 1 when the record has no frames.
+        Bytes of one frame, 1 if the record has no frames. A record that ends a whole number of frames early has missed
+        triggers at unknown places.
     past
-        What the records before tell.
+        Knowledge from earlier records.
     not_before_ns
-        No pulse of the row was sent before (monotonic clock of the arrivals); 0: not known.
+        Time before the first pulse of the row (clock of the arrivals); 0 if unknown.
     dropped_by_card
-        Names of the status bits by which the card said that it dropped data before it numbered the packets. Then bytes
-        are gone without a gap in the counters, and no byte's place is certain.
+        Names of the status bits by which the card reported data dropped before the packets were numbered: bytes are
+        missing without a gap in the counters, so that no byte's place is certain.
     """
     past = past or Past()
     found = find_record(log, frame_bytes, past, not_before_ns)
@@ -142,9 +119,9 @@ def place_record(
         located, reason = False, f"the card dropped data before numbering it ({dropped_by_card})"
     row.put_in_place()
     if located and row.conflicts and not found.foreseen:
-        located, reason = False, "packets with the same counters brought different bytes: the card may have begun anew"
-    if not located and row.counts.restarted and _ANEW not in reason:
-        reason = f"{_ANEW} within it" + (f"; {reason}" if found.certain else "")
+        located, reason = False, "packets with the same counters have different bytes: the card may have restarted"
+    if not located and row.counts.restarted and _RESTARTED not in reason:
+        reason = f"{_RESTARTED} within it" + (f"; {reason}" if found.certain else "")
     holes = _merged([*_gaps(row.covered, row.extent), *row.conflicts])
     missing = _merged([*holes, *([(row.extent, log.expected)] if row.extent < log.expected else [])])
     out = row.bytes(missing if located else holes)
@@ -171,7 +148,7 @@ def place_record(
 
 
 def preview(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int) -> Preview:
-    """How far a row is by the packets that have come. Compares nothing and copies nothing."""
+    """Return the progress of a row from its packets so far, without comparing or copying payload."""
     found = find_record(log, frame_bytes, past, not_before_ns)
     own = found.own & (found.offsets < log.expected)
     if not own.any():
@@ -186,7 +163,7 @@ def preview(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int) ->
 
 
 class _Row:
-    """The packets of the record, put in place."""
+    """Puts the packets of a record in place."""
 
     def __init__(self, log: PacketLog, found: Found, past: Past) -> None:
         self._log, self._found, self._past = log, found, past
@@ -202,7 +179,7 @@ class _Row:
         self.counts = PacketCounts()
 
     def put_in_place(self) -> None:
-        """Decide which packets are placed, and compare those that overlap."""
+        """Select the packets to place, and compare those that overlap."""
         self._place()
         self.counts = count_packets(
             self._log, self._found, self._past, self._placed, self._duplicate, self._conflicting
@@ -223,7 +200,7 @@ class _Row:
         self.counts.short = int((self._sizes[mine] < self._found.full).sum())
 
     def _place(self) -> None:
-        """Of packets with the same place, the first is placed, and any that brings more bytes."""
+        """Of packets at the same place, select the first and any with more bytes."""
         own = np.flatnonzero(self._own)
         offsets = self._found.offsets[own]
         order = np.argsort(offsets, kind="stable")
@@ -239,7 +216,7 @@ class _Row:
                 self._overlap(own[order[i:j]].tolist())
 
     def _overlap(self, packets: list[int]) -> None:
-        """Packets of one place, in the order of arrival: the longest so far holds the place."""
+        """Compare packets of one place, in order of arrival, with the longest so far."""
         longest = packets[0]
         for k in packets[1:]:
             offset = int(self._found.offsets[k])
@@ -259,7 +236,7 @@ class _Row:
         return self._log.payload[self._starts[k] : self._starts[k] + self._sizes[k]]
 
     def arrivals(self) -> Counts:
-        """When batches of packets came, and up to which byte the row was there then."""
+        """Return the arrival time of each batch and the bytes received by then, int64 [n, 2]."""
         batches = self._log.batches
         if not batches.size:
             return np.zeros((0, 2), dtype=np.int64)
@@ -268,7 +245,7 @@ class _Row:
         return np.ascontiguousarray(pairs[pairs[:, 1] > 0])
 
     def bytes(self, holes: list[Gap]) -> Bytes:
-        """The row: the log's own memory where the packets came in order, else a copy. Zero at the holes and behind."""
+        """Return the row: the log's own memory if the packets came in order, otherwise a copy. Zero at the holes."""
         log, mine = self._log, np.flatnonzero(self._placed)
         out = log.payload[: log.expected]
         if (self.at[mine] != self._starts[mine]).any() or log.payload.size < log.expected:
@@ -280,7 +257,7 @@ class _Row:
         return out
 
     def _copy(self, mine: Counts, out: Bytes) -> None:
-        """Copy runs of packets that follow each other in the log and in the row."""
+        """Copy runs of packets that are consecutive in the log and in the row."""
         if not mine.size:
             return
         offsets, sizes, starts, stops = self.at[mine], self._sizes[mine], self._starts[mine], self._stops[mine]
@@ -301,13 +278,13 @@ def _losses(missing: list[Gap], extent: int, expected: int) -> Losses:
 
 
 def _gaps(covered: list[Gap], extent: int) -> list[Gap]:
-    """What of [0, extent) is not covered."""
+    """Return the ranges of [0, extent) that are not covered."""
     edges = [0, *(edge for gap in covered for edge in gap), extent]
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
 
 
 def _merged(gaps: list[Gap]) -> list[Gap]:
-    """The same bytes as sorted ranges that do not touch."""
+    """Return the same bytes as sorted ranges that do not touch."""
     out: list[Gap] = []
     for start, stop in sorted(gaps):
         if out and start <= out[-1][1]:

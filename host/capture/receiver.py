@@ -1,8 +1,7 @@
-"""The host's handle of one receiving process, and the messages between the two.
+"""Start and control the receiver process of one card; the messages between host and process.
 
-Requests and answers are msgpack structs on a connection that the process inherits. A row is one round: `BeginRow` with
-the file to write, `Progress` while packets come, `EndRow`, and a `RowCapture` that says what was received. The process
-itself is `receiver_process.py`.
+Requests and answers are msgpack structs on an inherited connection. For each row: `BeginRow` with the file to write,
+`Progress` during reception, `EndRow`, and a `RowCapture` with the result. The process itself is `receiver_process.py`.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import sys
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import msgspec
@@ -21,17 +19,18 @@ import msgspec
 from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight.host.capture.scheduling import Core
 from polysight.shared.config import Board
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 
-_START_LIMIT_S = 30.0
-_ANSWER_LIMIT_S = 60.0  # ending a row waits for the disk
+_START_TIMEOUT_S = 30.0
+_ANSWER_TIMEOUT_S = 60.0  # ending a row waits for the disk
 
 
-class _Words(msgspec.Struct, frozen=True, tag=True):
+class _Message(msgspec.Struct, frozen=True, tag=True):
     pass
 
 
-class Open(_Words, frozen=True):
+class Open(_Message, frozen=True):
     """Bind the data socket. Answered with Opened or Failed."""
 
     board: str
@@ -43,8 +42,8 @@ class Open(_Words, frozen=True):
     own_core: bool = True
 
 
-class BeginRow(_Words, frozen=True):
-    """Drop what is waiting, and place what comes from now on into the file at `path`. Answered with Began or Failed."""
+class BeginRow(_Message, frozen=True):
+    """Drop pending packets and receive a row into the file at `path`. Answered with Began or Failed."""
 
     row: int
     take: int
@@ -53,29 +52,29 @@ class BeginRow(_Words, frozen=True):
     path: str
 
 
-class EndRow(_Words, frozen=True):
-    """The row has ended: fetch what still waits, make the file durable. Answered with RowCapture or Failed.
+class EndRow(_Message, frozen=True):
+    """End the row: fetch pending packets, make the file durable. Answered with RowCapture or Failed.
 
-    `card_status` holds the bits the card reported since record start: some say that it lost data itself.
-    `not_before_ns`: as in Report.
+    `card_status` has the bits that the card reported since record start; some report lost data. `not_before_ns` as in
+    Report.
     """
 
     card_status: int = 0
     not_before_ns: int = 0
 
 
-class Discard(_Words, frozen=True):
-    """Forget the running row and remove its file. Answered with Discarded."""
+class Discard(_Message, frozen=True):
+    """Discard the running row and its file. Answered with Discarded."""
 
 
-class Report(_Words, frozen=True):
-    """Answered with Progress. No pulse of the row was sent before `not_before_ns` (monotonic clock; 0: not known)."""
+class Report(_Message, frozen=True):
+    """Request Progress. `not_before_ns` is a time before the first pulse (monotonic clock), 0 if unknown."""
 
     not_before_ns: int = 0
 
 
-class Opened(_Words, frozen=True):
-    """The socket is bound. `scheduling` says where and how urgently the process runs, `warnings` what it may not."""
+class Opened(_Message, frozen=True):
+    """The socket is bound. `scheduling` has core and priority, `warnings` what the system did not permit."""
 
     granted_bytes: int
     data_port: int
@@ -83,34 +82,31 @@ class Opened(_Words, frozen=True):
     warnings: list[str] = []
 
 
-class Began(_Words, frozen=True):
-    """Ready for the row; `stale` packets that came between rows were dropped."""
+class Began(_Message, frozen=True):
+    """Ready for the row; `stale` packets from between rows were dropped."""
 
     stale: int
 
 
-class Progress(_Words, frozen=True):
-    """How far the row is. Sent unasked when every expected byte is there, and when the short last packet came.
-
-    `ended`: the furthest packet is a short one, which only the last of a record is.
-    """
+class Progress(_Message, frozen=True):
+    """Progress of the row; also sent without a request when every byte has arrived, and on the short last packet."""
 
     row: int
     take: int
     received: int
     complete: bool
     last_arrival_ns: int  # monotonic clock; 0 before the first packet
-    ended: bool = False
+    ended: bool = False  # the furthest packet is short, as only the last of a record is
 
 
-class RowCapture(_Words, frozen=True):
-    """What one board's receiver got of one row.
+class RowCapture(_Message, frozen=True):
+    """Reception of one row of one board.
 
-    `bytes` is what was placed, `missing` the byte ranges that are not (the whole row when `located` is false).
-    Arrival times are the host's monotonic clock, 0 when no packet came. Counts of packets as in
-    :class:`polysight.host.capture.packet_counts.PacketCounts`, bytes lost at the head, in gaps and at the tail as in
-    :class:`polysight.host.capture.placement.Losses`. `card_status` is what the card reported by itself during the row.
-    `holes` and `slipped` as in :class:`polysight.host.capture.placement.Placed`.
+    `bytes` counts placed bytes, `missing` are the other byte ranges (the whole row if `located` is False). Arrival
+    times are of the host's monotonic clock, 0 without packets. Packet counts as in
+    :class:`polysight.host.capture.packet_counts.PacketCounts`, lost bytes as in
+    :class:`polysight.host.capture.placement.Losses`, `holes` and `slipped` as in
+    :class:`polysight.host.capture.placement.Placed`. `card_status` are the bits the card reported during the row.
     """
 
     row: int
@@ -151,30 +147,31 @@ class RowCapture(_Words, frozen=True):
 
     @property
     def missing_bytes(self) -> int:
-        """Bytes of the row that are not there for certain."""
+        """Number of missing or uncertain bytes."""
         return sum(stop - start for start, stop in self.missing)
 
     @property
     def lost_before_packets(self) -> Status:
-        """The status bits by which the card said that it dropped data before numbering it; 0 when it did not."""
+        """The status bits that report data dropped by the card before numbering; 0 if none."""
         return Status(self.card_status) & LOST_BEFORE_PACKETS
 
     @property
     def complete(self) -> bool:
-        """Whether the row is there to the last byte."""
+        """True if every byte of the row is there."""
         return self.located and not self.missing
 
 
-class Discarded(_Words, frozen=True):
-    """The row is forgotten."""
+class Discarded(_Message, frozen=True):
+    """The row is discarded."""
 
 
-class Failed(_Words, frozen=True):
-    """What was asked could not be done."""
+class Failed(_Message, frozen=True):
+    """The request failed; fields as of a PolysightError."""
 
     what: str
     why: str = ""
     remedy: str = ""
+    code: str = ErrorCode.OTHER
 
 
 Request = Open | BeginRow | EndRow | Discard | Report
@@ -185,48 +182,39 @@ _requests: Any = msgspec.msgpack.Decoder(Request)
 _answers: Any = msgspec.msgpack.Decoder(Answer)
 
 
-def send(connection: Connection, words: Request | Answer) -> None:
-    """Send one message. Raises DeviceError when the other side is gone."""
+def send(connection: Connection, message: Request | Answer) -> None:
+    """Send one message. Raises DeviceError if the connection is closed."""
     try:
-        connection.send_bytes(_encoder.encode(words))
+        connection.send_bytes(_encoder.encode(message))
     except OSError as e:
-        raise DeviceError(f"the receiver's pipe broke: {e}", "the other process ended") from None
+        what, why = f"the receiver's pipe broke: {e}", "the other process ended"
+        raise DeviceError(what, why, code=ErrorCode.NO_ANSWER) from None
 
 
 def next_request(connection: Connection) -> Request:
-    """The next request. Raises EOFError when the host is gone."""
+    """Receive a request. Raises EOFError if the host has closed the connection."""
     return _requests.decode(connection.recv_bytes())
 
 
-def next_answer(connection: Connection) -> Answer:
-    """The next answer. Raises EOFError when the receiver is gone."""
-    return _answers.decode(connection.recv_bytes())
-
-
 class ReceiverProcess:
-    """One card's receiving process: `begin_row`, then `poll` until complete or given up, then `end_row`.
+    """The receiver process of one card: `begin_row`, then `poll` until complete or timeout, then `end_row`.
+
+    Attributes `granted_bytes`, `scheduling` and `warnings` as in :class:`Opened`.
 
     Parameters
     ----------
     board
-        Whose data to receive; addresses and ports are its.
+        Board with the addresses and ports.
     buffer_bytes
-        Receive buffer to ask the kernel for.
+        Requested receive buffer.
     core
-        Core to pin it to, as :func:`polysight.host.capture.scheduling.receiver_cores` chooses them; None: any. A core
-        that it shares is taken with real-time priority only.
-
-    Attributes
-    ----------
-    granted_bytes
-        Receive buffer the kernel gave.
-    scheduling, warnings
-        Where and how urgently the process runs, and what of that the system did not permit.
+        Core to pin the process to, as chosen by :func:`polysight.host.capture.scheduling.receiver_cores`; None: any. A
+        shared core is used only with real-time priority.
 
     Raises
     ------
     DeviceError
-        when the process does not start, or its address and port cannot be bound.
+        if the process does not start, or its address and port cannot be bound.
     """
 
     def __init__(self, board: Board, buffer_bytes: int, core: Core | None = None) -> None:
@@ -238,7 +226,7 @@ class ReceiverProcess:
                 [sys.executable, "-m", "polysight.host.capture.receiver_process", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C in the terminal is the host's to handle
+                start_new_session=True,  # only the host handles Ctrl-C
             )
         self._connection = Connection(ours.detach())
         try:
@@ -246,7 +234,7 @@ class ReceiverProcess:
             request = Open(
                 board.name, board.host_address, board.data_port, board.card_address, buffer_bytes, number, own
             )
-            opened = self._ask(request, Opened, _START_LIMIT_S)
+            opened = self._ask(request, Opened, _START_TIMEOUT_S)
         except DeviceError:
             self.close()
             raise
@@ -255,48 +243,47 @@ class ReceiverProcess:
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
+        """Process id."""
         return self._process.pid
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when the process has something to say."""
+        """Return the descriptor that becomes readable when the process has sent a message."""
         return self._connection.fileno()
 
     def begin_row(self, row: int, take: int, expected_bytes: int, frame_bytes: int, path: Path) -> int:
-        """Receive a row into the file at `path` (its index beside it); returns how many stray packets were dropped.
+        """Receive a row into the file at `path`, with its index beside it; return the number of dropped stray packets.
 
-        Raises DeviceError when the file cannot be made.
+        Raises DeviceError if the file cannot be made.
         """
         request = BeginRow(row, take, expected_bytes, frame_bytes, str(path))
-        stale = self._ask(request, Began, _ANSWER_LIMIT_S).stale
+        stale = self._ask(request, Began, _ANSWER_TIMEOUT_S).stale
         self._progress = Progress(row, take, 0, expected_bytes == 0, 0)
         return stale
 
     def poll(self) -> Progress:
-        """How far the row is, without waiting: only what the process said unasked."""
+        """Return the latest progress that the process has sent, without waiting."""
         while self._connection.poll():
             self._take(self._next())
         return self._progress
 
     def report(self, not_before_ns: int = 0) -> Progress:
-        """How far the row is, asked for. No pulse of it was sent before `not_before_ns`, if that is given."""
-        return self._ask(Report(not_before_ns), Progress, _ANSWER_LIMIT_S)
+        """Request the progress; `not_before_ns` as in :class:`Report`."""
+        return self._ask(Report(not_before_ns), Progress, _ANSWER_TIMEOUT_S)
 
     def end_row(self, card_status: Status | None = None, not_before_ns: int = 0) -> RowCapture:
-        """End the row: its file is durable when this returns. Raises DeviceError.
+        """End the row; its file is durable on return. Raises DeviceError.
 
-        No pulse of the row was sent before `not_before_ns` (monotonic clock): packets that came earlier are left over.
-        `card_status` is what the card reported by itself since record start. With bits 7 or 9 in it the card dropped
-        data before numbering it: the row is masked as a whole, and the reason says so.
+        Packets from before `not_before_ns` (monotonic clock), a time before the first pulse, are left over. With bit 7
+        or 9 in `card_status`, the card dropped data before numbering it, and the row is masked as a whole.
         """
-        return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_LIMIT_S)
+        return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_TIMEOUT_S)
 
     def discard(self) -> None:
-        """Forget the running row and remove its file."""
-        self._ask(Discard(), Discarded, _ANSWER_LIMIT_S)
+        """Discard the running row and its file."""
+        self._ask(Discard(), Discarded, _ANSWER_TIMEOUT_S)
 
     def close(self) -> None:
-        """End the process. Twice is once."""
+        """End the process. Safe to repeat."""
         self._connection.close()
         try:
             self._process.wait(timeout=5.0)
@@ -307,43 +294,43 @@ class ReceiverProcess:
     def __enter__(self) -> ReceiverProcess:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _take(self, answer: Answer) -> None:
         if isinstance(answer, Progress):
             self._progress = answer
         elif isinstance(answer, Failed):
-            raise DeviceError(answer.what, answer.why, answer.remedy)
+            raise DeviceError(answer.what, answer.why, answer.remedy, code=ErrorCode(answer.code))
 
     def _next(self) -> Answer:
         try:
-            return next_answer(self._connection)
+            return _answers.decode(self._connection.recv_bytes())
         except (EOFError, OSError):
             raise self._ended() from None
 
     def _ended(self) -> DeviceError:
         return DeviceError(
-            f"{self.board.name}: the receiving process ended with status {self._process.poll()}",
+            f"{self.board.name}: the receiver process ended with status {self._process.poll()}",
             "it was killed, or it failed; its message is above",
-            "`dmesg` tells whether the kernel ended it, for want of memory",
+            "check with `dmesg` if the kernel ended it for lack of memory",
+            code=ErrorCode.NO_ANSWER,
         )
 
-    def _ask(self, request: Request, kind: type[A], limit_s: float) -> A:
+    def _ask(self, request: Request, kind: type[A], timeout_s: float) -> A:
         try:
             send(self._connection, request)
         except DeviceError:
             raise self._ended() from None
-        deadline = time.monotonic() + limit_s
+        deadline = time.monotonic() + timeout_s
         while self._connection.poll(max(0.0, deadline - time.monotonic())):
             answer = self._next()
             self._take(answer)
             if isinstance(answer, kind):
                 return answer
         raise DeviceError(
-            f"{self.board.name}: the receiving process did not answer {type(request).__name__} within {limit_s:g} s",
+            f"{self.board.name}: the receiver process did not answer {type(request).__name__} within {timeout_s:g} s",
             "the machine or its disk is overloaded",
-            "look at the load of the machine and its disk",
+            "check the load of the machine and its disk",
+            code=ErrorCode.NO_ANSWER,
         )

@@ -1,7 +1,8 @@
-"""The receiving process of one card: `python -m polysight.host.capture.receiver_process FD`.
+"""Receiver process of one card: `python -m polysight.host.capture.receiver_process FD`.
 
-A process of its own, so that imaging in the host never starves it. It obeys requests on the inherited socket FD, sits
-in one poll() over that and the card's data, and ends when the host does, because then the socket closes.
+A separate process, so that processing in the host cannot delay reception. It waits in one poll() for requests on the
+inherited socket FD and for the card's data, and ends when the socket closes, which happens at the latest when the host
+ends.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.capture import receiver as words
+from polysight.host.capture import receiver as messages
 from polysight.host.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight.host.capture.earlier_records import Past
 from polysight.host.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
@@ -29,43 +30,43 @@ from polysight.host.capture.scheduling import take_core, take_priority
 from polysight.host.capture.segment import Segment, write_index
 from polysight.shared.errors import DeviceError, PolysightError
 
-_MAX_BATCHES = 64  # batches fetched before the pipe is looked at again
-_LOOK_SHARE = 20  # a look at how far the row is takes at most this part of the time
-_GATHER_MS = 1  # packets gather in the kernel's buffer meanwhile: fewer, fuller batches
+_MAX_BATCHES = 64  # batches fetched before requests are checked again
+_PREVIEW_SHARE = 20  # previews take at most 1/20 of the time
+_GATHER_MS = 1  # pause in which packets gather in the kernel's buffer: fewer, larger batches
 
 
 class _Row:
-    """The row that is being received."""
+    """A row during reception."""
 
-    def __init__(self, request: words.BeginRow, segment: Segment, log: PacketLog, past: Past) -> None:
+    def __init__(self, request: messages.BeginRow, segment: Segment, log: PacketLog, past: Past) -> None:
         self.request, self.segment, self.log, self.past = request, segment, log, past
         self.stale = self.strangers = self.drops = 0
         self.not_before_ns = 0
-        self._told = (False, False)
-        self._looked_at = 0  # packets
-        self._next_look_ns = 0
+        self._reported = (False, False)
+        self._previewed = 0  # packets
+        self._next_preview_ns = 0
         self._preview = Preview(0, request.expected_bytes == 0, ended=False)
 
-    def news(self) -> bool:
-        """Whether there is something to tell the host unasked: it may be complete, or its last packet came."""
+    def has_news(self) -> bool:
+        """True if the host must be notified: the row has become complete, or its last packet came."""
         log = self.log
         if log.payload_bytes < log.expected and not log.last_is_short:
             return False
-        if log.count == self._looked_at or (began := time.monotonic_ns()) < self._next_look_ns:
+        if log.count == self._previewed or (began := time.monotonic_ns()) < self._next_preview_ns:
             return False
-        self._look()
-        self._next_look_ns = time.monotonic_ns() + _LOOK_SHARE * (time.monotonic_ns() - began)
-        told, self._told = self._told, (self._preview.complete, self._preview.ended)
-        return self._told != told and any(self._told)
+        self._update()
+        self._next_preview_ns = time.monotonic_ns() + _PREVIEW_SHARE * (time.monotonic_ns() - began)
+        reported, self._reported = self._reported, (self._preview.complete, self._preview.ended)
+        return self._reported != reported and any(self._reported)
 
-    def progress(self) -> words.Progress:
-        self._look()
+    def progress(self) -> messages.Progress:
+        self._update()
         p, r = self._preview, self.request
-        return words.Progress(r.row, r.take, p.received, p.complete, self.log.last_arrival_ns, p.ended)
+        return messages.Progress(r.row, r.take, p.received, p.complete, self.log.last_arrival_ns, p.ended)
 
-    def _look(self) -> None:
-        if self.log.count != self._looked_at:
-            self._looked_at = self.log.count
+    def _update(self) -> None:
+        if self.log.count != self._previewed:
+            self._previewed = self.log.count
             self._preview = preview(self.log, self.request.frame_bytes, self.past, self.not_before_ns)
 
 
@@ -77,11 +78,11 @@ class Receiver:
         self._socket: socket.socket | None = None
         self._batches: BatchReceiver | None = None
         self._row: _Row | None = None
-        self._past = Past()  # what the records so far tell about the next
-        self._memory: NDArray[np.uint8] | None = None  # of the row before, taken again
+        self._past = Past()  # knowledge from earlier records
+        self._memory: NDArray[np.uint8] | None = None  # of the previous row, to be reused
 
     def serve(self) -> None:
-        """Obey requests and receive until the connection closes."""
+        """Answer requests and receive until the connection closes."""
         poll, requests = select.poll(), select.poll()
         poll.register(self._connection.fileno(), select.POLLIN)
         requests.register(self._connection.fileno(), select.POLLIN)
@@ -92,15 +93,15 @@ class Receiver:
                 requests.poll(_GATHER_MS)
             if self._connection.fileno() in ready:
                 try:
-                    request = words.next_request(self._connection)
+                    request = messages.next_request(self._connection)
                 except (EOFError, OSError):
                     break
                 try:
-                    answer = self._obey(request)
+                    answer = self._answer(request)
                 except PolysightError as e:
-                    answer = words.Failed(e.what, e.why, e.remedy)
-                words.send(self._connection, answer)
-                # Between rows the socket is not watched: stray packets wait there until the next row drops them.
+                    answer = messages.Failed(e.what, e.why, e.remedy, e.code)
+                messages.send(self._connection, answer)
+                # Between rows the socket is not polled: stray packets wait there until the next row drops them.
                 if self._socket is not None and self._row is not None:
                     poll.register(self._socket.fileno(), select.POLLIN)
                 elif self._socket is not None:
@@ -109,37 +110,37 @@ class Receiver:
         if self._row is not None:
             self._row.segment.discard()
 
-    def _obey(self, request: words.Request) -> words.Answer:
-        if isinstance(request, words.Open):
+    def _answer(self, request: messages.Request) -> messages.Answer:
+        if isinstance(request, messages.Open):
             return self._open(request)
-        if isinstance(request, words.BeginRow):
+        if isinstance(request, messages.BeginRow):
             return self._begin(request)
-        if isinstance(request, words.EndRow):
+        if isinstance(request, messages.EndRow):
             return self._end(request)
-        if isinstance(request, words.Discard):
+        if isinstance(request, messages.Discard):
             if self._row is not None:
-                self._forget()
-            return words.Discarded()
+                self._discard()
+            return messages.Discarded()
         if self._row is None:
-            return words.Progress(-1, 0, 0, False, 0)
+            return messages.Progress(-1, 0, 0, False, 0)
         self._row.not_before_ns = request.not_before_ns or self._row.not_before_ns
         return self._row.progress()
 
-    def _open(self, request: words.Open) -> words.Answer:
+    def _open(self, request: messages.Open) -> messages.Answer:
         self._socket = bind_udp(request.host_address, request.data_port, f"{request.board} data")
         granted = enlarge_receive_buffer(self._socket, request.buffer_bytes)
         self._batches = BatchReceiver(self._socket, request.card_address)
-        priority, ordinary = take_priority()  # capture goes before processing where the system allows it
+        priority, ordinary = take_priority()
         core, unpinned = take_core(request.core, request.own_core, urgent=not ordinary)
         scheduling = f"{'any core' if core is None else f'core {core}'}, {priority}"
         port = self._socket.getsockname()[1]
-        return words.Opened(granted, port, scheduling, [w for w in (unpinned, ordinary) if w])
+        return messages.Opened(granted, port, scheduling, [w for w in (unpinned, ordinary) if w])
 
-    def _begin(self, request: words.BeginRow) -> words.Answer:
+    def _begin(self, request: messages.BeginRow) -> messages.Answer:
         if self._socket is None or self._batches is None:
             raise DeviceError("the receiver has no socket yet")
         if self._row is not None:
-            self._forget()
+            self._discard()
         segment = Segment(Path(request.path), request.expected_bytes)
         try:
             log = PacketLog(request.expected_bytes, self._memory)
@@ -154,10 +155,10 @@ class Receiver:
         self._row = row = _Row(request, segment, log, self._past)
         row.stale, row.strangers = strays.count + strays.malformed, self._batches.strangers
         row.drops = kernel_drops(self._socket)
-        return words.Began(row.stale)
+        return messages.Began(row.stale)
 
-    def _forget(self) -> None:
-        """Give the row up; what its card sent is not known then."""
+    def _discard(self) -> None:
+        """Discard the row; the end of its record is unknown then."""
         if self._row is not None:
             self._row.segment.discard()
         self._row, self._past = None, Past(spans=self._past.spans)
@@ -167,35 +168,35 @@ class Receiver:
         if row is None or batches is None:
             return
         for _ in range(_MAX_BATCHES):
-            looked_ns = time.monotonic_ns()
+            read_ns = time.monotonic_ns()
             n = batches.receive()
             if n == 0:
-                row.log.note_quiet(looked_ns)
+                row.log.note_quiet(read_ns)
                 break
             row.log.add(batches.packets[:n], batches.lengths[:n], time.monotonic_ns())
-        if row.news():
-            words.send(self._connection, row.progress())
+        if row.has_news():
+            messages.send(self._connection, row.progress())
 
-    def _end(self, request: words.EndRow) -> words.Answer:
+    def _end(self, request: messages.EndRow) -> messages.Answer:
         row = self._row
         if row is None or self._socket is None or self._batches is None:
             raise DeviceError("no row is being received")
         self._receive()
         self._row = None
-        asked, log, path = row.request, row.log, Path(row.request.path)
+        begun, log, path = row.request, row.log, Path(row.request.path)
         dropped = (Status(request.card_status) & LOST_BEFORE_PACKETS).name or ""
         not_before_ns = max(request.not_before_ns, row.not_before_ns)
-        evidence = Evidence(asked.expected_bytes, asked.frame_bytes, not_before_ns, dropped, row.past)
-        placed, out = place_record(log, asked.frame_bytes, row.past, not_before_ns, dropped)
+        evidence = Evidence(begun.expected_bytes, begun.frame_bytes, not_before_ns, dropped, row.past)
+        placed, out = place_record(log, begun.frame_bytes, row.past, not_before_ns, dropped)
         self._past, self._memory = placed.past, log.payload
         crc = row.segment.finish(out)
-        facts = {"row": asked.row, "take": asked.take, **placed.facts(), "card_status": request.card_status}
+        facts = {"row": begun.row, "take": begun.take, **placed.facts(), "card_status": request.card_status}
         index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
         counts, losses, arrivals = vars(placed.counts).copy(), vars(placed.losses), placed.arrivals
         counts["packets"] = counts.pop("placed")
-        return words.RowCapture(
-            row=asked.row,
-            take=asked.take,
+        return messages.RowCapture(
+            row=begun.row,
+            take=begun.take,
             expected=placed.expected,
             bytes=placed.received,
             missing=placed.missing,
@@ -218,14 +219,14 @@ class Receiver:
 
 
 def main(argv: list[str]) -> int:
-    """Run the receiver on the inherited socket whose descriptor is the only argument."""
+    """Run the receiver on the inherited socket; its descriptor is the only argument."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the host decides when a row ends
     with Connection(int(argv[1])) as connection:
         try:
             Receiver(connection).serve()
         except PolysightError as e:
-            with contextlib.suppress(DeviceError):  # the host may be gone; then nobody is left to tell
-                words.send(connection, words.Failed(e.what, e.why, e.remedy))
+            with contextlib.suppress(DeviceError):  # the host may have ended
+                messages.send(connection, messages.Failed(e.what, e.why, e.remedy, e.code))
             return e.exit_status
     return 0
 

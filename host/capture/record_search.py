@@ -1,9 +1,9 @@
-"""Which of a row's packets are its record, and where the record starts: decided from all of them together.
+"""Find a row's record among its packets: its start, and the packets that belong to it.
 
-What is observed, what is hidden and which decision has which error: docs/spec/placement.md. In short: within a record
-all packets but the last are full, so `byte count - full x sequence` is one number, the record's *line*. Packets of
-other records lie on other lines, or on the same line at other counts. The record's start is believed where counters of
-the records before leave one possibility, or where its end proves it. Anything else is not located.
+The model and the errors of each decision: docs/spec/placement.md. Within a record all packets but the last are full, so
+`byte count - full x sequence` is constant: the record's *line*. Packets of other records are on other lines, or on the
+same line at other counts. The start is certain if the counters of earlier records leave one possibility, or if the
+record's end proves it. Otherwise the record is not located.
 """
 
 from __future__ import annotations
@@ -19,71 +19,40 @@ from polysight.host.capture.packet_log import PacketLog
 
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-SMALL_RECORD = 16  # packets: a record as small as this may be delayed as a whole
+SMALL_RECORD = 16  # packets: a record of this size may be delayed as a whole
 _NEAR = 64  # records
 SWITCHED_ON = Counters(0, 1)  # of the first packet after a reset
-_JOINS, _JOINS_SMALL = 1, 3  # doubtful records in a row, without a seam, after which the next one is believed
+_JOINS, _JOINS_SMALL = 1, 3  # consecutive doubtful records without a gap, after which the next one is trusted
 
 
 @dataclass(frozen=True)
 class Found:
-    """The record among a row's packets.
+    """The record among a row's packets; arrays are [packet]."""
 
-    Attributes
-    ----------
-    base
-        Counters of the record's first byte; the best guess when it is not `certain`; None without any packet.
-    certain, located
-        Whether the base is certain; whether every byte's place is.
-    reason
-        Why it is not located.
-    offsets, steps
-        int64 [packet]: bytes and packets from the base.
-    own
-        bool [packet]: of the record's line, from the base on, and of no earlier record.
-    early, old
-        bool [packet]: came before the row's first pulse; has counters of an earlier record.
-    full
-        Payload of a full packet.
-    excess
-        Whether more came than the record has.
-    doubtful
-        Whether it is whole, but could be made of an earlier record's packets as well.
-    fresh
-        Whether it starts with the counters of a card just switched on, and nothing else came: the base is as good as
-        certain for a row that missed triggers, whose frames are placed by their arrival.
-    foreseen
-        Whether the records before tell where it starts.
-    clock_jumps
-        Times at which the clock of the arrivals went backwards; then arrival decides nothing.
-    restarted
-        Whether the card may have begun anew just before it: then it ends where its last packet does.
-    again
-        bool [packet]: has counters that came before, and is no copy by what is known; None when there is none.
-    """
-
-    base: Counters | None
-    certain: bool
-    located: bool
-    reason: str
-    offsets: Counts
-    steps: Counts
-    own: Flags
-    early: Flags
-    old: Flags
-    full: int
-    excess: bool = False
-    doubtful: bool = False
+    base: Counters | None  # of the record's first byte, a guess unless `certain`; None without any packet
+    certain: bool  # the base is certain
+    located: bool  # the place of every byte is certain
+    reason: str  # why it is not located
+    offsets: Counts  # int64, bytes from the base
+    steps: Counts  # int64, packets from the base
+    own: Flags  # on the record's line, from the base on, and of no earlier record
+    early: Flags  # came before the row's first pulse
+    old: Flags  # has counters of an earlier record
+    full: int  # payload of a full packet
+    excess: bool = False  # more came than the record has
+    doubtful: bool = False  # complete, but possibly made of packets of an earlier record
     fresh: bool = False
-    foreseen: bool = False
-    clock_jumps: int = 0
-    restarted: bool = False
-    again: Flags | None = None
+    """It starts with the counters of a card just switched on, and nothing else came: the base is practically certain
+    for a row with missed triggers, whose frames are placed by arrival times."""
+    foreseen: bool = False  # its start is known from earlier records
+    clock_jumps: int = 0  # number of times the arrival clock went backwards; arrival times are then ignored
+    restarted: bool = False  # the card may have restarted just before it, so its last packet is its end
+    again: Flags | None = None  # has counters that came before and is not a known copy; None if no packet has
 
 
 @dataclass(frozen=True)
 class _Verdict:
-    """What is decided of the packets on one line; `base` relative to the reference."""
+    """Decision about the packets on one line; `base` relative to the reference, the rest as in `Found`."""
 
     base: int
     certain: bool
@@ -103,11 +72,11 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
     log
         The packets.
     frame_bytes
-        Bytes of a frame; 1 when the record has none.
+        Bytes of a frame; 1 if the record has none.
     past
-        What the records before tell.
+        Knowledge from earlier records.
     not_before_ns
-        No pulse of the row was sent before this time: packets that came earlier are left over.
+        Time before the first pulse of the row: packets that arrived earlier are left over.
     """
     full = full_payload(log)
     nothing = np.zeros(log.count, dtype=np.bool_)
@@ -127,22 +96,22 @@ def find_record(log: PacketLog, frame_bytes: int, past: Past, not_before_ns: int
                        clock_jumps=jumps)  # fmt: skip
     found = _found(packets, live, log.expected, frame_bytes, past, sorted_out) if live.any() else None
     if again.any() and (found is None or not _ends_where_foreseen(found, log)):
-        # Counters that came already, in a row that lacks its end: copies on a slow path, or the card began anew.
+        # Repeated counters in a row without its end: late copies, or the card has restarted.
         if found is not None and found.located:
-            why = "packets with counters that came before, and the end is not there: the card may have begun anew"
+            why = "packets repeat earlier counters, and the record's end is missing: the card may have restarted"
             return replace(found, located=False, certain=False, reason=why, restarted=True, again=again)
         unknown = Past(spans=past.spans, joint=past.joint, joined=past.joined, unseen=True, anew=past.anew)
         packets = CounterView(log, Counters(int(log.byte_counts[again][0]), int(log.sequences[again][0])), full)
         sorted_out = replace(sorted_out, old=old & ~again, again=again)
         found = _found(packets, live | again, log.expected, frame_bytes, unknown, sorted_out)
     if found is None:
-        why = "every packet is of an earlier record, by its counters or because it came before the first pulse"
+        why = "every packet is of an earlier record, by its counters or by its arrival before the first pulse"
         return replace(sorted_out, reason=why)
     return found
 
 
 def _found(packets: CounterView, live: Flags, expected: int, frame_bytes: int, past: Past, sorted_out: Found) -> Found:
-    """The record among the packets that may be its own; `sorted_out` says what the others are."""
+    """Find the record among the `live` packets; `sorted_out` classifies the others."""
     line, v = _Search(packets, live, expected, frame_bytes, past).best()
     offsets, steps = packets.ahead - v.base, packets.steps - (v.base - line) // packets.full
     own = live & (packets.line == line) & (offsets >= 0)
@@ -157,38 +126,38 @@ def _found(packets: CounterView, live: Flags, expected: int, frame_bytes: int, p
 
 
 def _rival(packets: CounterView, found: Found, rest: Flags, expected: int) -> str:
-    """Why other packets may be the row's record as well as these; "" when they may not.
+    """Return why other packets may be the row's record instead; "" if they may not.
 
-    The host has started one record, so the card's last one is the row's: unless the card began another by itself.
+    The host has started one record, so the card's last one is the row's, unless the card started another by itself.
     """
     if later_packets(found, rest, expected, expected).any():
-        return "packets of two records came, one behind the other: which of them is the row's is not known"
+        return "packets of two consecutive records came: it is unknown which is the row's"
     before = (found.offsets < 0) & (found.steps < 0)
     if _many(packets, rest & ~before, expected) or (not found.foreseen and _many(packets, rest & before, expected)):
-        return "half of another record came with it: which of them is the row's is not known"
+        return "half of another record came with it: it is unknown which is the row's"
     return ""
 
 
 def _many(packets: CounterView, which: Flags | Counts, expected: int) -> bool:
-    """Whether these packets hold half of a record's bytes: no network holds back so many."""
+    """True if these packets have half of a record's bytes: networks do not delay so many."""
     _, one = np.unique(packets.ahead[which], return_index=True)
     return 2 * int(packets.sizes[which][one].sum()) >= expected > 0
 
 
 def later_packets(found: Found, rest: Flags, stop: int, expected: int) -> Flags:
-    """Which of the packets have counters not far behind a record that ended at `stop`."""
+    """Select the packets with counters not far behind a record that ended at `stop`."""
     behind = (found.offsets >= stop) & (found.offsets < stop + 2 * expected + found.full)
     counted = (found.steps > 0) & (found.steps * found.full < stop + 4 * expected + 4 * found.full)
     return rest & behind & counted
 
 
 def _ends_where_foreseen(found: Found, log: PacketLog) -> bool:
-    """Whether a located record's last byte came, where the records before foretold its start."""
+    """True if the last byte came of a located record whose start was known from earlier records."""
     return found.located and found.foreseen and int((found.offsets + log.sizes)[found.own].max()) == log.expected
 
 
 class _Search:
-    """Judges the lines on which a row's packets lie, and chooses the record's."""
+    """Decides about each line of a row's packets, and chooses the record's."""
 
     def __init__(self, packets: CounterView, live: Flags, expected: int, frame_bytes: int, past: Past) -> None:
         self._p, self._live, self._expected, self._frame, self._past = packets, live, expected, frame_bytes, past
@@ -197,9 +166,9 @@ class _Search:
         self._ends, self._end_lines = ends, ends - packets.full * -(-ends // packets.full)
 
     def best(self) -> tuple[int, _Verdict]:
-        """The record's line, and what is decided of it.
+        """Return the record's line and the decision about it.
 
-        A line on which the record was to start comes first, where it is located; else the one with most bytes.
+        Preferred is a line on which the record is expected to start, if it is located; otherwise that with most bytes.
         """
         p, live = self._p, np.flatnonzero(self._live)
         lines, group = np.unique(p.line[live], return_inverse=True)
@@ -219,7 +188,7 @@ class _Search:
         return int(lines[k]), self._judge(live[group == k], int(lines[k]))
 
     def _judge(self, which: Counts, line: int) -> _Verdict:
-        """What is decided of the packets on one line."""
+        """Decide about the packets on one line."""
         p, bases = self._p, self._ends[self._end_lines == line]
         first, last = int(p.ahead[which].min()), int(p.ahead[which].max())
         last_size = int(p.sizes[which][p.ahead[which] == last].max())
@@ -227,28 +196,28 @@ class _Search:
         if bases.size:
             verdict = replace(self._from_past(bases, first, stop, short), foreseen=True)
         else:
-            inside = p.ahead[which] >= stop - self._expected  # none where one packet is longer than the row
+            inside = p.ahead[which] >= stop - self._expected  # none if a packet is longer than the row
             verdict = self._from_itself(int(p.ahead[which][inside].min(initial=last)), first, stop, last_size)
             if verdict.located and self._ended_within(which, stop):
-                why = "a record ended within it: the card may have begun anew"
+                why = "a record ended within it: the card may have restarted"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
             if verdict.located and self._before_switched_on(verdict.base, first, line):
-                why = "its first bytes would be older than the card's counters: the card began anew within it"
+                why = "its first bytes would be older than the card's counters: the card restarted within it"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
             if verdict.located and p.at(first, line) == SWITCHED_ON and self._ends_first(which):
-                why = "its end came before its beginning, which is a card's just switched on: it began anew within it"
+                why = "its end came before its beginning, which has a card's first counters: it restarted within it"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
             if verdict.located and not self._much(which):
-                why = "too little of it came to tell it from an earlier record's end"
+                why = "too little of it came to distinguish it from the end of an earlier record"
                 verdict = replace(verdict, located=False, certain=False, reason=why)
             alone = which.size == self._live.sum() and not self._past.spans and p.at(first, line) == Counters(0, 1)
             if alone and not verdict.located and not verdict.excess:
-                why = self._too_short(first, stop, short).reason or "its last bytes did not come"
+                why = self._too_short(first, stop, short).reason or "its last bytes are missing"
                 verdict = replace(verdict, reason=f"{why}; the card's counters had just begun", fresh=True)
         start = p.at(verdict.base, line)
         unsure = not bases.size or self._past.guessed
         strange = (unsure and self._past.unseen) or (not bases.size and self._is_behind(verdict.base))
-        # Full packets alone: one that came late at the head and one lost at the end have the row's length together.
+        # With full packets only, a late packet at the head and a lost one at the end add up to the row's length.
         by_length = not bases.size and not short and bool(self._past.spans)
         unclear = self._unclear(which, strange) or self._unclear(which[self._unsure[which]], True)
         if verdict.located and (by_length or unclear):
@@ -257,62 +226,61 @@ class _Search:
             enough = _JOINS if self._expected >= SMALL_RECORD * p.full else _JOINS_SMALL
             joins = self._past.joint == start and self._past.joined >= enough
             if not joins and not (start == SWITCHED_ON and self._past.anew >= enough):
-                why = "its packets could as well be those of an earlier record that came late"
+                why = "its packets may be late packets of an earlier record"
                 return replace(verdict, located=False, certain=False, reason=why)
         return verdict
 
     def _ended_within(self, which: Counts, stop: int) -> bool:
-        """Whether a packet that is not full lies before the last: only a record's last one is."""
+        """True if a short packet is before the last: only the last of a record is short."""
         sizes = self._p.sizes[which]
         return bool(((sizes < self._p.full) & (self._p.ahead[which] + sizes < stop)).any())
 
     def _ends_first(self, which: Counts) -> bool:
-        """Whether packets came first that belong behind all that came later."""
+        """True if the packets that came first belong behind all later ones."""
         ahead = self._p.ahead[which]
         first = int(np.argmin(ahead))
         return first > 0 and int(ahead[first:].max()) < int(ahead[:first].min())
 
     def _before_switched_on(self, base: int, first: int, line: int) -> bool:
-        """Whether a record from `base` on would reach back behind sequence 1 and byte 0, where counters begin."""
+        """True if a record from `base` on would begin before sequence 1 and byte 0, where counters start."""
         at, lost = self._p.at(first, line), first - base
         return at.byte_count < lost and at.sequence <= lost // self._p.full
 
     def _unclear(self, which: Counts, suspect: bool) -> bool:
-        """Whether suspect packets may be an earlier record's: not half of a record that is not small."""
+        """True if suspect packets may be an earlier record's; half of a record that is not small cannot."""
         big = self._expected >= SMALL_RECORD * self._p.full
         return suspect and which.size > 0 and not (big and self._much(which))
 
     def _is_behind(self, base: int) -> bool:
-        """Whether a record with this base was sent not long before the place where this one was to start."""
+        """True if a record with this base was sent not long before the expected start of this one."""
         near = -_NEAR * (self._expected + self._p.full)
         return bool(self._ends.size) and near < base < int(self._ends.min())
 
     def _much(self, which: Counts) -> bool:
-        """Whether half of the record's bytes are among these packets."""
         return _many(self._p, which, self._expected)
 
     def _from_past(self, bases: Counts, first: int, stop: int, short: bool) -> _Verdict:
-        """The record starts at one of these bases."""
+        """Decide for a record that starts at one of these bases."""
         e = self._expected
         possible = bases[(stop <= bases + e) & (bases <= first)]
         if not possible.size:
             base = int(bases[bases <= first].max(initial=-1)) if (bases <= first).any() else int(bases.min())
             more = stop - base - e
             if more > 0:
-                why = f"{more} bytes more than the row has: triggers the radar should not have seen"
+                why = f"{more} bytes more than the row has: the radar saw spurious triggers"
                 return _Verdict(base, False, False, why, excess=True)
-            return _Verdict(first, False, False, "packets lie before the place where the record was to start")
+            return _Verdict(first, False, False, "packets precede the expected start of the record")
         if possible.size > 1:
             base = int(possible.max())
             if not (short and stop in possible + e):
-                return _Verdict(base, False, False, "the record may start at more than one place")
+                return _Verdict(base, False, False, "the record has more than one possible start")
             possible = possible[possible + e == stop]
         if int(possible[0]) + e == stop:
             return _Verdict(int(possible[0]), True, True)
         return self._too_short(int(possible[0]), stop, short)
 
     def _too_short(self, base: int, stop: int, short: bool) -> _Verdict:
-        """The record starts here for certain, and its last bytes are not there."""
+        """Decide for a record with a certain start whose last bytes are missing."""
         missing = base + self._expected - stop
         frames = f" ({missing // self._frame} frames)" if missing % self._frame == 0 and self._frame > 1 else ""
         if short:
@@ -322,12 +290,12 @@ class _Search:
             )
             return _Verdict(base, True, False, why)
         if missing >= self._frame > 1:
-            why = f"the last {missing} bytes did not come: whether frames are missing before them is not known"
+            why = f"the last {missing} bytes are missing, and perhaps frames before them"
             return _Verdict(base, True, False, why)
         return _Verdict(base, True, True)
 
     def _from_itself(self, first_inside: int, first: int, stop: int, last_size: int) -> _Verdict:
-        """Nothing is known of the start: only the record's end can prove it."""
+        """Decide for a record with an unknown start, which only its end can prove."""
         e, full = self._expected, self._p.full
         base = stop - e
         lost = first_inside - base
@@ -338,17 +306,17 @@ class _Search:
             return _Verdict(base, True, True)
         if stop - first > e:
             return _Verdict(
-                first, False, False, f"{stop - first - e} bytes more than the row has, and its start is not known",
+                first, False, False, f"{stop - first - e} bytes more than the row has, and its start is unknown",
                 excess=True,
             )  # fmt: skip
-        why = f"{e - (stop - first)} bytes short, and the record's first byte is not known"
+        why = f"{e - (stop - first)} bytes short, and the start of the record is unknown"
         return _Verdict(first, False, False, why)
 
 
 def _before_pulses(log: PacketLog, not_before_ns: int) -> tuple[Flags, int]:
-    """Which packets came before any pulse was sent, and how often the clock of the arrivals went backwards.
+    """Select packets that arrived before the first pulse, and count backward jumps of the arrival clock.
 
-    A clock that jumps tells nothing.
+    If the clock jumps, no packet is selected.
     """
     jumps = int((np.diff(log.batches[:, 0]) < 0).sum())
     early = log.arrivals_ns < not_before_ns

@@ -1,34 +1,29 @@
-"""Where and how urgently the receiving processes run, so that processing in the host never starves them."""
+"""Priority and cores of the receiver processes, so that processing in the host does not delay them."""
 
 from __future__ import annotations
 
 import os
 from typing import NamedTuple
 
-REAL_TIME = 5  # below the kernel's own threads and the Pi's pulses (where both run on one machine)
+REAL_TIME = 5  # below the kernel's threads, and below the Pi's pulses if both run on one machine
 NICE = -5
 PRIORITY_REMEDY = (
-    "`sudo host/rights.sh USER` (USER: who scans), then log out and in again, or restart the machine (docs/how-to/"
-    "install.md); without it a busy machine may lose packets, which are counted and their row taken again"
+    "`sudo host/rights.sh USER` (USER: the user who scans), then log out and in again, or restart the machine"
+    " (docs/how-to/install.md); without it a busy machine may lose packets, which are counted and their row retaken"
 )
 
 
 class Core(NamedTuple):
-    """A core for a receiver, and whether it has it to itself among the receivers."""
+    """A core for a receiver; `own` if no other receiver shares it."""
 
     number: int
     own: bool
 
 
 def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core | None]:
-    """A core for each receiver, from the last one down; the first is left to the host. None where there is only one.
+    """Choose a core for each receiver, from the last one down; the first is the host's. None if there is only one.
 
-    Parameters
-    ----------
-    receivers
-        How many will run.
-    cores
-        What this process may use; asked for when None.
+    `cores` are the usable cores (default: those of this process).
     """
     if cores is None:
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -38,10 +33,10 @@ def receiver_cores(receivers: int, cores: list[int] | None = None) -> list[Core 
 
 
 def take_core(core: int | None, own: bool = True, urgent: bool = True) -> tuple[int | None, str]:
-    """Pin this process to a core. Returns the core it is on (None: any), and what could not be done ("" when all).
+    """Pin this process to a core; return the core (None: any) and a warning ("" if there is none).
 
-    Not on a core that it shares with other receivers (`own` false), unless it is `urgent`, of real-time priority:
-    ordinary processes pinned to one core lose far more packets than where the kernel may move them.
+    A core shared with other receivers (`own` False) is used only with real-time priority (`urgent`): ordinary processes
+    pinned to one core lose far more packets than processes that the kernel may move.
     """
     if core is None or not (own or urgent):
         return None, ""
@@ -53,10 +48,10 @@ def take_core(core: int | None, own: bool = True, urgent: bool = True) -> tuple[
 
 
 def take_priority(real_time: int = REAL_TIME, nice: int = NICE) -> tuple[str, str]:
-    """Run before all ordinary processes, or at least before most. Returns what is in force, and what was not permitted.
+    """Give this process real-time priority, or else a lower nice value; return the priority and what was not permitted.
 
-    Real time (round robin) needs CAP_SYS_NICE, and so does a negative nice value. A receiver sleeps for a millisecond
-    between batches, so it never takes the whole of a core.
+    Real time (round robin) and negative nice values need CAP_SYS_NICE. A receiver sleeps for a millisecond between
+    batches, so it never occupies a whole core.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(real_time))

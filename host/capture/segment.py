@@ -1,7 +1,7 @@
-"""The file one row of one board is received into, and its index of arrivals and gaps.
+"""File of one row of one board, and its index of arrivals and gaps.
 
-`<row>.idx` is one JSON line (counts, gaps) followed by int64 little-endian pairs (arrival on the monotonic clock in ns,
-bytes of the row up to which data had come by then), one pair a batch of packets.
+`<row>.idx` is one JSON line (counts, gaps) followed by int64 little-endian pairs (arrival time on the monotonic clock
+in ns, bytes of the row received by then), one pair per batch of packets.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError
 from polysight.shared.files import open_to_write, read_bounded
 
@@ -29,32 +30,25 @@ def _scan_of(path: Path) -> Path:
 
 
 def disk_full(path: Path) -> tuple[str, str]:
-    """Why a row's file could not be written, and what to do."""
+    """Return cause and remedy for a row's file that cannot be written."""
     return "the disk is full or fails", f"free space, then `polysight resume {_scan_of(path)}` takes the row again"
 
 
 def damaged(path: Path) -> tuple[str, str]:
-    """Why a row's file cannot be read, and what to do."""
+    """Return cause and remedy for a row's file that cannot be read."""
     return "the file is damaged or truncated", f"`polysight validate {_scan_of(path)}` names every damaged file"
 
 
 class Segment:
-    """A file of known size, its space on the disk reserved; its bytes are written at once by :meth:`finish`.
+    """A file of `size` bytes with reserved disk space, which :meth:`finish` writes at once; its folder is made.
 
-    At once, because a mapped file can make the receiver wait for the disk whenever the kernel writes the file back,
-    while the receive buffer holds a quarter of a second. A row that was not finished is re-taken anyway.
-
-    Parameters
-    ----------
-    path
-        The file; its folder is made.
-    size
-        Bytes.
+    A mapped file could block the receiver while the kernel writes it back, and the receive buffer holds only a quarter
+    of a second. A row that is not finished is taken again anyway.
 
     Raises
     ------
     DeviceError
-        when the disk has no room or cannot be written.
+        if the disk is full or cannot be written.
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -72,11 +66,12 @@ class Segment:
             raise DeviceError(
                 f"{path}: cannot reserve {size} bytes: {e.strerror}",
                 "the disk is full or read-only",
-                f"free space; `polysight resume {_scan_of(path)}` then goes on from the last committed row",
+                f"free space, then `polysight resume {_scan_of(path)}`",
+                code=ErrorCode.DISK_FULL,
             ) from None
 
     def finish(self, data: NDArray[np.uint8]) -> int:
-        """Write the bytes, make them durable, close; returns their CRC-32. Raises DeviceError when the disk fails."""
+        """Write the bytes durably, close the file, and return their CRC-32. Raises DeviceError if the disk fails."""
         left = np.ascontiguousarray(data).data
         crc = zlib.crc32(left)
         try:
@@ -84,13 +79,14 @@ class Segment:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except OSError as e:
-            raise DeviceError(f"{self.path}: cannot be made durable: {e.strerror}", *disk_full(self.path)) from None
+            what = f"{self.path}: cannot be made durable: {e.strerror}"
+            raise DeviceError(what, *disk_full(self.path), code=ErrorCode.DISK_FULL) from None
         finally:
             self.close()
         return crc
 
     def close(self) -> None:
-        """Close the file. Twice is once."""
+        """Close the file. Safe to repeat."""
         self._file.close()
 
     def discard(self) -> None:
@@ -100,32 +96,34 @@ class Segment:
 
 
 def write_index(path: Path, facts: dict[str, Any], arrivals: NDArray[np.int64]) -> int:
-    """Write a row's index durably; returns its CRC-32. `arrivals` is int64 [n, 2]. Raises DeviceError."""
+    """Write a row's index durably and return its CRC-32. `arrivals` is int64 [n, 2]. Raises DeviceError."""
     head = json.dumps({**facts, "arrivals": len(arrivals)}, sort_keys=True, separators=(",", ":"))
     raw = head.encode("ascii") + b"\n" + arrivals.astype(PAIR).tobytes()
     return write_durably(path, raw)
 
 
 def write_durably(path: Path, raw: bytes) -> int:
-    """Write a file that is on the disk when this returns; returns its CRC-32. Raises DeviceError."""
+    """Write a file durably and return its CRC-32. Raises DeviceError."""
     try:
         with open_to_write(path) as f:
             f.write(raw)
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
-        raise DeviceError(f"{path}: cannot be written: {e.strerror}", *disk_full(path)) from None
+        what = f"{path}: cannot be written: {e.strerror}"
+        raise DeviceError(what, *disk_full(path), code=ErrorCode.DISK_FULL) from None
     return zlib.crc32(raw)
 
 
 def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
-    """The facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError when absent or damaged."""
+    """Read the facts and arrivals (int64 [n, 2]) of a row's index. Raises DataError if missing or damaged."""
     try:
         head, _, tail = read_bounded(path, MOST_INDEX_BYTES).partition(b"\n")
         facts = json.loads(head)
         pairs = np.frombuffer(tail, dtype=PAIR).reshape(-1, 2).astype(np.int64)
     except (OSError, ValueError, RecursionError) as e:
-        raise DataError(f"{path}: not a readable row index: {e}", *damaged(path)) from None
+        what = f"{path}: not a readable row index: {e}"
+        raise DataError(what, *damaged(path), code=ErrorCode.FILE_DAMAGED) from None
     if not isinstance(facts, dict) or facts.get("arrivals") != len(pairs):
-        raise DataError(f"{path}: the row index does not hold what it says", *damaged(path))
+        raise DataError(f"{path}: the row index is incomplete", *damaged(path), code=ErrorCode.FILE_DAMAGED)
     return facts, pairs

@@ -1,4 +1,4 @@
-"""Every hop between a capture card and the host's memory, tried in order: which is sound, which is silent."""
+"""Check every hop between a capture card and the host's memory, in order."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from polysight.shared.errors import DeviceError
 
 Verdict = Literal["ok", "warning", "error", "not checked"]
 HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
-"""From near to far: the host's address and ports, the interface, its cable, the card; then what receives its data."""
-PULSES = "`polysight doctor`: it sends pulses at rest, and tells what comes of each"
-_SILENT_AT = {Hop.ROUTE: "route", Hop.LINK: "link"}
-_TURN_S = 0.05
+"""The host's address and ports, the interface, its cable, the card; then the receiver process, its buffer, data."""
+PULSES = "`polysight doctor`: it sends pulses with the stage at rest, and reports each one"
+_FAULTY_HOP = {Hop.ROUTE: "route", Hop.LINK: "link"}
+_POLL_S = 0.05
 
 
 @dataclass(frozen=True)
 class HopFinding:
-    """One hop: how it is, what was found, the likely cause and what to do when it is not ok."""
+    """Result of checking one hop, with the likely cause and remedy if it is not ok."""
 
     hop: str
     verdict: Verdict
@@ -38,7 +38,7 @@ class HopFinding:
 
 @dataclass
 class CardSurvey:
-    """What was found out about one board's card. `version` is "" when it did not say."""
+    """Survey result of one board's capture card; `version` is "" if the card did not reply."""
 
     board: Board
     version: str = ""
@@ -46,24 +46,19 @@ class CardSurvey:
 
     @property
     def ok(self) -> bool:
-        """Whether no hop is wrong."""
+        """True if no hop has an error."""
         return all(hop.verdict != "error" for hop in self.hops)
 
     @property
     def silent(self) -> str:
-        """The first hop that is wrong; "" when none is."""
+        """The first hop with an error; "" if none has."""
         return next((hop.hop for hop in self.hops if hop.verdict == "error"), "")
 
 
 def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurvey]:
-    """Try every card of the rig file, all at once, in the order of the rig file.
+    """Check the cards of all boards in parallel; return the results in the order of the rig file.
 
-    Parameters
-    ----------
-    instrument
-        The rig file. Cards of boards that are not recorded are asked too, but nothing is received from them.
-    listen_s
-        Record from every recorded board for so long, to see whether its radar streams; 0 for not at all.
+    From every recorded board, data is recorded for `listen_s` seconds (0: not at all), to check that its radar streams.
     """
     cores = dict(zip(instrument.recorded, receiver_cores(len(instrument.recorded)), strict=True))
     with ThreadPoolExecutor(len(instrument.boards)) as pool:
@@ -92,7 +87,7 @@ def _wrong(hop: str, e: DeviceError) -> HopFinding:
 
 
 def _reach(survey: CardSurvey, card: CardClient) -> Iterator[HopFinding]:
-    """Route, link and card. Where the card answers, the hops before it are sound."""
+    """Check route, link and card. If the card replies, the hops before it are ok."""
     address = card.board.card_address
     error = None
     try:
@@ -100,17 +95,17 @@ def _reach(survey: CardSurvey, card: CardClient) -> Iterator[HopFinding]:
         survey.version = str(card.version())
     except DeviceError as e:
         error = e
-    silent = "" if error is None else _SILENT_AT.get(silent_hop(address), "card")
-    way = "loopback" if address.startswith("127.") else route_interface(address) or "not told by this system"
-    for hop, sound in (("route", way), ("link", way), ("card", f"answers, FPGA {survey.version}")):
-        if error is not None and hop == silent:
+    faulty = "" if error is None else _FAULTY_HOP.get(silent_hop(address), "card")
+    interface = "loopback" if address.startswith("127.") else route_interface(address) or "unknown interface"
+    for hop, found in (("route", interface), ("link", interface), ("card", f"replies, FPGA {survey.version}")):
+        if error is not None and hop == faulty:
             yield _wrong(hop, error)
             return
-        yield HopFinding(hop, "ok", sound)
+        yield HopFinding(hop, "ok", found)
 
 
 def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen_s: float) -> Iterator[HopFinding]:
-    """The receiving process as a scan starts it, its buffer, and what it gets from the radar."""
+    """Check the receiver process as a scan starts it, its buffer, and the radar's data."""
     board, wanted = card.board, instrument.card.receive_buffer_bytes
     try:
         receiver = ReceiverProcess(board, wanted, core)
@@ -132,7 +127,7 @@ def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen
         if warning:
             yield HopFinding("buffer", "warning", warning.removeprefix(f"{board.name}: "))
         else:
-            yield HopFinding("buffer", "ok", f"{receiver.granted_bytes} bytes granted, {wanted} asked for")
+            yield HopFinding("buffer", "ok", f"{receiver.granted_bytes} bytes granted, {wanted} requested")
         if listen_s > 0:
             yield _listen(card, receiver, instrument, listen_s)
         else:
@@ -140,7 +135,7 @@ def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen
 
 
 def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument, listen_s: float) -> HopFinding:
-    """Record for a time, or until a row's bytes are there, into a file that is removed again."""
+    """Record for a time, or until a row's bytes have arrived, into a temporary file."""
     try:
         with tempfile.TemporaryDirectory(prefix="polysight-card-") as folder:
             card.record_stop()
@@ -150,7 +145,7 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
             deadline = time.monotonic() + listen_s
             while time.monotonic() < deadline and not receiver.poll().complete:
                 card.take_status()
-                time.sleep(_TURN_S)
+                time.sleep(_POLL_S)
             card.record_stop()
             got = receiver.end_row(card.take_status())
     except DeviceError as e:
@@ -159,14 +154,14 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
 
 
 def _streams(got: RowCapture) -> HopFinding:
-    """A radar that sends. Where its record began is not known, so only gaps between packets are certain losses."""
+    """Report a radar's data; the start of its record is unknown, so only gaps between packets count as lost."""
     text = f"{got.packets} packets, {got.bytes} bytes came"
     if got.lost_before_packets:
         return HopFinding(
             "radar",
             "warning",
             text,
-            f"the card reports {got.lost_before_packets.name}: it dropped data itself",
+            f"the card reports {got.lost_before_packets.name}: it dropped data",
             "a shorter card.packet_delay_us in instrument.toml lets the card send faster",
         )
     if got.gap_bytes or got.strangers:

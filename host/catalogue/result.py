@@ -7,7 +7,7 @@ from typing import Any
 
 from polysight.host.catalogue.pictures import MAPS
 from polysight.host.catalogue.pixels import Pixels
-from polysight.host.products import find_labels, label_place, read_products
+from polysight.host.products import find_labels, label_folder, read_products
 from polysight.shared.errors import PolysightError
 
 EXPORT = "export"
@@ -62,7 +62,7 @@ def labels_of(folder: Path, pixels: Pixels) -> dict[str, Any] | None:
         path, labels = found
         labels = labels.in_mm(pixels.products.x_m, pixels.products.y_m)
     except PolysightError as e:
-        return {"boxes": {}, "metal": None, "specimens": {}, "file": str(label_place(folder)), "problem": e.what}
+        return {"boxes": {}, "metal": None, "specimens": {}, "file": str(label_folder(folder)), "problem": e.what}
     boxes = {name: list(box) for name, box in labels.boxes.items()}
     return {
         "boxes": boxes,

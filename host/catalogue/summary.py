@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from polysight.host.acquisition import last_sign_of_life
+from polysight.host.acquisition import last_alive_s
 from polysight.host.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes
 from polysight.host.products import IMAGE, MATERIALS, QUALITY, SavedProducts
 from polysight.host.store import MANIFEST, Fact, manifest
@@ -174,7 +174,7 @@ def as_of_now(folder: Path, s: Summary) -> Summary:
     """With the signs of life of its program."""
     if s.state not in ("lost", "paused"):
         return s
-    life, now = last_sign_of_life(folder), time.time()
+    life, now = last_alive_s(folder), time.time()
     if life is None:
         try:
             alive = now - (folder / MANIFEST).stat().st_mtime < _GRACE_S

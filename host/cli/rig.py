@@ -151,11 +151,13 @@ _NUMBERS = (
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from polysight.host.plan import Changes, Wanted, plan
+    from polysight.host.plan import Changes, PlanOptions, run_plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
-    wanted = Wanted(args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json)
-    return plan(args.config, Changes(**{name: getattr(args, name) for name in names}), wanted)
+    options = PlanOptions(
+        args.minutes, args.count, args.like, args.snr_db, args.row_overhead_s, args.scene_mm, args.json
+    )
+    return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
 
 
 def _size(text: str) -> tuple[float, float]:

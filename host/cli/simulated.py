@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from polysight.data import packaged
@@ -30,6 +31,8 @@ def _simulate(args: argparse.Namespace) -> int:
 def _reproduce(args: argparse.Namespace) -> int:
     if args.config != packaged(RIG):
         load_instrument(args.config)  # a wrong one is told now, not with the first item that needs it
+    sys.stderr.write("polysight reproduce: starting\n")  # its figures' libraries take seconds to load
+    sys.stderr.flush()
     if args.authors is not None:
         from polysight.papers.sensys2026.dataset_run import reproduce_authors
 

@@ -27,7 +27,7 @@ from polysight.host.doctor.kernel import NetworkInterface, read_interface
 from polysight.host.radar import RadarState
 from polysight.shared.config import Board, Instrument
 from polysight.shared.faults import PiFault, explain
-from polysight.shared.messages import MOST_PULSES, MOST_PULSES_S
+from polysight.shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S
 
 _CARD_HOPS = ("host", "route", "link", "card")  # of the network survey
 _MIN_MTU, _MIN_SPEED_MBIT, _MIN_RING = 1500, 1000, 512
@@ -118,11 +118,11 @@ def check_pulses(context: CheckContext) -> Finding:
         return not_checked("no capture card is usable")
     rig, burst = with_boards(context.rig, context.usable_cards), context.rig.burst
     burst_s = burst.pulses * burst.period_us * 1e-6
-    bursts = min(context.options.bursts, MOST_PULSES // burst.pulses, int(MOST_PULSES_S / burst_s))
+    bursts = min(context.options.bursts, MAX_PULSES_AT_REST // burst.pulses, int(MAX_PULSES_AT_REST_S / burst_s))
     if not bursts:
         return not_checked(
             f"a burst of {burst.pulses} pulses every {burst.period_us:g} us is longer than the Pi sends at rest",
-            f"`polysight scan` can use it; the limit here is {MOST_PULSES} pulses or {MOST_PULSES_S:g} s",
+            f"`polysight scan` can use it; the limit here is {MAX_PULSES_AT_REST} pulses or {MAX_PULSES_AT_REST_S:g} s",
         )
     try:
         context.captured, sent = capture_frames(rig, context.pi, bursts)

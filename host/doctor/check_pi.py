@@ -10,7 +10,7 @@ import os
 import time
 from pathlib import Path
 
-from polysight.host.acquisition import StopRequest, differences, make_ready
+from polysight.host.acquisition import StopRequest, make_ready, stage_differences
 from polysight.host.doctor.context import CheckContext, Finding, error, not_checked, ok, warning
 from polysight.host.store import new_scan_id
 from polysight.shared import __version__
@@ -65,7 +65,7 @@ def check_pi(context: CheckContext) -> Finding:
             "install the same release on both: `make pi-install HOST=...`",
             **facts,
         )
-    if differing := differences(context.rig.stage, hello):
+    if differing := stage_differences(context.rig.stage, hello):
         return error(
             f"{found}; {'; '.join(differing)}",
             "host and Pi have different rig files, so the Pi would refuse a scan",

@@ -25,6 +25,7 @@ from polysight.host.calibration import (
     write_calibration,
 )
 from polysight.host.jobs.process import imaged, load_reference, plane_of
+from polysight.host.jobs.progress import say, steps
 from polysight.host.polarimetry import (
     Image,
     Leakage,
@@ -78,6 +79,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     rig = source.instrument if given is None else with_places_of(source.instrument, given)
     in_force = calibration_of_scan(source)
     filters = {b.name: in_force.high_pass(b.name) for b in rig.receivers}
+    say("places of boards and plane")
     fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(prior_mm, prior_mm))
     file = places_file(rig, fit, len(points), [source_scan(source, scan)])
     path = write_calibration(file, out)
@@ -115,7 +117,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
             f"the scans have different filters: {sorted(chirps)} kHz", "they are of several sweeps", "give one"
         )
     names = [b.name for b in sources[0].instrument.receivers]
-    boards = {name: fit_filter(sources, name) for name in names}
+    boards = {name: fit_filter(sources, name) for name in steps(names, [f"filters of {name}" for name in names])}
     found = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
     file = FilterFile(**header("hpf", found), boards=boards)
     path = write_calibration(file, out)
@@ -160,7 +162,8 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     from polysight.host.calibration import fit_start
 
     source = open_raw(scan, None if config is None else load_instrument(config))
-    boards = {b.name: fit_start(source, b.name) for b in source.instrument.receivers}
+    names = [b.name for b in source.instrument.receivers]
+    boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}
     file = StartFile(**header("start_frequency", [source_scan(source, scan)]), boards=boards)
     path = write_calibration(file, out)
     lines, what_to_set = [], []

@@ -38,7 +38,7 @@ from polysight.host.products import (
     SavedProducts,
     find_labels,
     find_products,
-    label_place,
+    label_folder,
     write_atomically,
 )
 from polysight.host.report import label_figure
@@ -135,7 +135,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         if there and ask("name the patches anew, in place of the boxes drawn by hand? type yes: ").strip() != "yes":
             raise ConfigError("nothing was changed", "yes was asked for", "options edit boxes: polysight label --help")
         labels, left_out = asked(found, ask), []
-    place = label_place(products.folder)
+    place = label_folder(products.folder)
     return _save(place, products, labels, left_out)
 
 

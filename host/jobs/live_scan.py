@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from polysight.host.acquisition import (
-    ControlDesk,
+    ControlFolder,
     OnProgress,
     OnRow,
     ScanProgress,
     ScanResult,
     StopRequest,
-    hangups_pass,
+    ignore_hangup,
     resume_scan,
     run_scan,
 )
@@ -124,11 +124,11 @@ class _Live:
             publish_images(self.pipeline, self._folder / PRODUCTS)
 
 
-@hangups_pass()
+@ignore_hangup()
 def _run(folder: Path, options: Options, process: bool, take: Take) -> int:
     live = _Live(folder)
     stop = StopRequest()
-    with ScanBar() as bar, ControlDesk(folder, stop) as desk:
+    with ScanBar() as bar, ControlFolder(folder, stop) as desk:
 
         def told(progress: ScanProgress) -> None:
             if progress.phase != "connect":

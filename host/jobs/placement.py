@@ -10,6 +10,7 @@ from pathlib import Path
 from polysight.host.capture import PACKETS
 from polysight.host.jobs.look import scan_of
 from polysight.host.store import PlacedAgain, Replaced, ScanFolder, damage_of, place_again, replace_rows
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 _SHOWN = 8
@@ -24,7 +25,8 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     row = file.with_suffix(".bin")
     if scan := scan_of(row):
         if strange := damage_of(scan, row):
-            raise DataError(f"{row}: {strange}", "a damaged file, or one of another row", "`polysight validate SCAN`")
+            why, remedy = "a damaged file, or one of another row", "`polysight validate SCAN`"
+            raise DataError(f"{row}: {strange}", why, remedy, code=ErrorCode.FILE_DAMAGED)
         if not row.with_suffix(PACKETS).exists():
             why = "the scan was simulated without cards, or recorded by an older release"
             raise DataError(

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from polysight.host.calibration import calibration_of_scan
 from polysight.host.imaging import (
@@ -23,6 +20,7 @@ from polysight.host.imaging import (
     View,
     focus_sweep,
 )
+from polysight.host.jobs.progress import counted, current_step, say
 from polysight.host.materials import (
     TruthPlate,
     find_truth,
@@ -34,10 +32,8 @@ from polysight.host.process import (
     Options,
     ProcessRequest,
     Products,
-    Progress,
     coverage_lines,
     map_rows,
-    no_progress,
     quality_content,
     save_images,
 )
@@ -85,9 +81,7 @@ def all_rows(
         )
     if isinstance(source, ScanFolder) and not pipeline.samples.holds(rows):
         require_raw(source)
-    console = Console(stderr=True)
-    done = map_rows(pipeline.add_row, rows, threads)
-    for _ in track(done, "rows", total=len(rows), console=console, disable=not console.is_terminal):
+    for _ in counted(map_rows(pipeline.add_row, rows, threads), len(rows), "rows"):
         pass
     return pipeline
 
@@ -155,12 +149,12 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
 
 
 def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple[TruthPlate, ...]) -> Products:
-    """All products, which take the place of those in `out`; what is being made is shown on a terminal.
+    """All products, which take the place of those in `out`; the current step is shown on stderr.
 
     When the metal that was given is none, the images alone do, unless `out` holds a report; the error says where they
     are. Raises PolysightError.
     """
-    with making_products(out, pipeline.source.scan_id) as new, _progress() as progress:
+    with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
         try:
             return replace(pipeline.finish(new, options, plates, progress), folder=out)
         except DataError as e:
@@ -171,17 +165,6 @@ def make_products(pipeline: Pipeline, out: Path, options: Options, plates: tuple
                 raise DataError(e.what, e.why, advice(e.remedy, where), code=e.code) from None
             failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """Show the current step on a terminal."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield no_progress
-        return
-    with console.status("image") as status:
-        yield status.update
 
 
 def plane_of(pipeline: Pipeline, images: ChannelImages) -> PlaneReference:
@@ -279,11 +262,11 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     out.mkdir(parents=True, exist_ok=True)
     pipeline = all_rows(source, data, max(depth_mm / 1e3, PLANE_REACH_M))
     builder = pipeline.images
-    _say("images, and the plane of the plates")
+    say("images, and the plane of the plates")
     images = pipeline.form_images()
     pipeline.place_plane(images, move=False)
     plates = pipeline.plane
-    _say("the plane at which the image is sharpest")
+    say("the plane at which the image is sharpest")
     found = focus_sweep(builder, depth_m=depth_mm / 1e3)
     depth_m = plates.offset_m if plates.known else found.depth_mm / 1e3
     grid, board = builder.grid, builder.boards[source.instrument.receivers[0].name]
@@ -298,12 +281,6 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     sys.stdout.write("".join(f"{line}\n" for line in _focus_lines(head, at, found, plates)))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")
     return 0
-
-
-def _say(step: str) -> None:
-    """What is being done for the next seconds."""
-    sys.stderr.write(f"{step} ...\n")
-    sys.stderr.flush()
 
 
 def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstimate) -> list[str]:
@@ -347,7 +324,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     for board in rig.receivers:
         setup = BoardSetup.of(rig, board, model=calibration.high_pass(board.name))
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
-        _say(f"rows of {board.name}")
+        say(f"rows of {board.name}")
         for row in source.rows():
             recorded = source.read_row(board.name, row)
             words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples)

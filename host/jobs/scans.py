@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from polysight.host.acquisition import Wish, ask
+from polysight.host.acquisition import ScanCommand, send_command
 from polysight.host.catalogue import (
     Notes,
     Scans,
@@ -80,7 +80,7 @@ def ask_scan(folder: Path, wish: str) -> int:
     """Ask a running scan for something; returns 0 when it has heard. Raises ScanError."""
     if not folder.is_dir():
         raise no_such(folder)
-    ask(folder, Wish(wish))
+    send_command(folder, ScanCommand(wish))
     sys.stdout.write(f"{folder}: heard {wish}\n")
     return 0
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from polysight.host.jobs.demo import check_scenes, run_simulator
 from polysight.host.jobs.process import all_rows
-from polysight.host.jobs.steps import steps
+from polysight.host.jobs.progress import steps
 from polysight.host.materials import (
     TRUTH,
     ImagePair,

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from polysight.host.acquisition import Wish, time_left
+from polysight.host.acquisition import ScanCommand, time_left
 from polysight.host.page.images import Shown
 from polysight.host.page.listener import Heard
 from polysight.host.page.story import Notice, Story
@@ -31,7 +31,7 @@ class Content:
     signs: Signs
     heard: Heard
     shown: Shown
-    asked: Wish | None
+    asked: ScanCommand | None
     control: bool
     problem: str
     verdict: Verdict | None = None

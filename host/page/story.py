@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from polysight.host.acquisition import FaultKind, usual_row_s
+from polysight.host.acquisition import FaultKind, typical_row_s
 from polysight.host.plan import scan_time
-from polysight.host.store import Fact, reconnected
+from polysight.host.store import Fact, with_connection
 from polysight.shared.config import Instrument
 from polysight.shared.errors import PolysightError
 from polysight.shared.faults import PiFault, explain
@@ -267,7 +267,7 @@ class Story:
         self.ended, self.paused = None, False
         self.run_started_s = seconds(fact["resumed_utc"])
         if fact.get("rig"):  # the Pi is somewhere else from now on
-            self.instrument = reconnected(self.instrument, fact["rig"])
+            self.instrument = with_connection(self.instrument, fact["rig"])
 
     def _scan_paused(self, fact: Fact) -> None:
         self.paused, self._paused_at = True, seconds(fact["paused_utc"])
@@ -312,7 +312,7 @@ class Story:
     def row_seconds(self) -> tuple[float, str] | None:
         """How long a row takes, and from what that is known; None when it is not."""
         if self._row_seconds:
-            return usual_row_s(self._row_seconds), "measured"
+            return typical_row_s(self._row_seconds), "measured"
         if self.last_commit_s > self.run_started_s:
             return self.last_commit_s - self.run_started_s, "first row"
         if self.simulated:

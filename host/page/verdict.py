@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from polysight.host.acquisition import Wish
+from polysight.host.acquisition import ScanCommand
 from polysight.host.page.images import Shown
 from polysight.host.page.listener import Heard
 from polysight.host.page.story import Notice, Story, sentence
@@ -70,7 +70,7 @@ def unreadable(folder: Path, problem: str) -> Status:
     return Status("bad", "This scan cannot be shown", problem, why, f"`polysight validate {folder}`")
 
 
-def judge(story: Story, folder: Path, signs: Signs, heard: Heard, shown: Shown, asked: Wish | None) -> Status:
+def judge(story: Story, folder: Path, signs: Signs, heard: Heard, shown: Shown, asked: ScanCommand | None) -> Status:
     """The status of a scan: the worst thing first."""
     rows, done = story.plan.rows, len(story.takes)
     resume = f"`polysight resume {folder}`"
@@ -93,16 +93,16 @@ def judge(story: Story, folder: Path, signs: Signs, heard: Heard, shown: Shown, 
         )
         told = heard.faults[-1] if heard.faults else unknown
         return Status("bad", "The rig has stopped with a fault", told.what, told.why, told.do)
-    if asked is Wish.ABORT:
+    if asked is ScanCommand.ABORT:
         return Status("wait", "Stopping now", "The stage stops; the running row will be taken again.")
-    if asked is Wish.STOP:
+    if asked is ScanCommand.STOP:
         return Status("wait", "Stopping after this row", f"Afterwards, {resume} goes on.")
     if story.paused:
         return Status(
             "wait", "Paused", f"{done} of {rows} rows are safe. Nothing moves.", "",
             f"Continue with the button, or `touch {folder}/control/continue`",
         )  # fmt: skip
-    if asked is Wish.PAUSE:
+    if asked is ScanCommand.PAUSE:
         return Status("wait", "Pausing after this row", "The stage stands still then, until you continue.")
     if heard.state == "held":
         return Status(

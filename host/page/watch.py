@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from polysight.host.acquisition import Wish, ask, last_sign_of_life
+from polysight.host.acquisition import ScanCommand, last_alive_s, send_command
 from polysight.host.page.images import RowViewer, Shown
 from polysight.host.page.listener import Heard, PiListener
 from polysight.host.page.result import ResultTail
@@ -26,7 +26,7 @@ from polysight.host.page.story import Story
 from polysight.host.page.verdict import Signs
 from polysight.host.store import EVENTS, MANIFEST, Fact, Manifest, manifest
 from polysight.shared.errors import PolysightError, ProtocolError
-from polysight.shared.messages import AnyEvent, unpack_kept
+from polysight.shared.messages import AnyEvent, unpack_with_crc
 
 _HEAD = 256
 _TURN_S = 0.2
@@ -108,7 +108,7 @@ class EventTail:
         try:
             while True:
                 unpacker.skip()
-                events.append(unpack_kept(raw[end : unpacker.tell()]))
+                events.append(unpack_with_crc(raw[end : unpacker.tell()]))
                 end = unpacker.tell()
         except (msgpack.OutOfData, msgpack.UnpackException, ValueError, ProtocolError):
             self.file.take(end)
@@ -139,7 +139,7 @@ class Watch:
         self.folder, self.control = folder, control
         self._lapse_s = lapse_s
         self._ended = threading.Event()
-        self._asked: tuple[Wish, int] | None = None  # and how many facts there were
+        self._asked: tuple[ScanCommand, int] | None = None  # and how many facts there were
         self._looked = False
         self.state, self.motion = Versioned(0, b"{}"), Versioned(0, b"{}")
         self.shown = Shown()
@@ -225,7 +225,7 @@ class Watch:
     def _signs(self, heard: Heard) -> Signs:
         """Whether the scan program and the Pi live."""
         now, wall = time.monotonic(), time.time()
-        life = last_sign_of_life(self.folder)
+        life = last_alive_s(self.folder)
         if life is not None and life != self._life_seen:
             age = max(0.0, wall - life) if self._life_seen is None else 0.0  # from then on changes count, not clocks
             self._life_seen, self._life_at = life, now - age
@@ -236,7 +236,7 @@ class Watch:
         silent = now - heard.heard_s if heard.heard_s else None
         return Signs(alive, alive_s, silent, _PI_LIMIT_S, wall)
 
-    def _wish(self) -> Wish | None:
+    def _wish(self) -> ScanCommand | None:
         """What was asked, until the manifest shows that it came to pass."""
         if self._asked is None or self._story is None:
             return None
@@ -247,12 +247,12 @@ class Watch:
             return None
         return wish
 
-    def ask(self, wish: Wish) -> None:
+    def ask(self, wish: ScanCommand) -> None:
         """Ask the scan for something; returns when it has heard. Raises ScanError."""
         before = len(self._content.facts)
-        ask(self.folder, wish)
+        send_command(self.folder, wish)
         paused = self._story is not None and self._story.paused
-        self._asked = None if wish is Wish.CONTINUE and not paused else (wish, before)
+        self._asked = None if wish is ScanCommand.CONTINUE and not paused else (wish, before)
 
     def wait_for(self, condition: Callable[[dict[str, Any]], bool], limit_s: float) -> bool:
         """Until a snapshot meets a condition; whether it did within the limit."""

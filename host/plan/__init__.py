@@ -1,13 +1,14 @@
-"""What a scan will take and give, before it is made: time, data, resolution, noise, aliases, and what is wrong.
+"""`polysight plan`: predict a scan before it is made: time, data, resolution, noise, aliases, warnings.
 
-`forecast` judges a rig file with `Changes`, `propose` searches for the best plans within a time. Time comes from
-`timing`, the field of view from `field`; `text` prints, and takes noise and overhead from an earlier scan.
+`forecast` predicts the scan of a rig file to which `Changes` were applied; `propose` searches for the plans with the
+least noise within a time. `scan_time` estimates the duration, `field_limits` the alias-free field of view. `run_plan`
+is the command; it can take noise and standstill from an earlier scan.
 """
 
 from polysight.host.plan.field import FieldLimits, field_limits
 from polysight.host.plan.forecast import Forecast, Noise, forecast
+from polysight.host.plan.plan_command import PlanOptions, forecast_values, run_plan
 from polysight.host.plan.search import Changes, propose
-from polysight.host.plan.text import Wanted, numbers, plan
 from polysight.host.plan.timing import ScanTime, row_motion_s, scan_time, straight_move_s
 
 __all__ = [
@@ -15,14 +16,14 @@ __all__ = [
     "FieldLimits",
     "Forecast",
     "Noise",
+    "PlanOptions",
     "ScanTime",
-    "Wanted",
     "field_limits",
     "forecast",
-    "numbers",
-    "plan",
+    "forecast_values",
     "propose",
     "row_motion_s",
+    "run_plan",
     "scan_time",
     "straight_move_s",
 ]

@@ -1,7 +1,7 @@
-"""Plans that differ from the rig file, and the best of them within a time.
+"""Search for the best plans within a time, and describe how plans differ from the rig file.
 
-`Changes` is what a plan has otherwise than the rig file; `rig_lines` writes the differences as lines of a rig file.
-`propose` tries speeds, steps and bursts, and keeps the aperture.
+`Changes` holds the values of a plan that differ from the rig file; `rig_lines` writes them as lines for a rig file.
+`propose` varies speed, steps and burst, and keeps the aperture.
 """
 
 from __future__ import annotations
@@ -15,35 +15,34 @@ import numpy as np
 
 from polysight.host.plan.forecast import (
     MAX_STEPS_PER_S,
-    Caution,
     Forecast,
     Noise,
-    burst_facts,
-    cautions,
+    PlanWarning,
+    find_warnings,
     forecast,
-    noise_facts,
+    predict_burst,
+    predict_noise,
 )
-from polysight.host.plan.timing import ROW_OVERHEAD_S, payload_bytes, scan_time
+from polysight.host.plan.timing import ROW_OVERHEAD_S, scan_time, whole_packets
 from polysight.host.radar import INTER_FRAME_US, TRIGGER_MARGIN_US, chirp_us
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, to_builtins
 
-ON_THE_PI = ("speed_mm_s", "accel_mm_s2")
-"""Of [stage]: the Pi drives with its own rig file's acceleration, and refuses speeds above that file's."""
-_MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
-_MARGIN = 0.95  # of the time between two points that a burst may fill
-_MOST_TRAVEL_WAVELENGTHS = 0.5
-MAX_FRAMES = 65535
-"""Of a row, that a radar counts (host/radar/constraints.py)."""
+# Keys of [stage] that the Pi takes from its own rig file: acceleration, and the limit of the speed.
+_PI_KEYS = ("speed_mm_s", "accel_mm_s2")
+_STEP_MULTIPLES = (1, 2, 3, 4, 5)  # of the rig file's steps
+_MAX_DUTY = 0.95  # of a burst in the time between two points
+_MAX_TRAVEL_WAVELENGTHS = 0.5
+_MAX_FRAMES = 65535  # of a row (host/radar/constraints.py)
 
 
 @dataclass(frozen=True)
 class Changes:
-    """What a plan has otherwise than the rig file; None leaves the rig file's.
+    """Values of a plan that replace those of the rig file; None keeps the rig file's value.
 
-    A new step keeps the aperture's size, as near as whole steps come to it, unless the number of positions or a size is
-    given too.
+    A new step keeps the size of the aperture, rounded to whole steps, if neither a number of positions nor a size is
+    given.
     """
 
     speed_mm_s: float | None = None
@@ -59,13 +58,7 @@ class Changes:
     object_distance_mm: float | None = None
 
     def apply(self, rig: Instrument) -> Instrument:
-        """The rig file with these numbers.
-
-        Raises
-        ------
-        ConfigError
-            when a number breaks a rule of the rig file.
-        """
+        """Return the changed rig file. Raises ConfigError if a value breaks a rule of the rig file."""
         table = to_builtins(rig)
         grid = table["grid"]
         for axis, count, size in (("x", "columns", self.width_mm), ("y", "rows", self.height_mm)):
@@ -86,23 +79,23 @@ class Changes:
         return decode(table, Instrument, f"{rig.name}, changed")
 
 
-def rig_lines(plan: Instrument, begun_with: Instrument) -> str:
-    """The lines that make a plan of the rig file it began with: every number that differs; "" when none does."""
-    new, old = to_builtins(plan), to_builtins(begun_with)
+def rig_lines(plan: Instrument, original: Instrument) -> str:
+    """Return the lines of the rig file that differ between `plan` and `original`; "" if none differs."""
+    new, old = to_builtins(plan), to_builtins(original)
     parts = []
     for section, keys in new.items():
         if not isinstance(keys, dict):
             continue
         lines = [f"{key} = {value}" for key, value in keys.items() if value != old[section].get(key)]
-        if section == "stage" and any(old[section][key] != keys[key] for key in ON_THE_PI):
-            lines.append("# speed_mm_s and accel_mm_s2: into the Pi's rig file too, then restart polysight-pi there")
+        if section == "stage" and any(old[section][key] != keys[key] for key in _PI_KEYS):
+            lines.append("# set speed_mm_s and accel_mm_s2 also in the Pi's rig file, then restart polysight-pi there")
         if lines:
             parts.append("\n".join([f"[{section}]", *lines, ""]))
     return "\n".join(parts)
 
 
 def shortest_period_us(rig: Instrument) -> float:
-    """Shortest pulse period that the radars take (host/radar/constraints.py), up to the next 10 us."""
+    """Return the shortest pulse period of the radars (host/radar/constraints.py), rounded up to 10 us."""
     return 10 * float(np.ceil((chirp_us(rig) + INTER_FRAME_US + TRIGGER_MARGIN_US) / 10))
 
 
@@ -114,104 +107,96 @@ def propose(
     row_overhead_s: float = ROW_OVERHEAD_S,
     scene_mm: tuple[float, float] | None = None,
 ) -> list[Forecast]:
-    """The plans with the least noise in the image that take no longer and have no aliases, best first.
+    """Search for the plans with the least noise in the image within a time and without aliases, best first.
 
-    For each pair of steps the best speed and burst; the aperture stays as large as the rig file's. Bursts never take
-    more than half a wavelength of travel.
+    Each plan has the best speed and burst for its pair of steps, and the rig file's aperture. The stage moves at most
+    half a wavelength during a burst.
 
     Parameters
     ----------
     rig
-        Rig file, with what shall not be changed.
+        Rig file.
     minutes
-        Time there is, homing not included.
+        Maximum duration, without homing.
     count
-        Plans wanted; fewer, or none, where the time is too short.
+        Maximum number of plans; fewer, or none, are returned if the time is too short.
     noise, row_overhead_s, scene_mm
-        As for :func:`polysight.host.plan.forecast`.
+        As for `forecast`.
     """
     noise = noise or Noise()
     best: list[tuple[float, Instrument]] = []
     for changed in _grids(rig):
-        tried = [(_score(p, noise), p) for p in _bursts(changed, minutes, row_overhead_s)]
-        if tried:
-            best.append(max(tried, key=lambda t: t[0]))
+        candidates = _bursts(changed, minutes, row_overhead_s)
+        scored = [(predict_noise(p, noise).image_db - predict_burst(p).edge_loss_db, p) for p in candidates]
+        if scored:
+            best.append(max(scored, key=lambda t: t[0]))
     best.sort(key=lambda t: -t[0])
-    good = (p for _, p in best if not any(_rules_out(w) for w in cautions(p, noise, scene_mm)))
-    return [forecast(p, noise, row_overhead_s, scene_mm) for p in islice(good, count)]
+    usable = (p for _, p in best if not any(_excludes(w) for w in find_warnings(p, noise, scene_mm)))
+    return [forecast(p, noise, row_overhead_s, scene_mm) for p in islice(usable, count)]
 
 
-def _rules_out(caution: Caution) -> bool:
-    return caution.refused or caution.topic == "aliasing"
-
-
-def _score(rig: Instrument, noise: Noise) -> float:
-    return noise_facts(rig, noise).image_db - burst_facts(rig).edge_loss_db
+def _excludes(warning: PlanWarning) -> bool:
+    return warning.refused or warning.topic == "aliasing"
 
 
 def _grids(rig: Instrument) -> Iterator[Instrument]:
-    """The rig file with other steps."""
-    for nx in _MULTIPLES:
-        for ny in _MULTIPLES:
+    """Yield the rig file with other steps."""
+    for nx in _STEP_MULTIPLES:
+        for ny in _STEP_MULTIPLES:
             steps = Changes(step_x_mm=nx * rig.grid.step_x_mm, step_y_mm=ny * rig.grid.step_y_mm)
             try:
                 yield steps.apply(rig)
             except ConfigError:
-                continue  # whole steps make this aperture larger than the travel
+                continue  # the aperture, rounded to whole steps, exceeds the travel
 
 
 def _bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iterator[Instrument]:
-    """As many pulses as travel and time to the next position allow, at the slowest speed that keeps the time.
+    """Yield plans with as many pulses as fit, at the slowest speed that keeps the time.
 
-    At the rig's period and the radars' shortest; all that fit, and as many as make a row whole packets. A burst of
-    frames of many chirps stays as it is.
+    They use the rig's pulse period and the radars' shortest, once with the maximum number of pulses and once with the
+    highest number that fills whole packets. A burst with several chirps a frame is not changed.
     """
     if rig.burst.chirps > 1:
         for speed in _speeds(rig, minutes):
-            plan = _with(rig, speed, rig.burst.pulses, rig.burst.period_us)
-            fits = _most_pulses(plan) >= rig.burst.pulses
-            if fits and scan_time(plan, row_overhead_s).minutes <= minutes:
+            plan = _with_burst(rig, speed, rig.burst.pulses, rig.burst.period_us)
+            if _max_pulses(plan) >= rig.burst.pulses and scan_time(plan, row_overhead_s).minutes <= minutes:
                 yield plan
                 return
         return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
         for whole in (False, True):
             for speed in _speeds(rig, minutes):
-                plan = _with(rig, speed, 2, period)
-                pulses = _most_pulses(plan)
+                plan = _with_burst(rig, speed, 2, period)
+                pulses = _max_pulses(plan)
                 if whole:
-                    pulses = next((n for n in range(pulses, 1, -1) if _whole(plan, n)), 0)
+                    pulses = next((n for n in range(pulses, 1, -1) if whole_packets(plan, n)), 0)
                 if pulses < 2:
                     break
-                plan = _with(rig, speed, pulses, period)
+                plan = _with_burst(rig, speed, pulses, period)
                 if scan_time(plan, row_overhead_s).minutes <= minutes:
                     yield plan
                     break
 
 
-def _with(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> Instrument:
-    """Another speed and burst, quickly: that they keep the rig file's rules is known."""
+def _with_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> Instrument:
+    """Replace speed and burst without validation, for speed; the values keep the rig file's rules."""
     stage = msgspec.structs.replace(rig.stage, speed_mm_s=speed_mm_s)
     burst = msgspec.structs.replace(rig.burst, pulses=pulses, period_us=period_us)
     return msgspec.structs.replace(rig, stage=stage, burst=burst)
 
 
-def _most_pulses(rig: Instrument) -> int:
-    fits = _MARGIN * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
-    travel = burst_facts(rig).travel_wavelengths
-    still = 1 + _MOST_TRAVEL_WAVELENGTHS * (rig.burst.chirps_a_position - 1) / travel
-    return min(int(fits), int(still), MAX_FRAMES // rig.grid.columns)
-
-
-def _whole(rig: Instrument, pulses: int) -> bool:
-    return pulses * rig.grid.columns * rig.frame_bytes % payload_bytes(rig) == 0
+def _max_pulses(rig: Instrument) -> int:
+    by_time = _MAX_DUTY * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
+    travel = predict_burst(rig).travel_wavelengths
+    by_travel = 1 + _MAX_TRAVEL_WAVELENGTHS * (rig.burst.chirps_a_position - 1) / travel
+    return min(int(by_time), int(by_travel), _MAX_FRAMES // rig.grid.columns)
 
 
 def _speeds(rig: Instrument, minutes: float) -> Iterator[float]:
-    """Whole speeds, ascending, from one that might keep the time to what stage and travel allow."""
+    """Yield whole speeds, mm/s, ascending, from the slowest that can keep the time to the limit of stage and travel."""
     length = (rig.grid.columns - 1) * rig.grid.step_x_mm
     slowest = max(1, int(rig.grid.rows * length / (60 * minutes)))
     for speed in range(slowest, int(MAX_STEPS_PER_S / rig.stage.steps_per_mm) + 1):
-        at = msgspec.structs.replace(rig.stage, speed_mm_s=float(speed))
-        if not at.misfit(rig.grid):
+        stage = msgspec.structs.replace(rig.stage, speed_mm_s=float(speed))
+        if not stage.misfit(rig.grid):
             yield float(speed)

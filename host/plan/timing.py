@@ -1,6 +1,6 @@
-"""How long the stage takes for a scan: rows with their ramps, turn-rounds, and what host and Pi add between rows.
+"""Estimate the duration of a scan: rows with their ramps, turns, and the standstill between rows.
 
-The stage's own sequence is in docs/spec/stage-line.md ("A row"); speeds are trapezoids of constant acceleration.
+docs/spec/stage-line.md ("A row") has the stage's sequence; motion has trapezoidal speed with constant acceleration.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from polysight.shared.config import Grid, Instrument, Stage
 from polysight.shared.raster import burst_duration_s
 
 ROW_OVERHEAD_S = 0.3
-"""Standstill between rows once the data is there: row made durable, cards and radars armed, commands.
+"""Default standstill between rows, for storing the row, arming cards and radars, and commands.
 
 Simulated: 0.14 and 0.29 s between rows of 350 points x 13 and 16 chirps on the simulated rig at real time, on a busy
-machine. Not measured on hardware; `polysight plan --like SCAN` takes it from a scan.
+machine. Not measured on hardware; `polysight plan --like SCAN` measures it in a scan.
 """
 
 TAIL_S = 2.0
-"""A card keeps a record's short last packet back for so long after the last data (docs/spec/dca1000.md, seen)."""
+"""Delay with which a card sends a record's short last packet (docs/spec/dca1000.md, observed)."""
 
 _PACKET_OVERHEAD_BYTES = 14
 
 
 @dataclass(frozen=True)
 class ScanTime:
-    """Seconds of a scan, added up over its rows. Homing is not in it: it depends on where the stage stands.
+    """Duration of a scan by cause, summed over its rows, without homing, which depends on the stage's position.
 
     Attributes
     ----------
@@ -36,15 +36,13 @@ class ScanTime:
     measuring_s
         At constant speed from each row's first point to its last.
     ramps_s
-        Acceleration, slowing down, and the run-up of one step (or the backlash) on either side.
+        Acceleration, deceleration, and the run-up of one step (or the backlash) on either side.
     turns_s
-        Way from each row's end to the next one's beginning.
+        From each row's end to the next one's beginning.
     tail_s
         Waiting for the cards' short last packets.
     overhead_s
-        Standstill besides.
-    rows
-        Rows of the scan.
+        Other standstill between rows.
     """
 
     approach_s: float
@@ -53,21 +51,20 @@ class ScanTime:
     turns_s: float
     tail_s: float
     overhead_s: float
-    rows: int
 
     @property
     def total_s(self) -> float:
-        """All of it."""
+        """Sum of all parts, seconds."""
         return self.approach_s + self.measuring_s + self.ramps_s + self.turns_s + self.tail_s + self.overhead_s
 
     @property
     def minutes(self) -> float:
-        """All of it, in minutes."""
+        """Sum of all parts, minutes."""
         return self.total_s / 60
 
 
 def straight_move_s(distance_mm: float, speed_mm_s: float, accel_mm_s2: float) -> float:
-    """From rest to rest over a distance: a trapezoid of speed, or a triangle where the speed is not reached."""
+    """Return the duration of a move from rest to rest: trapezoidal speed, or triangular for short distances."""
     if distance_mm <= 0:
         return 0.0
     if distance_mm < speed_mm_s**2 / accel_mm_s2:
@@ -76,30 +73,30 @@ def straight_move_s(distance_mm: float, speed_mm_s: float, accel_mm_s2: float) -
 
 
 def row_motion_s(grid: Grid, stage: Stage) -> float:
-    """One row from rest to rest."""
+    """Return the duration of a row from rest to rest."""
     length = (grid.columns - 1) * grid.step_x_mm + 2 * stage.run_up_mm(grid.step_x_mm)
     return straight_move_s(length, stage.speed_mm_s, stage.accel_mm_s2)
 
 
 def turn_s(grid: Grid, stage: Stage) -> float:
-    """From a row's end to the next one's beginning: y alone moves, from below where backlash is taken up."""
+    """Return the duration from a row's end to the next one's beginning; only y moves, and takes up its backlash."""
     step, lost = grid.step_y_mm, stage.backlash_mm
     legs = (step,) if lost <= step else (lost - step, lost)
     return sum(straight_move_s(leg, stage.travel_speed_mm_s, stage.accel_mm_s2) for leg in legs)
 
 
 def payload_bytes(rig: Instrument) -> int:
-    """Payload of a full packet: what the card is told less its header's 14 bytes, at most 1456."""
+    """Return the payload of a full packet: the configured size minus a header of 14 bytes, at most 1456."""
     return min(rig.card.packet_bytes - _PACKET_OVERHEAD_BYTES, MAX_PAYLOAD_BYTES)
 
 
-def whole_packets(rig: Instrument) -> bool:
-    """Whether a row fills whole packets, so that its last byte comes without the card's wait."""
-    return rig.row_bytes % payload_bytes(rig) == 0
+def whole_packets(rig: Instrument, pulses: int | None = None) -> bool:
+    """Return True if a row with `pulses` pulses a position fills whole packets, so that no short one is delayed."""
+    return rig.row_bytes // rig.burst.pulses * (pulses or rig.burst.pulses) % payload_bytes(rig) == 0
 
 
 def tail_s(rig: Instrument) -> float:
-    """Waiting at the end of each row for the cards' last packet, after the stage has come to rest, seconds."""
+    """Return the wait for the cards' last packet at the end of each row, after the stage has stopped, seconds."""
     if whole_packets(rig):
         return 0.0
     grid, stage = rig.grid, rig.stage
@@ -108,14 +105,9 @@ def tail_s(rig: Instrument) -> float:
 
 
 def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTime:
-    """How long a rig's scan takes, every row taken once.
+    """Estimate the duration of a scan without retakes.
 
-    Parameters
-    ----------
-    rig
-        Grid, stage and burst.
-    row_overhead_s
-        Standstill for each row besides motion and the wait for its last packet, seconds.
+    `row_overhead_s` is the standstill for each row apart from motion and the wait for the last packet, seconds.
     """
     grid, stage = rig.grid, rig.stage
     row = row_motion_s(grid, stage)
@@ -129,5 +121,4 @@ def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTi
         turns_s=(grid.rows - 1) * turn_s(grid, stage),
         tail_s=grid.rows * tail_s(rig),
         overhead_s=grid.rows * row_overhead_s,
-        rows=grid.rows,
     )

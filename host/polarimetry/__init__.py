@@ -1,19 +1,18 @@
-"""From the two images to the material's reflection and permittivity.
+"""Polarimetry: from the H and V images to reflection and permittivity.
 
-`calibrate` references the images to metal in the scene, `PlaneReference` to a plate scanned on its own; leakage is
-estimated from metal at two orientations. `incidence_choice` gives the angle, `fresnel` and `multilayer` the reflection
-of a material, `permittivity_from_ratio` the material of a reflection (Eq. 2 and 3 of the paper).
+`calibrate` divides the images by a metal region in the scene, a `PlaneReference` by a metal plate from another scan.
+`correct_leakage` removes cross-polar leakage; `leakage_from_images` estimates it from metal at two orientations.
+`incidence_choice` gives the incidence angle of each pixel. `fresnel` and `multilayer` compute the reflection of a
+material, `permittivity_from_ratio` the permittivity from a polarisation ratio (Eq. 2 and 3 of the paper).
 """
 
 from polysight.host.polarimetry.calibrate import (
     Calibrated,
     Image,
     Mask,
-    axial_ratio_from_known,
     calibrate,
     calibrate_by_reference,
     correct_leakage,
-    multilook_ratio,
     ratio,
     smooth,
 )
@@ -27,9 +26,7 @@ from polysight.host.polarimetry.fresnel import (
 from polysight.host.polarimetry.incidence import (
     Incidence,
     IncidenceChoice,
-    effective_incidence_map,
     incidence_choice,
-    incidence_map,
     specular_incidence_rad,
 )
 from polysight.host.polarimetry.leakage import (
@@ -52,21 +49,17 @@ __all__ = [
     "Mask",
     "PlaneReference",
     "Standard",
-    "axial_ratio_from_known",
     "brewster_angle_rad",
     "calibrate",
     "calibrate_by_reference",
     "common_direction",
     "correct_leakage",
-    "effective_incidence_map",
     "estimate_axial_ratio",
     "estimate_leakage",
     "fresnel",
     "incidence_choice",
-    "incidence_map",
     "leakage_from_images",
     "multilayer",
-    "multilook_ratio",
     "permittivity_from_ratio",
     "plane_reference",
     "ratio",

@@ -1,7 +1,7 @@
-"""Reflection of plane waves at flat interfaces: Fresnel's coefficients, their ratio, and layered media.
+"""Reflection of plane waves: Fresnel coefficients, their ratio, the permittivity from a ratio, and layered media.
 
-Time convention `exp(+j omega t)`: a passive medium has permittivity `eps' - j eps''` with `eps'' >= 0` and every wave
-inside it decays. Signs of Eq. 2 of the paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
+Time convention `exp(+j omega t)`: a passive medium has permittivity `eps' - j eps''` with `eps'' >= 0`, and waves in it
+decay. Signs of Eq. 2 of the paper: metal has r_s = r_p = -1, so that P = r_s / r_p = +1 at every angle.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import PolysightError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
@@ -19,11 +20,11 @@ Complex = npt.NDArray[np.complex128]
 Real = npt.NDArray[np.float64]
 _AIR = np.asarray(1.0 + 0j)
 _NAN = complex(np.nan, np.nan)
-_CONDUCTOR = 1 - 1e24j  # in place of infinite permittivity: reflects -1 to one part in 1e12
+_CONDUCTOR = 1 - 1e24j  # replaces infinite permittivity: reflects -1 within 1e-12
 
 
 def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
-    """Index times cosine in the medium, sqrt(eps - sin^2 theta_i): the root that decays when passive (Im <= 0)."""
+    """Return index times cosine in the medium, sqrt(eps - sin^2 theta_i), the root that decays (Im <= 0)."""
     q: Complex = np.sqrt(eps - sine**2)
     return np.where((q.real == 0) & (q.imag > 0), -q, q)
 
@@ -31,7 +32,7 @@ def _normal_wavenumber(eps: Complex, sine: Real) -> Complex:
 def _media(
     eps: npt.ArrayLike, theta_rad: npt.ArrayLike
 ) -> tuple[Complex, Real, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Permittivity and angle broadcast, finite everywhere, and where they stood for metal or were not a number."""
+    """Broadcast permittivity and angle; return them made finite, and masks of metal (infinite) and of NaN."""
     eps, theta = np.broadcast_arrays(np.asarray(eps, np.complex128), np.asarray(theta_rad, np.float64))
     unknown = np.isnan(eps) | ~np.isfinite(theta)  # of a complex number: either part
     metal = np.isinf(eps) & ~unknown
@@ -39,7 +40,7 @@ def _media(
 
 
 def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Complex]:
-    """Reflection coefficients of a half space seen from air (Eq. 2 of the paper).
+    """Return the reflection coefficients of a half space in air (Eq. 2 of the paper).
 
     Parameters
     ----------
@@ -51,8 +52,8 @@ def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Comp
     Returns
     -------
     r_s, r_p
-        complex128, broadcast shape: s (perpendicular to the plane of incidence) and p (parallel to it). Not a number
-        where either part of `eps`, or the angle, is not.
+        complex128, broadcast shape: s (perpendicular to the plane of incidence) and p (parallel to it). NaN where
+        `eps` or the angle is NaN.
     """
     eps, theta, metal, unknown = _media(eps, theta_rad)
     c, s = np.cos(theta), np.sin(theta)
@@ -64,12 +65,10 @@ def fresnel(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> tuple[Complex, Comp
 
 
 def ratio_from_permittivity(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
-    """Polarisation ratio P = r_s / r_p of a half space (Eq. 2 of the paper).
+    """Return the polarisation ratio P = r_s / r_p of a half space (Eq. 2 of the paper), complex128.
 
-    Written as (q cos + sin^2) / (q cos - sin^2) with q = sqrt(eps - sin^2), which equals r_s / r_p and has no 0/0 at
-    eps = 1. Infinite permittivity gives 1 (metal), the exact Brewster angle of a lossless medium gives infinity.
-
-    Parameters and shapes as :func:`fresnel`; returns complex128, not a number where a parameter is not.
+    Evaluated as (q cos + sin^2) / (q cos - sin^2) with q = sqrt(eps - sin^2), which has no 0/0 at eps = 1. Infinite
+    permittivity gives 1 (metal), the Brewster angle of a lossless medium infinity. Parameters as :func:`fresnel`.
     """
     eps, theta, metal, unknown = _media(eps, theta_rad)
     s = np.sin(theta)
@@ -81,28 +80,28 @@ def ratio_from_permittivity(eps: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Com
 
 
 def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
-    """Permittivity of a half space from its polarisation ratio (Eq. 3 of the paper).
+    """Return the permittivity of a half space from its polarisation ratio (Eq. 3 of the paper).
 
-    Eq. 3 is evaluated as sin^2 (1 + tan^2 ((1 + P) / (1 - P))^2), which is the same expression without cancellation.
-    It does not change under P -> 1/P, so either ratio may be given.
+    Eq. 3 is evaluated as sin^2 (1 + tan^2 ((1 + P) / (1 - P))^2), the same expression without cancellation. P and 1/P
+    give the same result.
 
-    P = 1 is the pole: a perfect conductor, at any angle. It returns `inf + 0j`. Close to it the permittivity grows as
-    4 / |P - 1|^2 and an error of P is magnified accordingly: what is metal-like has no determinable permittivity.
+    P = 1 (a perfect conductor, at any angle) returns `inf + 0j`. Near it the permittivity grows as 4 / |P - 1|^2, and
+    errors of P with it: a metal-like material has no determinable permittivity.
 
     Parameters
     ----------
     p
-        Complex ratio H / V, metal-referenced, any shape; infinite is allowed (V vanishes: the Brewster angle).
+        Complex ratio H / V, metal-referenced, any shape; infinite at the Brewster angle.
     theta_rad
         Incidence angle in radians, broadcast against `p`.
 
     Returns
     -------
     eps
-        complex128; not a number where `p` is not.
+        complex128; NaN where `p` is NaN.
     """
     p, theta = np.broadcast_arrays(np.asarray(p, np.complex128), np.asarray(theta_rad, np.float64))
-    # Work with the ratio of modulus <= 1: the same permittivity, and no overflow near the Brewster angle.
+    # Use P or 1/P, whichever has modulus <= 1: no overflow near the Brewster angle.
     big = np.abs(p) > 1
     with np.errstate(invalid="ignore"):
         small = np.where(np.isinf(p), 0.0, np.where(big, 1.0 / np.where(big, p, 1.0), p))
@@ -113,16 +112,15 @@ def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Compl
 
 
 def brewster_angle_rad(eps: npt.ArrayLike) -> Real:
-    """Angle at which |r_p| of a half space is smallest, radians (exact for lossless media: tan theta = sqrt(eps)).
+    """Return the angle of smallest |r_p| of a half space, radians: arctan(sqrt|eps|), exact for lossless media.
 
-    For lossy media this is the pseudo-Brewster angle of least |r_p|, approximated by arctan(sqrt|eps|). The paper
-    calls it the angle of lowest *s* reflectance; it is the p-polarised wave that vanishes there.
+    The paper calls it the angle of lowest *s* reflectance; it is the p-polarised wave that vanishes there.
     """
     return np.arctan(np.sqrt(np.abs(np.asarray(eps, np.complex128))))[()]
 
 
 def _entries(value: Sequence[npt.ArrayLike] | npt.ArrayLike) -> list[Any]:
-    """The entries of a list, tuple or array; a single number is a list of one."""
+    """Return the entries of a list, tuple or array; a number becomes a list of one."""
     if isinstance(value, list | tuple):
         return list(value)
     array = np.asarray(value)
@@ -132,7 +130,7 @@ def _entries(value: Sequence[npt.ArrayLike] | npt.ArrayLike) -> list[Any]:
 def _stack(
     eps: Sequence[npt.ArrayLike] | npt.ArrayLike, thickness_m: Sequence[npt.ArrayLike] | npt.ArrayLike
 ) -> tuple[list[Complex], list[Real]]:
-    """Permittivities of air and of all media, and the thicknesses of those between two half spaces, metres.
+    """Return the permittivities of air and all media, and the thicknesses of the layers between, metres.
 
     Raises PolysightError as :func:`multilayer`.
     """
@@ -143,6 +141,7 @@ def _stack(
         raise PolysightError(
             f"multilayer: {len(media)} permittivities with {len(layers)} thicknesses",
             "each medium needs a thickness; only that of the last one may be left out (half space)",
+            code=ErrorCode.MISMATCH,
         )
     if len(layers) == len(media):
         if np.all(np.isinf(layers[-1])):
@@ -151,7 +150,9 @@ def _stack(
             media.append(_AIR)
     if any(np.any(~np.isfinite(d)) or np.any(d < 0) for d in layers):
         raise PolysightError(
-            "multilayer: a thickness is negative or not finite", "only the last medium may be infinitely thick"
+            "multilayer: a thickness is negative or not finite",
+            "only the last medium may be infinitely thick",
+            code=ErrorCode.VALUE_INVALID,
         )
     return [_AIR, *media], layers
 
@@ -162,21 +163,21 @@ def multilayer(
     frequency_hz: npt.ArrayLike,
     theta_rad: npt.ArrayLike,
 ) -> tuple[Complex, Complex]:
-    """Reflection coefficients of a stack of flat layers seen from air.
+    """Return the reflection coefficients of a stack of flat layers in air.
 
-    The transfer-matrix solution in its recursive form (Rouard; Born & Wolf, section 1.6): from the last interface to
-    the first, r = (r_front + r_behind z) / (1 + r_front r_behind z) with z = exp(-2 j k0 d q). Only decaying
-    exponentials occur, so thick and lossy layers do not overflow as a product of matrices does.
+    Transfer-matrix solution in recursive form (Rouard; Born & Wolf, section 1.6), from the last interface to the first:
+    r = (r_front + r_behind z) / (1 + r_front r_behind z) with z = exp(-2 j k0 d q). All exponentials decay, so thick
+    lossy layers do not overflow.
 
     Parameters
     ----------
     eps
-        Relative permittivity of each medium in the order the wave meets them; each entry a number or an array that
-        broadcasts against frequency and angle. A single number is one medium. Infinite: a perfect conductor.
+        Relative permittivity of each medium from the front; each entry a number or an array that broadcasts against
+        frequency and angle. A single number is one medium. Infinite: a perfect conductor.
     thickness_m
-        Thickness of each of them in metres. The last medium is a half space when its thickness is infinite or left
-        out; otherwise air follows it. So `multilayer(eps, inf, f, theta)` is :func:`fresnel` and
-        `multilayer(eps, d, f, theta)` is a sheet in air.
+        Thickness of each medium, metres. The last medium is a half space if its thickness is infinite or left out;
+        otherwise air follows. `multilayer(eps, inf, f, theta)` is :func:`fresnel`, `multilayer(eps, d, f, theta)` a
+        sheet in air.
     frequency_hz
         Frequency, number or array.
     theta_rad
@@ -190,8 +191,8 @@ def multilayer(
     Raises
     ------
     PolysightError
-        when the numbers of permittivities and thicknesses do not fit, or a thickness is negative or infinite before
-        the last medium.
+        if the numbers of permittivities and thicknesses do not fit, or a thickness is negative, or infinite before the
+        last medium.
     """
     media, layers = _stack(eps, thickness_m)
     theta = np.asarray(theta_rad, np.float64)

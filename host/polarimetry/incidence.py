@@ -1,12 +1,11 @@
-"""The angle of incidence behind each pixel.
+"""Incidence angle of each pixel.
 
-For a plane parallel to the stage the radars move past a mirror: at every stage offset the reflection happens at the
-specular point of that offset, which is always seen under the same angle. A pixel is bright exactly when it is that
-point, so its angle is that of the specular midpoint, everywhere (:func:`incidence_map`).
+A plane parallel to the stage reflects like a mirror: at every stage offset the reflection comes from the specular
+point, under the same angle. So all pixels have the incidence angle of the specular midpoint.
 
-The image of a pixel also gathers offsets around its specular one, about one Fresnel zone to each side, under slightly
-different angles; near the border of the scanned aperture only part of that zone was visited.
-:func:`effective_incidence_map` weights the local bistatic angle over the part that was.
+The image of a pixel also contains stage offsets within about one Fresnel zone of the specular one, with slightly
+different angles; near the border of the aperture only part of that zone was scanned. :func:`effective_incidence_map`
+averages the bistatic angle over the scanned part.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
 Incidence = Literal["one", "pixel"]
-"""One angle for the image (the specular one), or each pixel's own (:func:`effective_incidence_map`)."""
+"""One angle for the image (specular), or one per pixel (:func:`effective_incidence_map`)."""
 
 
 def _half_bistatic(rig: Instrument, board_index: int, points_m: Real) -> tuple[Real, Real]:
-    """Half the angle TX-point-RX1 in radians, and the path TX-point-RX1 in metres, for points [..., 3]."""
+    """Return half the angle TX-point-RX1 (radians) and the path TX-point-RX1 (metres) for points [..., 3]."""
     a = np.asarray(tx_position_m(rig)) - points_m
     b = np.asarray(rx_positions_m(rig, rig.receivers[board_index])[0]) - points_m
     na, nb = np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1)
@@ -37,7 +36,7 @@ def _half_bistatic(rig: Instrument, board_index: int, points_m: Real) -> tuple[R
 
 
 def specular_incidence_rad(rig: Instrument) -> float:
-    """Incidence angle at the specular midpoints, mean of H and V (they differ by hundredths of a degree), radians."""
+    """Return the incidence angle at the specular midpoint, radians; mean of H and V, which differ by 0.01 degrees."""
     angles = []
     for i, board in enumerate(rig.receivers):
         angle, _ = _half_bistatic(rig, i, np.asarray(specular_midpoint_m(rig, board)))
@@ -45,21 +44,12 @@ def specular_incidence_rad(rig: Instrument) -> float:
     return float(np.mean(angles))
 
 
-def incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Real:
-    """Incidence angle of each pixel of a plane parallel to the stage, radians, float64 [ny, nx].
-
-    Constant: every pixel is bright where it is the specular point (see the module's text). Given as a map so that a
-    tilted plane or :func:`effective_incidence_map` fit the same place.
-    """
-    return np.full((np.size(y_m), np.size(x_m)), specular_incidence_rad(rig))
-
-
 def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Real:
-    """Incidence angle of each pixel, weighted over the stage offsets that were visited; radians, float64 [ny, nx].
+    """Return the incidence angle of each pixel, averaged over the scanned stage offsets; radians, float64 [ny, nx].
 
-    The weight of offset u for pixel v is exp(-(k D)^2 / 8) with k D the phase by which the path at u exceeds the
-    specular one: 1 at the specular offset, falling to about 0.3 at the edge of the first Fresnel zone (k D = pi). H
-    and V are averaged. Where no visited offset carries weight the specular angle stands.
+    The weight of offset u for a pixel is exp(-(k D)^2 / 8), where k D is the phase of the path at u minus that of the
+    specular path: 1 at the specular offset, about 0.3 at the edge of the first Fresnel zone (k D = pi). H and V are
+    averaged. Pixels without any weight get the specular angle.
 
     Parameters
     ----------
@@ -72,7 +62,7 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     step = np.array([rig.grid.step_x_mm, rig.grid.step_y_mm]) / 1e3
     count = np.array([rig.grid.columns, rig.grid.rows])
     wavelength = SPEED_OF_LIGHT_M_S / (rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2)
-    # Half of the first Fresnel zone along x, sqrt(lambda z / (2 cos^3)), is its longest: reach twice as far.
+    # The first Fresnel zone is longest along x, half its length is sqrt(lambda z / (2 cos^3)); sum twice as far.
     zone = np.sqrt(wavelength * rig.geometry.object_distance_mm / 2e3 / np.cos(specular_incidence_rad(rig)) ** 3)
     reach = np.ceil(2 * zone / step).astype(int)
     dx, dy = (np.arange(-n, n + 1) * s for n, s in zip(reach, step, strict=True))
@@ -98,7 +88,7 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
 
 
 def _convolved(a: Real, b: Real) -> Real:
-    """Full linear convolution of two images; scipy.signal has it too, and loads scipy.stats with it for a second."""
+    """Return the full linear convolution of two images; scipy.signal would load scipy.stats, which takes a second."""
     shape = [m + n - 1 for m, n in zip(a.shape, b.shape, strict=True)]
     fast = [scipy.fft.next_fast_len(n, real=True) for n in shape]
     both = scipy.fft.rfft2(a, fast) * scipy.fft.rfft2(b, fast)
@@ -107,7 +97,7 @@ def _convolved(a: Real, b: Real) -> Real:
 
 @dataclass(frozen=True)
 class IncidenceChoice:
-    """Both angles of every pixel, float64 [ny, nx] radians, and which of them is used."""
+    """Specular and effective incidence angle of every pixel, float64 [ny, nx] radians, and the one to use."""
 
     choice: Incidence
     one_rad: Real
@@ -115,16 +105,16 @@ class IncidenceChoice:
 
     @property
     def used_rad(self) -> Real:
-        """The one that was chosen."""
+        """The chosen angles."""
         return self.one_rad if self.choice == "one" else self.pixel_rad
 
     @property
     def other_rad(self) -> Real:
-        """The one that was not."""
+        """The other angles."""
         return self.pixel_rad if self.choice == "one" else self.one_rad
 
     def facts(self, valid: npt.NDArray[np.bool_]) -> dict[str, Any]:
-        """How far they are apart over the valid pixels, for quality.json; degrees."""
+        """Return both angles and their largest difference over valid pixels, for quality.json; degrees."""
         pixel = np.degrees(self.pixel_rad[valid]) if valid.any() else np.degrees(self.pixel_rad).ravel()
         one = float(np.degrees(self.one_rad.flat[0]))
         return {
@@ -136,5 +126,6 @@ class IncidenceChoice:
 
 
 def incidence_choice(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike, choice: Incidence) -> IncidenceChoice:
-    """One number for the image and each pixel's own angle, of which `choice` is to be used."""
-    return IncidenceChoice(choice, incidence_map(rig, x_m, y_m), effective_incidence_map(rig, x_m, y_m))
+    """Compute both kinds of incidence angles; `choice` is the one to use."""
+    pixel_rad = effective_incidence_map(rig, x_m, y_m)
+    return IncidenceChoice(choice, np.full(pixel_rad.shape, specular_incidence_rad(rig)), pixel_rad)

@@ -1,7 +1,9 @@
-"""The folder of products: written whole or not at all, and read back.
+"""Products of processed scans: write a folder of products, read it back, and convert it to xarray datasets.
 
-`making_products` gives a new folder that takes the place of the earlier one when it is whole. `SavedProducts`,
-found by `read_products`, is the one place that knows how the files are laid out and named.
+`making_products` is a context manager: products are written to a temporary folder, which replaces the old one when
+all are complete. `read_products` returns `SavedProducts`, the content of each file. `read_processed` returns a
+`ProcessedScan` in memory, from which `image_dataset`, `patch_dataset` and `full_dataset` make datasets. Names and
+permittivities of scans whose verdict is "no result" are never returned (`withhold`).
 """
 
 from polysight.host.products.dataset_files import read_netcdf, write_netcdf, write_zarr
@@ -10,7 +12,7 @@ from polysight.host.products.datasets import (
     full_dataset,
     image_dataset,
     patch_dataset,
-    runs,
+    ranges_text,
     verdict_attributes,
 )
 from polysight.host.products.files import (
@@ -22,19 +24,27 @@ from polysight.host.products.files import (
     SCAN,
     SavedProducts,
     find_products,
-    fresh_part,
     plain,
     read_image,
     read_products,
     rx_gains,
     scan_facts,
+    temporary_path,
+    withhold,
     write_atomically,
     write_image,
     write_json,
     write_scan_facts,
 )
-from polysight.host.products.folder import RAW_DROPPED, check_products_folder, making_products
-from polysight.host.products.label_files import LABELS_PICTURE, find_labels, label_place, scan_folder_of
+from polysight.host.products.folder import (
+    LABELS_PICTURE,
+    RAW_DROPPED,
+    check_products_folder,
+    find_labels,
+    label_folder,
+    making_products,
+    scan_folder_of,
+)
 from polysight.host.products.material_table import (
     PermittivitySpread,
     material_columns,
@@ -42,7 +52,6 @@ from polysight.host.products.material_table import (
     refused_text,
 )
 from polysight.host.products.processed import ProcessedScan, Rows, read_processed
-from polysight.host.products.withhold import withhold
 
 __all__ = [
     "CONVENTION",
@@ -61,24 +70,24 @@ __all__ = [
     "check_products_folder",
     "find_labels",
     "find_products",
-    "fresh_part",
     "full_dataset",
     "image_dataset",
-    "label_place",
+    "label_folder",
     "making_products",
     "material_columns",
     "patch_dataset",
     "permittivity_spread",
     "plain",
+    "ranges_text",
     "read_image",
     "read_netcdf",
     "read_processed",
     "read_products",
     "refused_text",
-    "runs",
     "rx_gains",
     "scan_facts",
     "scan_folder_of",
+    "temporary_path",
     "verdict_attributes",
     "withhold",
     "write_atomically",

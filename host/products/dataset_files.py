@@ -1,7 +1,7 @@
-"""Datasets as NetCDF files and Zarr stores.
+"""Write and read datasets as NetCDF files and Zarr stores.
 
 NetCDF has no complex numbers: a complex variable `h` is stored as `h_real` and `h_imag`, each with the attribute
-`complex_part`, from which :func:`read_netcdf` makes `h` again. Zarr stores complex numbers as they are.
+`complex_part`; :func:`read_netcdf` joins them again. Zarr stores complex numbers directly.
 """
 
 from __future__ import annotations
@@ -13,19 +13,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from polysight.host.products.files import fresh_part
+from polysight.host.products.files import temporary_path
 from polysight.host.store import MOST_BYTES
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     import xarray
 
 _PART = "complex_part"
-_ZARR_FORMAT = 2  # every reader knows it, and its text columns need no extension
+_ZARR_FORMAT = 2  # all readers support it, and text columns need no extension
 
 
 def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Copy of a dataset with each complex variable `h` replaced by real variables `h_real` and `h_imag`."""
+    """Return a dataset with each complex variable `h` replaced by real variables `h_real` and `h_imag`."""
     made: dict[str, Any] = {}
     for name, variable in dataset.data_vars.items():
         if variable.dtype.kind != "c":
@@ -40,7 +41,7 @@ def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Undo :func:`split_complex`: variables that say which part they are become complex ones again."""
+    """Undo :func:`split_complex`: join the variables with the attribute `complex_part`."""
     made: dict[str, Any] = {}
     for full_name, variable in dataset.data_vars.items():
         name, _, suffix = str(full_name).rpartition("_")
@@ -61,38 +62,39 @@ def _require(package: str, kind: str) -> None:
     except ImportError:
         raise ConfigError(
             f"{kind} needs the package {package}, which is not installed",
-            "only this export uses it, so it is an extra",
+            "only this export uses it, so it is optional",
             f"pip install 'polysight[export]', or pip install {package}",
+            code=ErrorCode.PACKAGE_MISSING,
         ) from None
 
 
 def write_netcdf(path: Path, dataset: xarray.Dataset) -> None:
-    """Write a NetCDF 4 file; complex variables as two real ones, True and False in attributes as 1 and 0.
+    """Write a NetCDF 4 file; complex variables become two real ones, True and False in attributes 1 and 0.
 
     Raises
     ------
     ConfigError
-        when h5netcdf is not installed.
+        if h5netcdf is not installed.
     """
     _require("h5netcdf", "NetCDF")
     split = split_complex(dataset)
     split.attrs = {key: int(value) if isinstance(value, bool) else value for key, value in split.attrs.items()}
     packed = {"zlib": True, "complevel": 4, "shuffle": True}
     encoding = {name: packed for name, v in split.data_vars.items() if v.ndim == 2 and v.dtype.kind in "biuf"}
-    part = fresh_part(path)
+    part = temporary_path(path)
     split.to_netcdf(part, engine="h5netcdf", encoding=encoding)
     part.replace(path)
 
 
 def read_netcdf(path: Path) -> xarray.Dataset:
-    """Read a file that :func:`write_netcdf` wrote, whole, with its complex variables.
+    """Load a file of :func:`write_netcdf` into memory, with complex variables.
 
     Raises
     ------
     ConfigError
-        when h5netcdf is not installed.
+        if h5netcdf is not installed.
     DataError
-        when the file cannot be read.
+        if the file cannot be read.
     """
     import xarray
 
@@ -101,58 +103,63 @@ def read_netcdf(path: Path) -> xarray.Dataset:
         _check_hdf5(path)
         dataset = xarray.load_dataset(path, engine="h5netcdf")
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: not a NetCDF file: {e}", "the path is wrong, or the file is damaged") from None
+        raise DataError(
+            f"{path}: not a NetCDF file: {e}",
+            "the path is wrong, or the file is damaged",
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None
     if "simulated" in dataset.attrs and dataset.attrs["simulated"] != "unknown":
         dataset.attrs["simulated"] = bool(dataset.attrs["simulated"])
     return join_complex(dataset)
 
 
 def _check_hdf5(path: Path) -> None:
-    """Refuse a file whose arrays lie in other files, or take more than is read, before any of it is.
-
-    Raises
-    ------
-    DataError, OSError
-        naming what.
-    """
+    """Raise DataError if arrays lie in other files or are too large, before anything is read. Raises OSError."""
     import h5py
 
     sizes: list[int] = []
-    elsewhere: list[str] = []
+    external: list[str] = []
     with h5py.File(path, "r") as file:
 
-        def look(name: str) -> None:  # must not raise: HDF5 calls it
+        def check(name: str) -> None:  # called by HDF5, must not raise
             outside = isinstance(file.get(name, getlink=True), h5py.ExternalLink)
             found = None if outside else file.get(name)
             if isinstance(found, h5py.Dataset):
                 outside = bool(found.external) or found.is_virtual
                 sizes.append((found.size or 0) * found.dtype.itemsize)
             if outside:
-                elsewhere.append(name)
+                external.append(name)
 
-        file.visit_links(look)
-    if elsewhere:
-        raise DataError(f"{path}: {elsewhere[0]} lies in another file", "it was not made by this program")
+        file.visit_links(check)
+    if external:
+        raise DataError(
+            f"{path}: {external[0]} lies in another file",
+            "it was not written by this program",
+            code=ErrorCode.PATH_OUTSIDE,
+        )
     if sum(sizes) > MOST_BYTES:
         raise DataError(
-            f"{path}: its arrays take {sum(sizes)} bytes, more than the {MOST_BYTES} bytes that are read",
-            "it was not made by this program, or is damaged",
+            f"{path}: its arrays take {sum(sizes)} bytes, more than the limit of {MOST_BYTES} bytes",
+            "it was not written by this program, or is damaged",
             "export the products again",
+            code=ErrorCode.FILE_TOO_LARGE,
         )
 
 
 def write_zarr(path: Path, dataset: xarray.Dataset) -> None:
-    """Write a Zarr store (a folder, Zarr format 2); an earlier store at `path` is replaced.
+    """Write a Zarr store (a folder, Zarr format 2); an existing store at `path` is overwritten.
 
     Raises
     ------
     ConfigError
-        when zarr is not installed, or `path` holds something else.
+        if zarr is not installed, or `path` is something else.
     """
     _require("zarr", "Zarr")
     if path.exists() and not (path / ".zgroup").exists():
-        raise ConfigError(f"{path} is not a Zarr store", "something else has that name", "give another folder")
-    part = fresh_part(path)
+        raise ConfigError(
+            f"{path} is not a Zarr store", "it was not exported", "give another folder", code=ErrorCode.FILE_FOREIGN
+        )
+    part = temporary_path(path)
     dataset.to_zarr(part, mode="w", zarr_format=_ZARR_FORMAT, consolidated=True)
     if path.exists():
         shutil.rmtree(path)

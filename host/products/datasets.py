@@ -1,8 +1,7 @@
-"""Processed scans as xarray datasets: named dimensions, coordinates in metres, units, and where the data comes from.
+"""Convert processed scans to xarray datasets with named dimensions, coordinates in metres, units and provenance.
 
-One vocabulary for notebooks and exports: `image_dataset` has the pixels, `patch_dataset` the patches, `full_dataset`
-both. Permittivity is eps' - j eps'' (eps'' is the loss); what is not known is not a number. xarray is imported when a
-dataset is made, not before.
+Notebooks and exports use the same names: `image_dataset` has the pixels, `patch_dataset` the patches, `full_dataset`
+both. Permittivity is eps' - j eps'' (eps'' is the loss); unknown values are NaN. xarray is imported at first use.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from polysight.host.polarimetry import incidence_choice, specular_incidence_rad
 from polysight.host.products.material_table import material_columns
 from polysight.host.products.processed import ProcessedScan
 from polysight.host.verdict import Verdict
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 if TYPE_CHECKING:
@@ -31,8 +31,8 @@ CONVENTION = (
 UNREFERENCED = "none: h, v and p are in arbitrary units"
 
 
-def runs(numbers: Sequence[int]) -> str:
-    """Ascending numbers as text, `3, 7-9`; `none` when there are none."""
+def ranges_text(numbers: Sequence[int]) -> str:
+    """Return ascending numbers as text, `3, 7-9`; `none` without numbers."""
     found: list[list[int]] = []
     for n in numbers:
         if found and n == found[-1][1] + 1:
@@ -43,7 +43,7 @@ def runs(numbers: Sequence[int]) -> str:
 
 
 def verdict_attributes(verdict: Verdict | None) -> dict[str, str]:
-    """`verdict`, its level, and `verdict_reasons` as JSON (what, why, do); nothing where there is no verdict."""
+    """Return `verdict` (the level) and `verdict_reasons` as JSON (what, why, do); empty without a verdict."""
     if verdict is None:
         return {}
     content = verdict.to_dict()
@@ -51,7 +51,7 @@ def verdict_attributes(verdict: Verdict | None) -> dict[str, str]:
 
 
 def provenance(done: ProcessedScan) -> dict[str, Any]:
-    """Attributes of every dataset: what the data is and where it comes from. Unknown entries are left out.
+    """Return the attributes of every dataset: identity and origin of the data. Unknown entries are left out.
 
     `simulated` is True, False or "unknown"; `versions` is JSON; `rows_missing` and `positions_masked` are text; see
     :func:`verdict_attributes` for `verdict` and `verdict_reasons`.
@@ -75,7 +75,7 @@ def provenance(done: ProcessedScan) -> dict[str, Any]:
         attrs["versions"] = json.dumps(done.scan["versions"])
     if done.rows is not None:
         attrs["rows_planned"] = done.rows.planned
-        attrs["rows_missing"] = runs(done.rows.missing)
+        attrs["rows_missing"] = ranges_text(done.rows.missing)
     masked = [
         f"{name} {b['positions_masked']} of {b['positions']}"
         for name, b in done.quality.get("boards", {}).items()
@@ -95,7 +95,7 @@ def _numbers(values: Sequence[Any]) -> npt.NDArray[np.float64]:
 
 
 def _complex(real: Sequence[Any], loss_or_imag: Sequence[Any], sign: int = 1) -> npt.NDArray[np.complex128]:
-    """Complex numbers; both parts are not a number where one is not known."""
+    """Return complex numbers; both parts are NaN if one is unknown."""
     out = _numbers(real) + 1j * sign * _numbers(loss_or_imag)
     out[np.isnan(out)] = complex(np.nan, np.nan)
     return out
@@ -106,16 +106,16 @@ def _described(dims: tuple[str, ...], values: Any, units: str, long_name: str) -
 
 
 def image_dataset(done: ProcessedScan) -> xarray.Dataset:
-    """Images of a processed scan.
+    """Return the images of a processed scan.
 
     Returns
     -------
     xarray.Dataset
         Dimensions `y`, `x` (metres, rig frame). `h`, `v`, `p` complex64 [y, x]: s-polarised and p-polarised channel
-        and their ratio, relative to metal where `metal_reference` does not begin with "none". `valid` bool [y, x].
-        `p_sigma` float32 [y, x], the standard deviation of `p`, where the products have it.
-        `incidence_deg`: one angle, or [y, x] where the scan was processed with each pixel's own; left out when the
-        rig is not known. Attributes: :func:`provenance`.
+        and their ratio, relative to metal unless `metal_reference` begins with "none". `valid` bool [y, x].
+        `p_sigma` float32 [y, x], the standard deviation of `p`, if the products have it.
+        `incidence_deg`: one angle, or [y, x] if the scan was processed with one angle per pixel; left out if the
+        rig is unknown. Attributes: :func:`provenance`.
     """
     import xarray
 
@@ -148,39 +148,40 @@ def _axes(done: ProcessedScan) -> dict[str, Any]:
 
 
 def patch_dataset(done: ProcessedScan) -> xarray.Dataset:
-    """Patches of a processed scan: the patch of each pixel, and a table.
+    """Return the patches of a processed scan: the patch number of each pixel, and a table.
 
     Returns
     -------
     xarray.Dataset
-        `label` int32 [y, x] (0: no patch) and, where known, `interior` bool [y, x], the pixels behind the numbers.
+        `label` int32 [y, x] (0: no patch) and, if known, `interior` bool [y, x], the pixels used for the values.
         On dimension `patch`: `name`, `confidence`, `runner_up`, `runner_up_share`, `metal_reference`, `metal_like`,
         `width` and `height` (m), `pixels`, `patch_incidence_deg`, `ratio` and `permittivity` (complex) with their
-        standard errors, `permittivity_real_loss_covariance`, `dominated_by` (what most of the error comes from) and
-        `refused` (why a patch was not judged), of boxes drawn by hand `drawn_as`, where the truth is known `true_name`
+        standard errors, `permittivity_real_loss_covariance`, `dominated_by` (largest source of the error) and
+        `refused` (why a patch has no result); for boxes drawn by hand `drawn_as`, if the truth is known `true_name`
         and `true_permittivity`, and with sub-bands `band_ratio` [patch, band]. Coordinates `centre_x` and `centre_y`
         (m, rig frame). Attributes: :func:`provenance`, `library`, `model`.
 
     Raises
     ------
     DataError
-        when only images were made.
+        if only images were made.
     """
     import xarray
 
     if not done.metal_referenced:
         raise DataError(
-            f"scan {done.scan_id}: no materials were looked for",
+            f"scan {done.scan_id} has no materials",
             "only images were made of this scan",
             "`polysight process` finds patches and materials; give the folder it writes, or the scan folder",
+            code=ErrorCode.NO_DATA,
         )
     plane = ("y", "x")
     data = {"label": _described(plane, done.labels, "1", "number of the patch that holds the pixel, 0 for none")}
     if done.interior is not None:
         data["interior"] = _described(plane, done.interior, "1", "True where the pixel is used for the patch's numbers")
     data |= _table(done) | _band_table(done.segments)
-    told = {key: done.materials[key] for key in ("library", "model") if done.materials.get(key)}
-    return xarray.Dataset(data, _axes(done) | _patch_axes(done), provenance(done) | told)
+    naming = {key: done.materials[key] for key in ("library", "model") if done.materials.get(key)}
+    return xarray.Dataset(data, _axes(done) | _patch_axes(done), provenance(done) | naming)
 
 
 def _patch_axes(done: ProcessedScan) -> dict[str, Any]:
@@ -194,7 +195,7 @@ def _patch_axes(done: ProcessedScan) -> dict[str, Any]:
 
 
 def _table(done: ProcessedScan) -> dict[str, Any]:
-    """Variables on dimension `patch`."""
+    """Return the variables on dimension `patch`."""
     c = material_columns(done)
     second = [_runner_up(s) for s in done.segments]
     inverse = _numbers(c["inverse_p_standard_error"])
@@ -230,14 +231,14 @@ def _table(done: ProcessedScan) -> dict[str, Any]:
 
 
 def _runner_up(segment: dict[str, Any]) -> tuple[str | None, float | None]:
-    """The likeliest material beside the patch's own and its probability; without those, by the share of its pixels."""
+    """Return the second most probable material and its probability (without probabilities: share of pixels)."""
     every = segment.get("probabilities") or segment.get("votes") or {}
     others = {name: share for name, share in every.items() if name != segment.get("name")}
     return max(others.items(), key=lambda item: item[1], default=(None, None))
 
 
 def _band_table(segments: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Variables on dimensions `patch`, `band`; empty unless every patch was imaged in sub-bands."""
+    """Return the variables on dimensions `patch`, `band`; empty unless every patch has sub-bands."""
     bands = [s.get("bands") for s in segments]
     if not bands or any(b is None for b in bands):
         return {}
@@ -258,9 +259,9 @@ def _band_table(segments: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def full_dataset(done: ProcessedScan) -> xarray.Dataset:
-    """Everything in one dataset: :func:`image_dataset`, and :func:`patch_dataset` where materials were looked for.
+    """Return :func:`image_dataset` and, if there are materials, :func:`patch_dataset` in one dataset.
 
-    The attribute `instrument` holds the rig file as JSON.
+    The attribute `instrument` is the rig file as JSON.
     """
     made = image_dataset(done)
     if done.metal_referenced:

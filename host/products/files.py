@@ -1,7 +1,7 @@
-"""The files of a processed scan, written and read back: the one place that knows their names and content.
+"""Files of a processed scan: names and content of image.npz, materials.json, quality.json and scan.json.
 
-image.npz, materials.json, quality.json and scan.json are written here, each whole or not at all. `SavedProducts` reads
-a folder of them; `find_products` finds the folder.
+Files are written atomically. `find_products` finds a folder of products, `SavedProducts` reads its files, without names
+and permittivities if the verdict is "no result" (`withhold`). Formats: docs/spec/products.md.
 """
 
 from __future__ import annotations
@@ -23,26 +23,32 @@ import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages
 from polysight.host.materials import PATCHES, ScanPatches, read_patches
-from polysight.host.products.withhold import withhold
 from polysight.host.store import Scan, open_npz, versions
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, no_such
 from polysight.shared.files import named, open_to_write, read_json
 from polysight.shared.tables import decode, to_builtins
 
 SCAN = "scan.json"
 IMAGE, QUALITY, MATERIALS, LABELS = "image.npz", "quality.json", "materials.json", "labels.json"
-FINISHED = ".finished.json"  # says what the products were made with, when several scans are processed
+FINISHED = ".finished.json"  # settings of the products, written by batch processing
 _OPTIONAL = ("p_sigma",)  # arrays of image.npz that earlier releases did not write
-_PRODUCTS = "products"  # of a scan folder
+_PRODUCTS = "products"  # in a scan folder
+_NOTHING: dict[str, Any] = {
+    "name": None,
+    "confidence": None,
+    "permittivity": None,
+    "ratio": None,
+    "votes": {},
+    "probabilities": {},
+    "why": "",
+}
 
 
-def fresh_part(path: Path) -> Path:
-    """The temporary name beside a file or folder to be made; whatever an ended program, or a link, left there is gone.
-
-    Raises OSError.
-    """
+def temporary_path(path: Path) -> Path:
+    """Return a temporary path beside a file or folder to be written; delete leftovers there. Raises OSError."""
     part = path.with_name(f".{path.name}.part")
     if part.is_dir() and not part.is_symlink():
         shutil.rmtree(part)
@@ -52,7 +58,7 @@ def fresh_part(path: Path) -> Path:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name beside it, flush it to disk, then take its place."""
+    """Write a file under a temporary name, flush it to disk, and rename it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
     with named(path), open_to_write(part) as f:
@@ -74,19 +80,18 @@ def write_image(
 ) -> None:
     """Write image.npz: h, v, p complex64 [ny, nx], x_m, y_m float64, valid bool; row 0 is the smallest y.
 
-    `p_sigma` float32 [ny, nx] is the standard deviation of the complex p, not a number where it is not known; without,
-    the file does not hold it.
+    `p_sigma` float32 [ny, nx] is the standard deviation of the complex p, NaN where unknown; None leaves it out.
 
     Raises
     ------
     DataError
-        when shapes do not fit each other.
+        if the shapes do not agree.
     """
     shape = (np.size(y_m), np.size(x_m))
     more: dict[str, Any] = {} if p_sigma is None else {"p_sigma": p_sigma.astype(np.float32)}
     for name, array in (("h", h), ("v", v), ("p", p), ("valid", valid), *more.items()):
         if array.shape != shape:
-            raise DataError(f"image {name} has shape {array.shape}, axes say {shape}")
+            raise DataError(f"image {name} has shape {array.shape}, the axes {shape}", code=ErrorCode.MISMATCH)
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -102,7 +107,7 @@ def write_image(
 
 
 def read_image(path: Path) -> dict[str, npt.NDArray]:
-    """Read image.npz (no pickle); `p_sigma` only where the file holds it. Raises DataError."""
+    """Read image.npz (no pickle), with `p_sigma` if the file has it. Raises DataError."""
     names = ("h", "v", "p", "x_m", "y_m", "valid")
     try:
         with open_npz(path) as z:
@@ -110,29 +115,33 @@ def read_image(path: Path) -> dict[str, npt.NDArray]:
         _check_image(image)
         return image
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
-        raise DataError(f"{path}: not an image product: {e}", "made by polysight process or image") from None
+        raise DataError(
+            f"{path}: not an image product: {e}",
+            "it was not written by polysight process or image",
+            code=ErrorCode.FILE_DAMAGED,
+        ) from None
 
 
 def _check_image(image: dict[str, npt.NDArray]) -> None:
-    """Refuse arrays that do not belong together. Raises ValueError."""
+    """Raise ValueError if types or shapes of the arrays are wrong."""
     shape = image["y_m"].size, image["x_m"].size
     if min(shape) < 2:
-        raise ValueError(f"an image has two pixels at least each way, not {shape[1]} x {shape[0]}")
+        raise ValueError(f"an image has at least 2 x 2 pixels, not {shape[1]} x {shape[0]}")
     for name, array in image.items():
         if array.dtype.kind not in "cfb":
             raise ValueError(f"{name} holds {array.dtype}, not numbers")
         if name not in ("x_m", "y_m") and array.shape != shape:
-            raise ValueError(f"{name} is {' x '.join(map(str, array.shape))}, x_m and y_m say {shape[0]} x {shape[1]}")
+            raise ValueError(f"{name} is {' x '.join(map(str, array.shape))}, x_m and y_m are {shape[0]} x {shape[1]}")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write materials.json or quality.json: strict JSON, so infinities and not-a-numbers become null."""
+    """Write a JSON file; infinite values and NaN become null."""
     text = json.dumps(plain(content), indent=1, allow_nan=False, ensure_ascii=False)
     write_atomically(path, (text + "\n").encode("utf-8"))
 
 
 def plain(value: Any) -> Any:
-    """A value as strict JSON types: numpy scalars and arrays unpacked, complex as {real, imag}, not finite as None."""
+    """Convert a value to strict JSON types: numpy to Python, complex to {real, imag}, not finite to None."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -151,7 +160,7 @@ def plain(value: Any) -> Any:
 
 
 def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
-    """Gain and phase of each RX against its board's first one, by board: from the direct path, divided out."""
+    """Return gain and phase of each RX relative to its board's first, by board, as divided out of the images."""
     out = {}
     for board, gains in images.rx_calibration.items():
         relative = gains / gains[0]
@@ -162,7 +171,7 @@ def rx_gains(images: ChannelImages) -> dict[str, list[dict[str, float]]]:
 
 
 def scan_facts(source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
-    """Content of scan.json. `rig` is the one the images were made with."""
+    """Return the content of scan.json; `rig` is the rig that the images were formed with."""
     return {
         "scan_id": source.scan_id,
         "simulated": source.simulated,
@@ -174,27 +183,46 @@ def scan_facts(source: Scan, rig: Instrument, images: ChannelImages) -> dict[str
 
 
 def write_scan_facts(out: Path, source: Scan, rig: Instrument, images: ChannelImages) -> dict[str, Any]:
-    """Write scan.json, and return its content, see :func:`scan_facts`."""
+    """Write scan.json and return its content, see :func:`scan_facts`."""
     facts = scan_facts(source, rig, images)
     write_json(out / SCAN, facts)
     return facts
 
 
+def withhold(materials: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of materials.json without results that the verdict does not support.
+
+    If the verdict is `none`, each patch keeps only its position and size: name, measured values and truth become null;
+    sub-bands and pixel accuracy are removed. Otherwise the content is returned unchanged. Processing writes the files
+    this way; readers apply it again, in case another program wrote them.
+    """
+    verdict = read_verdict(materials)
+    segments = materials.get("segments")
+    if verdict is None or verdict.usable or not isinstance(segments, list):
+        return materials
+    return {**materials, "pixel_accuracy": None, "segments": [_bare(s) for s in segments]}
+
+
+def _bare(segment: dict[str, Any]) -> dict[str, Any]:
+    hidden = _NOTHING | {key: None for key in ("truth", "inverse_ratio_std", "metal_like") if key in segment}
+    return {key: value for key, value in segment.items() if key != "bands"} | hidden
+
+
 @dataclass(frozen=True)
 class SavedProducts:
-    """A folder of products. Each file is read when it is first asked for, and raises DataError when it cannot be.
+    """A folder of products. Each file is read at first use; reading raises DataError if it is damaged.
 
     Attributes
     ----------
     folder
-        The products' folder, also when a scan folder was given.
+        Folder of the products, also if a scan folder was given.
     """
 
     folder: Path
 
     @cached_property
     def image(self) -> dict[str, npt.NDArray[Any]]:
-        """Arrays of image.npz, see :func:`polysight.host.report.write_image`."""
+        """Arrays of image.npz, see :func:`write_image`."""
         return read_image(self.folder / IMAGE)
 
     @property
@@ -224,40 +252,40 @@ class SavedProducts:
 
     @property
     def valid(self) -> npt.NDArray[np.bool_]:
-        """Pixels that the scan illuminates, bool [ny, nx]."""
+        """Pixels illuminated by the scan, bool [ny, nx]."""
         return self.image["valid"]
 
     @cached_property
     def materials(self) -> dict[str, Any]:
-        """Content of materials.json as it may be shown (:func:`withhold`); empty when no material was looked for."""
+        """Content of materials.json, see :func:`withhold`; empty if only images were made."""
         return withhold(_json(self.folder / MATERIALS))
 
     @cached_property
     def quality(self) -> dict[str, Any]:
-        """Content of quality.json; empty when there is none."""
+        """Content of quality.json; empty without the file."""
         return _json(self.folder / QUALITY)
 
     @cached_property
     def scan(self) -> dict[str, Any]:
-        """Content of scan.json: scan_id, simulated, versions, instrument, rx_gains; empty when there is none."""
+        """Content of scan.json: scan_id, simulated, versions, instrument, rx_gains; empty without the file."""
         return _json(self.folder / SCAN)
 
     @cached_property
     def patches(self) -> ScanPatches:
-        """Pixels of the patches, of patches.npz."""
+        """Pixels of the patches, from patches.npz."""
         return read_patches(self.folder / PATCHES)
 
     @property
     def segments(self) -> list[dict[str, Any]]:
-        """Patches as materials.json has them; none when no material was looked for."""
+        """Patches in materials.json; empty if only images were made."""
         found = self.materials.get("segments", [])
         if not isinstance(found, list):
-            raise _damaged(self.folder / MATERIALS, "its segments are no list")
+            raise _damaged(self.folder / MATERIALS, "its segments are not a list")
         return list(found)
 
     @property
     def verdict(self) -> Verdict | None:
-        """How far the result may be trusted; None in products of earlier releases."""
+        """Verdict on the results; None in products of earlier releases."""
         return read_verdict(self.materials) or read_verdict(self.quality)
 
     @property
@@ -267,17 +295,17 @@ class SavedProducts:
 
     @property
     def simulated(self) -> bool | None:
-        """Whether the data was simulated; None when nothing says."""
+        """True if the data was simulated; None if unknown."""
         return self.scan.get("simulated", self.materials.get("simulated"))
 
     @property
     def scan_id(self) -> str:
-        """The scan's name; "" when nothing says."""
+        """Name of the scan; "" if unknown."""
         return str(self.scan.get("scan_id", self.materials.get("scan_id", "")))
 
     @property
     def chirp(self) -> Chirp | None:
-        """The chirp the products were made with, of the rig file in scan.json; None when nothing says."""
+        """Chirp of the products, from the rig file in scan.json; None if unknown."""
         rig = self.scan.get("instrument")
         if rig is None:
             return None
@@ -285,14 +313,11 @@ class SavedProducts:
         try:
             return decode(rig["chirp"], Chirp, f"{path}: instrument.chirp")
         except (ConfigError, KeyError, TypeError) as e:
-            raise _damaged(path, e.what if isinstance(e, ConfigError) else "it holds no chirp") from None
+            raise _damaged(path, e.what if isinstance(e, ConfigError) else "it has no chirp") from None
 
 
 def find_products(folder: Path, needs: str = IMAGE) -> SavedProducts | None:
-    """A folder that `polysight process` or `image` wrote, or the scan folder that has it as `products`.
-
-    None when neither holds the product `needs`.
-    """
+    """Find products in a folder, or in `products` of a scan folder; None if the file `needs` is in neither."""
     for found in (folder, folder / _PRODUCTS):
         if (found / needs).exists():
             return SavedProducts(found)
@@ -300,7 +325,7 @@ def find_products(folder: Path, needs: str = IMAGE) -> SavedProducts | None:
 
 
 def read_products(folder: Path, needs: str = IMAGE) -> SavedProducts:
-    """What :func:`find_products` finds. Raises DataError when that is nothing."""
+    """Return the products that :func:`find_products` finds. Raises DataError if there are none."""
     if found := find_products(folder, needs):
         return found
     if not folder.exists():
@@ -309,11 +334,12 @@ def read_products(folder: Path, needs: str = IMAGE) -> SavedProducts:
         f"{folder}: no {needs}",
         "the folder is wrong, the scan was not processed" + ("" if needs == IMAGE else ", or only to images"),
         "give a folder that polysight process" + (" or polysight image wrote" if needs == IMAGE else " wrote"),
+        code=ErrorCode.FILE_MISSING,
     )
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """Content of a JSON file; empty when it is absent."""
+    """Read a JSON file; empty if it is missing."""
     try:
         content = read_json(path)
     except FileNotFoundError:
@@ -326,4 +352,9 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def _damaged(path: Path, what: str) -> DataError:
-    return DataError(f"{path}: cannot be read: {what}", "it was changed or damaged", "process the scan again")
+    return DataError(
+        f"{path}: cannot be read: {what}",
+        "it was changed or damaged",
+        "process the scan again",
+        code=ErrorCode.FILE_DAMAGED,
+    )

@@ -1,4 +1,4 @@
-"""The table of materials: one column a quantity, one entry a patch, as every export has it."""
+"""Table of materials for all exports: one column per quantity, one entry per patch."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ _COLUMNS = (
 
 
 class HasSegments(Protocol):
-    """Anything with patches as materials.json lists them."""
+    """An object with the patches of materials.json."""
 
     @property
     def segments(self) -> list[dict[str, Any]]:
-        """One dict a patch."""
+        """One dict per patch."""
         ...
 
 
 @dataclass(frozen=True)
 class PermittivitySpread:
-    """Error of a permittivity eps' - j eps'': standard deviations of both parts, and how they go together.
+    """Error of a permittivity eps' - j eps''.
 
     Attributes
     ----------
     real_std, loss_std
-        Of eps' and of eps''.
+        Standard deviations of eps' and eps''.
     covariance
-        Of eps' and eps''; None in products of earlier releases, which have standard errors only.
+        Covariance of eps' and eps''; None in products of earlier releases.
     """
 
     real_std: float
@@ -46,15 +46,15 @@ class PermittivitySpread:
 
     @property
     def matrix(self) -> npt.NDArray[np.float64]:
-        """Covariance of (eps', eps''), [2, 2]; both count as independent where their covariance is not known."""
+        """Covariance matrix of (eps', eps''), [2, 2]; diagonal if the covariance is unknown."""
         c = self.covariance or 0.0
         return np.array([[self.real_std**2, c], [c, self.loss_std**2]])
 
 
 def permittivity_spread(permittivity: Mapping[str, Any] | None) -> PermittivitySpread | None:
-    """Error of a segment's `permittivity`; None where it is not known.
+    """Return the error of a segment's `permittivity`; None if unknown.
 
-    `covariance` of materials.json is that of (real, imag), and the loss is -imag: the sign of its mixed term changes.
+    `covariance` in materials.json refers to (real, imag). The loss is -imag, so the off-diagonal term changes sign.
     """
     e = permittivity or {}
     given = e.get("covariance")
@@ -66,18 +66,18 @@ def permittivity_spread(permittivity: Mapping[str, Any] | None) -> PermittivityS
 
 
 def refused_text(segment: Mapping[str, Any]) -> str:
-    """Why a patch has no name and no permittivity, and what to do, in one line; "" where it was judged."""
+    """Return why a patch has no result, and the remedy, in one line; "" if it has one."""
     refused = segment.get("refused") or {}
     head = ": ".join(part for part in (refused.get("what"), refused.get("why")) if part)
     return "; ".join(part for part in (head, refused.get("do")) if part)
 
 
 def material_columns(products: HasSegments) -> dict[str, list[Any]]:
-    """Columns by name, an entry for each patch; None where a number is not known.
+    """Return the columns by name, with one entry per patch; None for unknown values.
 
-    Permittivity is `permittivity_real` - j `permittivity_loss`; `permittivity_real_loss_covariance` is of these two,
-    `dominated_by` what most of the error comes from, `refused` why a patch was not judged, `drawn_as` what its box was
-    called. p_imag and p_phase are those of P = H / V relative to metal; positions count from the image's centre.
+    Permittivity is `permittivity_real` - j `permittivity_loss`; `dominated_by` is the largest source of its error,
+    `refused` the reason why a patch has no result, `drawn_as` the name of its box drawn by hand. `p_...` refer to
+    P = H / V relative to metal; positions are relative to the image centre.
     """
     rows = [_row(segment) for segment in products.segments]
     return {name: [row[name] for row in rows] for name in _COLUMNS}

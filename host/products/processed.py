@@ -1,4 +1,4 @@
-"""A processed scan in memory: the content of its product files, read from a folder or just computed."""
+"""A processed scan in memory, read from a folder of products or just computed."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import numpy.typing as npt
 import skimage
 
 from polysight.host.materials import PATCHES, axis_mm, box_mask
-from polysight.host.products.files import SavedProducts
-from polysight.host.products.withhold import withhold
+from polysight.host.products.files import SavedProducts, withhold
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Instrument
 from polysight.shared.tables import decode
@@ -30,7 +29,7 @@ class Rows:
     planned
         Number of rows in the plan.
     committed
-        Indices of the rows that hold data, ascending.
+        Indices of the rows with data, ascending.
     """
 
     planned: int
@@ -43,25 +42,25 @@ class Rows:
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Indices of the planned rows that hold no data."""
+        """Indices of the planned rows without data."""
         return tuple(sorted(set(self.indices) - set(self.committed)))
 
 
 @dataclass(frozen=True)
 class ProcessedScan:
-    """Result of processing a scan, in memory: the content of its product files.
+    """Content of the product files of a scan, in memory.
 
     Attributes
     ----------
     image
-        `h`, `v`, `p` complex64 [ny, nx], `valid` bool [ny, nx], `x_m`, `y_m` float64, where known `p_sigma` float32
-        [ny, nx]: image.npz.
+        Arrays of image.npz: `h`, `v`, `p` complex64 [ny, nx], `valid` bool [ny, nx], `x_m`, `y_m` float64, and if
+        known `p_sigma` float32 [ny, nx].
     scan, quality, materials
         Content of scan.json, quality.json and materials.json. Without materials the image is not metal-referenced.
     labels
-        int32 [ny, nx]: number of the patch that holds each pixel, 0 for none.
+        int32 [ny, nx]: patch number of each pixel, 0 for none.
     interior
-        bool [ny, nx]: pixels that the patches' statistics are made from; None when not known.
+        bool [ny, nx]: pixels used for the patches' statistics; None if unknown.
     """
 
     image: dict[str, npt.NDArray[Any]]
@@ -73,12 +72,12 @@ class ProcessedScan:
 
     @property
     def segments(self) -> list[dict[str, Any]]:
-        """Patches as materials.json lists them; without names and permittivities where the verdict is `none`."""
+        """Patches in materials.json, see :func:`withhold`."""
         return list(withhold(self.materials).get("segments", []))
 
     @property
     def verdict(self) -> Verdict | None:
-        """How far the result may be trusted; None in products of earlier releases."""
+        """Verdict on the results; None in products of earlier releases."""
         return read_verdict(self.materials) or read_verdict(self.quality)
 
     @property
@@ -88,23 +87,23 @@ class ProcessedScan:
 
     @property
     def scan_id(self) -> str:
-        """Name of the scan; "" when it is not known."""
+        """Name of the scan; "" if unknown."""
         return str(self.scan.get("scan_id", self.materials.get("scan_id", "")))
 
     @property
     def simulated(self) -> bool | None:
-        """True if the data was simulated; None when it is not known."""
+        """True if the data was simulated; None if unknown."""
         return self.scan.get("simulated", self.materials.get("simulated"))
 
     @cached_property
     def rig(self) -> Instrument | None:
-        """Rig file the images were made with; None when it is not known. Raises ConfigError."""
+        """Rig of the images; None if unknown. Raises ConfigError."""
         raw = self.scan.get("instrument")
         return None if raw is None else decode(raw, Instrument, f"scan.json of {self.scan_id}: instrument")
 
     @property
     def rows(self) -> Rows | None:
-        """Rows of the scan and those in the images; None when they are not known."""
+        """Planned rows and rows in the images; None if unknown."""
         boards = self.quality.get("boards", {}).values()
         if self.rig is None or not boards or any("rows_recorded" not in b for b in boards):
             return None
@@ -115,14 +114,14 @@ class ProcessedScan:
 
 
 def read_processed(products: SavedProducts) -> ProcessedScan:
-    """Read a folder of products. Raises DataError when a file is damaged."""
+    """Read a folder of products. Raises DataError if a file is damaged."""
     image = products.image
     labels, interior = _saved_patches(products)
     return ProcessedScan(image, products.scan, products.quality, products.materials, labels, interior)
 
 
 def _saved_patches(products: SavedProducts) -> tuple[Labels, Mask | None]:
-    """Labels from the patches' outlines, accurate to half a pixel, and the interiors from patches.npz."""
+    """Return labels from the patches' outlines (accurate to half a pixel) and interiors from patches.npz."""
     x, y = axis_mm(products.x_m), axis_mm(products.y_m)
     labels = np.zeros((y.size, x.size), np.int32)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -144,5 +143,5 @@ def _saved_patches(products: SavedProducts) -> tuple[Labels, Mask | None]:
 
 
 def _nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
-    """Indices of the axis values nearest to `places`; the axis is evenly spaced."""
+    """Return the indices of the nearest values of an evenly spaced axis."""
     return np.rint((places - axis[0]) / (axis[1] - axis[0])).astype(np.intp)

@@ -1,9 +1,11 @@
-"""What a row needs of the radars: to be armed for its pulses, and to say how they are.
+"""Configure radars, arm them for the pulses of a row, and report their state.
 
-`radar_control` gives the backend that the rig file names: `RadarControl` with nothing to do, a line server a board, or
-`NativeRadars`, which configures and arms AWR2243 boards over USB (`board`, `bring_up`, `program`, `commands`,
-mmWaveLink in `messages` and `spi`, the USB chip in `usb`, `firmware`). `constraints` checks a rig file against what the
-chip can do. For a board's first days: `check_board`, and `TracedWords` with `ReplayedWords`.
+`radar_control` returns the backend that the rig file selects, a `RadarControl`: `Endless` (radars that another program
+started), `LineServers` (a control server for each board), or `NativeRadars`, which configures AWR2243 boards over USB.
+The latter runs a `RadarBoard` for each board, with the steps of `bring_up` and the commands of `program`; mmWaveLink
+messages (`messages`, `spi`) go through the FT4232H chip (`usb`). `constraints` checks a rig file against the limits of
+the AWR2243. `check_board` shows the bring-up of one board step by step; `TracedWords` logs its traffic, and
+`ReplayedWords` replays such a trace.
 """
 
 from polysight.host.radar.backends import radar_control

@@ -1,11 +1,9 @@
-"""The simple radar backends, and `radar_control`, which makes the backend that a rig file names.
+"""The backends `Endless` and `LineServers`, and `radar_control`, which creates the backend of a rig file.
 
-`LineServers` re-arms radars for each row over TCP: one server a board takes the line `Retrigger` and never answers.
-That is how the published rig does it: a MATLAB server beside mmWave Studio configures a radar for the frames of one
-row, and starts it again at each line. What can be known here is that the server's machine took the line (its kernel
-acknowledged it). Whether the server read it, and the radar obeyed, shows by the data of the row.
-
-`Endless` is for radars that were started once and need nothing for a row. `native.py` holds the third backend.
+`LineServers` re-arms the radars for each row over TCP: a server for each board receives the line `Retrigger` and never
+replies. The published rig works so: a MATLAB server beside mmWave Studio configures a radar for the frames of one row,
+and restarts it at each line. The kernel of the server's machine acknowledges the line; only the data of the row shows
+that the server read it and that the radar started.
 """
 
 from __future__ import annotations
@@ -24,27 +22,18 @@ from polysight.shared.config import Instrument
 from polysight.shared.errors import DeviceError
 
 LINE = b"Retrigger\n"
-_LOOK_MS = 5
-_START = (
+_POLL_MS = 5
+_START_SERVER = (
     "start the control server of this board (beside mmWave Studio), or correct radar.servers in instrument.toml"
-    " (a scan that was begun: `polysight resume SCAN --config instrument.toml`)"
+    " (then continue the scan: `polysight resume SCAN --config instrument.toml`)"
 )
 
 
 class LineServers(RadarControl):
-    """One connection a board, kept open from row to row, and made anew when its server has closed it.
+    """A connection to each board's control server, kept open between rows, and reopened if its server closed it.
 
-    Parameters
-    ----------
-    servers
-        `address:port` of each board's server, by board name.
-    timeout_s
-        For connecting, and for the line to be acknowledged.
-
-    Raises
-    ------
-    DeviceError
-        when a server cannot be reached.
+    `servers` has the `address:port` of each board's server; `timeout_s` limits connecting, and the acknowledgement of a
+    line. Raises DeviceError if a server cannot be reached.
     """
 
     def __init__(self, servers: Mapping[str, str], timeout_s: float) -> None:
@@ -60,10 +49,9 @@ class LineServers(RadarControl):
             raise
 
     def arm(self, frames: int) -> None:
-        """Send every board's server the line, and wait until its machine has it.
+        """Send the line to every server and wait for the acknowledgement of its machine. Raises DeviceError.
 
-        `frames` is for the server's own configuration to know. A connection that its server resets meanwhile shows in
-        :meth:`states`. Raises DeviceError.
+        The number of frames is set in the server's own configuration. `states` reports connections that were reset.
         """
         del frames
         self._reset.clear()
@@ -76,8 +64,8 @@ class LineServers(RadarControl):
             except BlockingIOError:
                 raise DeviceError(
                     f"{board}: its control server at {self._servers[board]} does not read its lines",
-                    "the program there hangs: what was sent to it for many rows fills its connection",
-                    "start it again, then `polysight resume SCAN`",
+                    "the program there hangs: the lines of many rows fill its connection",
+                    "restart it, then `polysight resume SCAN`",
                 ) from None
             except ConnectionError:
                 self._reset.add(board)
@@ -86,14 +74,14 @@ class LineServers(RadarControl):
             self._wait_taken(board, deadline)
 
     def states(self) -> dict[str, BoardState]:
-        """`FAULT` of boards whose server has reset the connection; else unknown, with where they were asked."""
+        """Return `FAULT` for boards whose server reset the connection, otherwise `UNKNOWN` with its address."""
         found = {}
         for board, address in self._servers.items():
             self._is_closed(board)
             found[board] = (
                 BoardState(RadarState.FAULT, f"its control server at {address} reset the connection")
                 if board in self._reset
-                else BoardState(RadarState.UNKNOWN, f"asked to re-arm at {address}, which never answers")
+                else BoardState(RadarState.UNKNOWN, f"re-armed through {address}, which never replies")
             )
         return found
 
@@ -118,7 +106,7 @@ class LineServers(RadarControl):
         self._sockets[board] = connection
 
     def _is_closed(self, board: str) -> bool:
-        """Whether the server has ended the connection, in order or by a reset; what it may have sent is dropped."""
+        """Return True if the server closed or reset the connection; data that it sent is discarded."""
         try:
             while self._sockets[board].recv(4096):
                 pass
@@ -129,16 +117,16 @@ class LineServers(RadarControl):
         return True
 
     def _wait_taken(self, board: str, deadline: float) -> None:
-        """Until the other machine has acknowledged the line, or the connection is gone."""
+        """Wait until the other machine acknowledged the line, or the connection ended."""
         connection = self._sockets[board]
         ended = select.poll()
         ended.register(connection, 0)  # a reset, or the end of both directions
         while _unacknowledged(connection):
-            if ended.poll(_LOOK_MS):
+            if ended.poll(_POLL_MS):
                 return
             if time.monotonic() > deadline:
                 raise DeviceError(
-                    f"{board}: its control server at {self._servers[board]} has not taken the line within"
+                    f"{board}: its control server at {self._servers[board]} did not acknowledge the line within"
                     f" {self._timeout_s:g} s",
                     "the connection is half-open: that machine was switched off, or the network is cut",
                     "check that machine and the cable, then `polysight resume SCAN`",
@@ -147,34 +135,38 @@ class LineServers(RadarControl):
     def _unreachable(self, board: str, e: OSError) -> DeviceError:
         what = f"{board}: cannot reach its control server at {self._servers[board]}"
         if isinstance(e, ConnectionRefusedError):
-            return DeviceError(f"{what}: connection refused", "that machine is there, but no server listens", _START)
+            return DeviceError(
+                f"{what}: connection refused", "that machine is running, but no server listens", _START_SERVER
+            )
         if isinstance(e, TimeoutError):
             return DeviceError(
                 f"{what} within {self._timeout_s:g} s",
                 "that machine is off, or a firewall drops the connection",
-                _START,
+                _START_SERVER,
             )
-        return DeviceError(f"{what}: {e.strerror or e}", "the address is wrong, or there is no route to it", _START)
+        return DeviceError(
+            f"{what}: {e.strerror or e}", "the address is wrong, or there is no route to it", _START_SERVER
+        )
 
 
 def _unacknowledged(connection: socket.socket) -> int:
-    """Bytes sent that the other side's kernel has not acknowledged (SIOCOUTQ, tcp(7))."""
+    """Return the sent bytes that the other kernel has not acknowledged (SIOCOUTQ, tcp(7))."""
     return struct.unpack("=i", fcntl.ioctl(connection, termios.TIOCOUTQ, b"\0\0\0\0"))[0]
 
 
 class Endless(RadarControl):
-    """Radars that were started once, with frames without end: nothing has to be done for a row."""
+    """Radars that another program started with an infinite number of frames; nothing is done for a row."""
 
     def arm(self, frames: int) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def states(self) -> dict[str, BoardState]:
-        """Nobody tells."""
+        """Return no states; they are not known."""
         return {}
 
 
 def radar_control(instrument: Instrument) -> RadarControl:
-    """Reach the radars of a rig as its file says. Raises ConfigError, DeviceError."""
+    """Connect to the radars of a rig with the backend of its file. Raises ConfigError, DeviceError."""
     if instrument.radar.control == "line_server":
         return LineServers(instrument.radar.servers, instrument.limits.command_timeout_s)
     if instrument.radar.control == "native":

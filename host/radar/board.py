@@ -1,19 +1,19 @@
-"""One radar board's states, from off to frames ended, and what brings it from one to the next.
+"""State machine of one radar board, from off to frames ended.
 
-`ARMED` only when the radar has said that it waits for triggers, `DONE` only when it has said that its frames have
-ended. A fatal event is `FAULT`, which only a reset leaves. Not run on hardware yet.
+A board is `ARMED` only after the radar reported that it waits for triggers, and `DONE` only after it reported the end
+of its frames. A fatal event leads to `FAULT`, which only a reset leaves. Not run on hardware yet.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import Enum
 from typing import Any
 
 from polysight.host.radar import commands as c
 from polysight.host.radar import events as e
-from polysight.host.radar import lab_commands as lab
 from polysight.host.radar.bring_up import BringUp, Step, data_of
 from polysight.host.radar.calibration_data import CalibrationFiles
 from polysight.host.radar.firmware import Image
@@ -21,13 +21,13 @@ from polysight.host.radar.program import Program
 from polysight.host.radar.spi import Clock, Link, WordLink
 from polysight.shared.errors import DeviceError, PolysightError
 
-_READY_S = 1.0
-_MOST_EVENTS = 1000
+_READY_TIMEOUT_S = 1.0
+_MAX_EVENTS = 1000
 _SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")
 
 
 class State(Enum):
-    """Where a board is."""
+    """State of a board."""
 
     OFF = "off"
     POWERED = "powered: main and RF core are up"
@@ -52,25 +52,25 @@ TRANSITIONS: Mapping[State, frozenset[State]] = {
 
 
 class RadarBoard:
-    """One board behind a word link.
+    """One board, reached through a word link.
 
     Parameters
     ----------
     firmware
-        Downloaded to the device's RAM at each start; None: what its flash holds.
+        Image that is downloaded to RAM at each start; None: use the flash.
     die_id
-        The only board that is accepted; "" for any.
+        Required die id; "" accepts any board.
     calibration
-        Where what its RF init found is kept for its next starts; None: it calibrates anew each time.
+        Files of RF init results for later starts; None: calibrate at each start.
 
     Attributes
     ----------
     reason
-        Why it is in `FAULT`.
+        Cause of the state `FAULT`.
     facts
-        What it said of itself: versions, die id, temperatures, calibration.
+        Versions, die id, temperatures and calibration, as reported by the board.
     steps
-        Of its last bring-up, in order.
+        Steps of the last bring-up, in order.
     """
 
     def __init__(
@@ -96,23 +96,20 @@ class RadarBoard:
 
     @property
     def state(self) -> State:
-        """Where the board is, as far as it was read."""
+        """Last known state."""
         return self._state
 
     @property
     def warnings(self) -> list[str]:
-        """What went wrong on the link and was mended, since the last report."""
+        """Errors of the link that a retry corrected, since the last report."""
         return self._link.warnings[:]
 
     def configure(self, on_step: Callable[[Step, str], None] | None = None) -> None:
-        """From wherever it is, by a reset, to `CONFIGURED`; `on_step` is told each step and what came of it.
+        """Reset and configure the board, from any state; call `on_step` with each step and its outcome.
 
-        Raises
-        ------
-        DeviceError, ConfigError
-            naming the step that failed; the board is then in `FAULT`.
+        Raises DeviceError or ConfigError for the step that failed; the board is then in `FAULT`.
         """
-        with _Failing(self):
+        with self._fault_on_error():
             up = self._begin()
             stages = (
                 (up.power_steps(), State.POWERED),
@@ -120,28 +117,28 @@ class RadarBoard:
                 (up.waveform_steps(), State.CONFIGURED),
             )
             self.steps = [step for steps, _ in stages for step in steps]
-            for steps, then in stages:
+            for steps, state in stages:
                 for step in steps:
                     try:
-                        came = step.run()
+                        outcome = step.run()
                     except DeviceError as error:
-                        raise up.blame(error) from None
+                        raise up.with_ignored(error) from None
                     if on_step is not None:
-                        on_step(step, came)
-                self._to(then)
+                        on_step(step, outcome)
+                self._to(state)
 
     def write_flash(self, image: Image, progress: Callable[[int, int], None]) -> str:
-        """Write firmware to the board's flash, start from it and verify; returns what it holds now.
+        """Write firmware to the board's flash, start from it and verify; return a description of the flash.
 
-        `progress` is told parts sent and in all. The board is `OFF` afterwards. Raises DeviceError, ConfigError.
+        `progress` is called with the parts sent and their total. The board is `OFF` afterwards. Raises DeviceError,
+        ConfigError.
         """
-        with _Failing(self):
+        with self._fault_on_error():
             up = self._begin()
             try:
-                told = up.write_flash(image, progress)
+                return up.write_flash(image, progress)
             except DeviceError as error:
-                raise up.blame(error) from None
-        return told
+                raise up.with_ignored(error) from None
 
     def _begin(self) -> BringUp:
         if self._state is not State.OFF:
@@ -154,20 +151,15 @@ class RadarBoard:
         )  # fmt: skip
 
     def arm(self, frames: int) -> None:
-        """Count out frames and start them, until the radar has said that it waits for their triggers.
+        """Start `frames` frames and wait until the radar reports that it waits for their triggers.
 
-        A board that failed, or was never configured, is configured first; frames still awaited from before are
-        stopped.
-
-        Raises
-        ------
-        DeviceError
-            when it does not get there; the board is then in `FAULT`.
+        A failed or unconfigured board is configured first; frames that still wait for triggers are stopped. Raises
+        DeviceError; the board is then in `FAULT`.
         """
         self.poll()
         if self._state in (State.OFF, State.FAULT):
             self.configure()
-        with _Failing(self):
+        with self._fault_on_error():
             if self._state in (State.ARMED, State.RUNNING):
                 self._stop()
             if self._state is State.FAULT:
@@ -180,26 +172,23 @@ class RadarBoard:
                 self._set_frames(frames, c.HARDWARE_TRIGGER)
                 self._frames = frames
             self._link.call(c.FrameControl(c.START))
-            self._wait(e.TRIGGER_READY, _READY_S)
+            self._wait(e.TRIGGER_READY, _READY_TIMEOUT_S)
             if self._state is State.DONE:
                 raise DeviceError(
-                    f"{self.name}: says that its frames ended as soon as it was armed, before any pulse was sent",
-                    "pulses on SYNC_IN from elsewhere (DCA1000 through R62, noise), or a late report of earlier ones",
-                    "look at SYNC_IN while nothing is sent (docs/how-to/wiring.md); the row is taken again",
+                    f"{self.name}: reported the end of its frames right after it was armed, before any pulse",
+                    "pulses on SYNC_IN from another source (DCA1000 through R62, noise), or a late report",
+                    "measure SYNC_IN while no pulse is sent (docs/how-to/wiring.md); the row is retaken",
                 )
             if self._state is not State.ARMED:
                 raise DeviceError(f"{self.name}: {self.reason}", "a fatal event while it was armed", "resume the scan")
 
     def run_one_frame(self) -> str:
-        """One frame, started by software and not by a pulse, for a configured board; what came of it.
-
-        Raises DeviceError.
-        """
-        with _Failing(self):
+        """Run one frame of a configured board with a software trigger; return its end event. Raises DeviceError."""
+        with self._fault_on_error():
             self._frames = 0
             self._set_frames(1, c.SOFTWARE_TRIGGER)
             self._link.call(c.FrameControl(c.START))
-            return str(self._wait(e.FRAME_END, _READY_S + self._program.frame_period_us * 1e-6))
+            return str(self._wait(e.FRAME_END, _READY_TIMEOUT_S + self._program.frame_period_us * 1e-6))
 
     def _set_frames(self, frames: int, trigger: int) -> None:
         self._sent_frames = self._program.frames(frames, trigger)
@@ -207,44 +196,41 @@ class RadarBoard:
             self._link.call(command)
 
     def read_back(self) -> list[str]:
-        """Profile, chirp and frame as the board has them, where they differ from what it was sent. Raises DeviceError.
-
-        For a configured board whose frames were set.
-        """
+        """Read back profile, chirp and frame of a board that was armed; return the differences. Raises DeviceError."""
         sent = {one.ID: one.block().data for one in (*self._program.waveform, *self._sent_frames)}
         differences = []
-        for question, of in ((lab.ReadProfile(), 0x0100), (lab.ReadChirp(), 0x0101), (lab.ReadFrame(), 0x0102)):
+        for question, of in ((c.ReadProfile(), 0x0100), (c.ReadChirp(), 0x0101), (c.READ_FRAME, 0x0102)):
             blocks = self._link.call(question).blocks
             found = blocks[0].data if blocks else b""
             if found != sent[of]:
                 differences.append(f"0x{of:04X}: sent {sent[of].hex()}, read back {found.hex()}")
         return differences
 
-    def stream_tone(self, tone: lab.StreamTone, on: bool) -> None:
-        """Begin or end continuous streaming of one frequency, for tests of the RF; frames must not run.
+    def stream_tone(self, tone: c.StreamTone, on: bool) -> None:
+        """Start or end continuous streaming of one frequency, for RF tests; frames must not run.
 
-        It leaves the board without its chirp: configure it before the next row. Raises DeviceError.
+        Configure the board again before the next row. Raises DeviceError.
         """
-        with _Failing(self):
+        with self._fault_on_error():
             if on:
                 self._link.call(tone)
-            self._link.call(lab.StreamData(on))
-            self._link.call(lab.StreamEnable(on))
+            for command in c.stream_commands(on):
+                self._link.call(command)
 
     def reconnect(self, words: WordLink) -> None:
-        """Go on over another link, the one before being gone; the next `arm` resets and configures the board."""
+        """Replace a lost link; the next `arm` resets and configures the board."""
         warnings = self._link.warnings
         self._words, self._link = words, Link(self.name, words, self._clock, self._sent.append)
         self._link.warnings += warnings
-        self.fail("its link was opened anew")
+        self.fail("its link was reopened")
 
     def pulses_begin(self) -> None:
-        """The host knows that pulses come from now on; the radar does not say so."""
+        """Note that pulses may come from now on, which the radar does not report."""
         if self._state is State.ARMED:
             self._to(State.RUNNING)
 
     def poll(self) -> State:
-        """Read what the board has to say, and return where it is. A link that is gone is a fault."""
+        """Read the board's events and return its state; a lost link is a fault."""
         if self._state not in (State.OFF, State.FAULT):
             try:
                 for event in self._link.poll():
@@ -254,7 +240,7 @@ class RadarBoard:
         return self._state
 
     def read_temperatures(self) -> None:
-        """Ask for the temperatures. Raises DeviceError."""
+        """Read the temperatures into `facts`. Raises DeviceError."""
         answer = self._link.call(c.GET_TEMPERATURES)
         data = data_of(self.name, answer, c.GET_TEMPERATURES, 24)
         stamp, *degrees = struct.unpack_from("<I9h", data)
@@ -262,8 +248,8 @@ class RadarBoard:
         self.facts["device_ms"] = stamp
 
     def report(self) -> dict[str, Any]:
-        """What happened since the last report: facts, every byte sent, events, warnings. For the manifest."""
-        told: dict[str, Any] = {
+        """Return facts, bytes sent, events and warnings since the last report, for the manifest."""
+        report: dict[str, Any] = {
             "state": self._state.name.lower(),
             **self.facts,
             "sent": [raw.hex() for raw in self._sent],
@@ -271,52 +257,52 @@ class RadarBoard:
             "warnings": self._link.warnings[:],
         }
         if self.reason:
-            told["reason"] = self.reason
+            report["reason"] = self.reason
         self._sent.clear()
         self._log.clear()
         self._link.warnings.clear()
-        return told
+        return report
 
     def close(self) -> None:
-        """Stop frames that are awaited, as far as the board listens, and let go of it."""
+        """Stop frames that wait for triggers, if the board still answers, and close the link."""
         try:
             if self.poll() in (State.ARMED, State.RUNNING):
                 self._stop()
         except DeviceError:
-            pass  # it is let go of either way, and hardware that is gone makes no frames for long
+            pass  # the link is closed in any case
         finally:
             self._words.close()
 
     def fail(self, reason: str) -> None:
-        """Into `FAULT`; the first reason stays."""
+        """Enter `FAULT`; the first reason is kept."""
         if self._state is not State.FAULT:
             self.reason = reason
             self._to(State.FAULT)
 
     def _stop(self) -> None:
-        """Stop frames that wait for triggers. The stop is forbidden within a frame: one frame period passes first."""
+        """Stop frames that wait for triggers, after one frame period, because a stop is forbidden during a frame."""
         self._clock.sleep(self._program.frame_period_us * 1e-6)
         self.poll()
         if self._state in (State.ARMED, State.RUNNING):
             self._link.call(c.FrameControl(c.STOP_WHILE_WAITING))
-            self._link.wait_for((e.FRAME_END,), _READY_S, self._note)
+            self._link.wait_for((e.FRAME_END,), _READY_TIMEOUT_S, self._note)
             self._to(State.CONFIGURED)
 
-    def _wait(self, wanted: int, limit_s: float) -> e.Event:
-        return self._link.wait_for((wanted,), limit_s, self._on_event)
+    def _wait(self, event_id: int, timeout_s: float) -> e.Event:
+        return self._link.wait_for((event_id,), timeout_s, self._on_event)
 
     def _note(self, event: e.Event) -> None:
-        """Keep an event for the report; a fatal one ends what is being done."""
+        """Log an event. Raises DeviceError for a fatal one."""
         self._keep(str(event))
         if event.fatal:
             self.fail(str(event))
             raise DeviceError(
-                f"{self.name}: {event}", "the radar stopped itself", "it is reset when the row is retaken"
+                f"{self.name}: {event}", "the radar stopped with a fault", "the retake of the row resets it"
             )
 
     def _keep(self, line: str) -> None:
-        """For the report; of events without end the first ones."""
-        if len(self._log) < _MOST_EVENTS:
+        """Log an event for the report, up to `_MAX_EVENTS`."""
+        if len(self._log) < _MAX_EVENTS:
             self._log.append(line)
 
     def _on_event(self, event: e.Event) -> None:
@@ -328,23 +314,19 @@ class RadarBoard:
         elif event.id == e.TRIGGER_READY and self._state in (State.CONFIGURED, State.DONE):
             self._to(State.ARMED)
 
-    def _to(self, then: State) -> None:
-        if then not in TRANSITIONS[self._state]:
+    def _to(self, state: State) -> None:
+        if state not in TRANSITIONS[self._state]:
             raise DeviceError(
-                f"{self.name}: {self._state.value}, cannot become: {then.value}", "out of order", "resume"
+                f"{self.name}: no transition from {self._state.name} to {state.name}",
+                "events in an unexpected order",
+                "resume the scan",
             )
-        self._state = then
+        self._state = state
 
-
-class _Failing:
-    """An error that leaves this block puts the board into `FAULT` with what it says."""
-
-    def __init__(self, board: RadarBoard) -> None:
-        self._board = board
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if error is not None:
-            self._board.fail(error.what if isinstance(error, PolysightError) else str(error))
+    @contextmanager
+    def _fault_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            self.fail(error.what if isinstance(error, PolysightError) else str(error))
+            raise

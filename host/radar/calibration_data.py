@@ -1,8 +1,8 @@
-"""What a board's RF init found, kept in a file for its next starts, so that it starts as it was calibrated.
+"""Save the results of a board's RF init to a file and restore them at its next starts.
 
-RX gains and filters are calibrated anew at each power-up and then differ a little; restored they are the same. One file
-a die; only what TI recommends is restored, clocks and synthesizers calibrate at every start (ICD 70-74). Not run on
-hardware yet.
+Each power-up calibrates RX gains and filters slightly differently; restored values stay the same. There is one file for
+each die. Only the calibrations that TI recommends are restored; clocks and synthesizers calibrate at every start
+(ICD 70-74). Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -11,96 +11,142 @@ import json
 import struct
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from polysight.host.radar import events as e
-from polysight.host.radar.lab_commands import (
-    ALL_CALIBRATIONS,
-    CALIBRATION_PART_BYTES,
-    CALIBRATION_PARTS,
-    RESTORED_CALIBRATIONS,
-    InitCalibrations,
-    RestoreCalibration,
-    SaveCalibration,
-)
+from polysight.host.radar.commands import Command
 from polysight.host.radar.spi import Link
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.files import read_bounded
 
-_BYTES = CALIBRATION_PARTS * CALIBRATION_PART_BYTES
-NO_DIE = "-".join(["00000000"] * 4)  # tells no boards apart
-_LARGEST_BYTES = 2**16
-_DO = "remove the file: the board then calibrates itself, and a new one is written"
+PARTS, PART_BYTES = 3, 224  # ICD 70
+RESTORED = 0x14E0  # ADC offset, both filters, RX gain, I/Q: recommended by TI (ICD 72)
+ALL = 0x1FF0  # calibrations of the RF init (ICD 63)
+NO_DIE = "-".join(["00000000"] * 4)  # a die id that does not identify a board
+_MAX_FILE_BYTES = 2**16
+_REMEDY = "delete the file: the board then calibrates itself, and a new file is written"
+
+
+@dataclass(frozen=True)
+class InitCalibrations(Command):
+    """Select the calibrations of the next RF init; the others must have been restored (ICD 63)."""
+
+    ID = 0x0089
+    mask: int = ALL
+
+    def data(self) -> bytes:
+        """Pack the mask."""
+        return struct.pack("<3I", self.mask, 0, 0)
+
+
+@dataclass(frozen=True)
+class SaveCalibration(Command):
+    """Request one of three parts of the calibration data (ICD 70)."""
+
+    ID = 0x00AB
+    part: int
+
+    def data(self) -> bytes:
+        """Pack the part's number."""
+        return struct.pack("<2H", 0, self.part)
+
+
+@dataclass(frozen=True)
+class RestoreCalibration(Command):
+    """Send one of three parts of the calibration data; event 0x1004 follows the last one (ICD 66)."""
+
+    ID = 0x008B
+    part: int
+    content: bytes
+
+    def __str__(self) -> str:
+        return f"part {self.part} of its calibration data"
+
+    def data(self) -> bytes:
+        """Pack the part; TI's library sends the number of parts in a field that the ICD calls reserved."""
+        return struct.pack("<2H", PARTS, self.part) + self.content
 
 
 class CalibrationFiles:
-    """One file a die in a folder. What the rig's settings were is part of its name: other settings, other file."""
+    """A folder with one file for each die and each set of rig settings (a digest in the file's name)."""
 
     def __init__(self, folder: Path, settings: bytes) -> None:
         self._folder, self._digest = folder, f"{zlib.crc32(settings):08x}"
 
     def path(self, die_id: str) -> Path:
-        """Where a die's data is."""
+        """Return the file of a die."""
         return self._folder / f"{die_id}-{self._digest}.json"
 
     def load(self, die_id: str) -> bytes | None:
-        """A die's data; None when there is none. Raises ConfigError when the file is damaged."""
+        """Return a die's data; None if there is no file. Raises ConfigError if the file is damaged."""
         path = self.path(die_id)
         if not path.exists():
             return None
         try:
-            told = json.loads(read_bounded(path, _LARGEST_BYTES))
-            data = bytes.fromhex(told["data"])
-            sound = told["die_id"] == die_id and len(data) == _BYTES and zlib.crc32(data) == told["crc32"]
-            passed = int.from_bytes(data[:4], "little")  # of the RF init that it was saved from (ICD 71)
+            content = json.loads(read_bounded(path, _MAX_FILE_BYTES))
+            data = bytes.fromhex(content["data"])
+            sound = content["die_id"] == die_id and len(data) == PARTS * PART_BYTES
+            sound = sound and zlib.crc32(data) == content["crc32"]
         except (ValueError, KeyError, TypeError, RecursionError):
-            sound, data, passed = False, b"", 0
-        if sound and passed & RESTORED_CALIBRATIONS != RESTORED_CALIBRATIONS:
-            raise ConfigError(
-                f"{path}: is of a start whose RF init did not pass", "saved before that was looked at", _DO
-            )
+            sound, data = False, b""
         if not sound:
-            raise ConfigError(f"{path}: is not the calibration data of {die_id}", "damaged, or another board's", _DO)
+            raise ConfigError(
+                f"{path}: is not the calibration data of {die_id}",
+                "it is damaged, or another board's",
+                _REMEDY,
+                code=ErrorCode.FILE_DAMAGED,
+            )
+        passed = int.from_bytes(data[:4], "little")  # of the RF init that was saved (ICD 71)
+        if passed & RESTORED != RESTORED:
+            raise ConfigError(
+                f"{path}: is from a failed RF init",
+                "an earlier release saved it without this check",
+                _REMEDY,
+                code=ErrorCode.VALUE_INVALID,
+            )
         return data
 
-    def save(self, die_id: str, data: bytes) -> Path:
-        """Write a die's data; the file is whole or not there. Raises OSError."""
+    def save(self, die_id: str, data: bytes) -> None:
+        """Write a die's file atomically. Raises OSError."""
         path = self.path(die_id)
         self._folder.mkdir(parents=True, exist_ok=True)
         temperature = struct.unpack_from("<h", data, 16)[0]
-        told = {"die_id": die_id, "temperature_c": temperature, "crc32": zlib.crc32(data), "data": data.hex()}
+        content = {"die_id": die_id, "temperature_c": temperature, "crc32": zlib.crc32(data), "data": data.hex()}
         part = path.with_suffix(".part")
-        part.write_text(json.dumps(told), encoding="utf-8")
+        part.write_text(json.dumps(content), encoding="utf-8")
         part.replace(path)
-        return path
 
 
 def read_calibration(link: Link, name: str) -> bytes:
-    """What the board's last RF init found, 672 bytes. Raises DeviceError."""
+    """Read the results of the board's last RF init, 672 bytes. Raises DeviceError."""
     data = b""
-    for part in range(CALIBRATION_PARTS):
+    for part in range(PARTS):
         blocks = link.call(SaveCalibration(part)).blocks
-        if not blocks or len(blocks[0].data) != CALIBRATION_PART_BYTES + 4:
+        if not blocks or len(blocks[0].data) != PART_BYTES + 4:
             raise DeviceError(
-                f"{name}: no calibration data in its answer", "another firmware", "leave calibration_dir out"
+                f"{name}: the answer has no calibration data", "unknown firmware", "remove calibration_dir"
             )
-        if struct.unpack_from("<2H", blocks[0].data) != (CALIBRATION_PARTS, part):
-            raise DeviceError(f"{name}: part {part} of its calibration is another", "another firmware", _DO)
+        if struct.unpack_from("<2H", blocks[0].data) != (PARTS, part):
+            raise DeviceError(f"{name}: the answer has not part {part} of the calibration", "unknown firmware", _REMEDY)
         data += blocks[0].data[4:]
     return data
 
 
-def restore_calibration(link: Link, name: str, data: bytes, limit_s: float, note: Callable[[e.Event], None]) -> str:
-    """Give a board the calibration of an earlier start; its next RF init then runs the others only.
+def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, note: Callable[[e.Event], None]) -> str:
+    """Send a board the calibration of an earlier start and exclude it from the next RF init; return a description.
 
-    Raises DeviceError when the board does not take it.
+    Raises DeviceError if the board does not accept it.
     """
-    valid = struct.pack("<2I", RESTORED_CALIBRATIONS, RESTORED_CALIBRATIONS) + data[8:]
-    for part in range(CALIBRATION_PARTS):
-        link.call(RestoreCalibration(part, valid[CALIBRATION_PART_BYTES * part : CALIBRATION_PART_BYTES * (part + 1)]))
-    told = link.wait_for((e.RF_INIT_DONE,), limit_s, note)
-    passed = told.values.get("passed")
-    if not isinstance(passed, int) or passed & RESTORED_CALIBRATIONS != RESTORED_CALIBRATIONS:
-        raise DeviceError(f"{name}: does not take its calibration back: {told}", "another firmware than then", _DO)
-    link.call(InitCalibrations(ALL_CALIBRATIONS & ~RESTORED_CALIBRATIONS))
-    return f"calibrated at {struct.unpack_from('<h', data, 16)[0]} C before"
+    valid = struct.pack("<2I", RESTORED, RESTORED) + data[8:]
+    for part in range(PARTS):
+        link.call(RestoreCalibration(part, valid[PART_BYTES * part : PART_BYTES * (part + 1)]))
+    event = link.wait_for((e.RF_INIT_DONE,), timeout_s, note)
+    passed = event.values.get("passed")
+    if not isinstance(passed, int) or passed & RESTORED != RESTORED:
+        raise DeviceError(
+            f"{name}: does not accept its calibration data: {event}", "the firmware has changed since", _REMEDY
+        )
+    link.call(InitCalibrations(ALL & ~RESTORED))
+    return f"calibration restored, made at {struct.unpack_from('<h', data, 16)[0]} C"

@@ -1,7 +1,7 @@
-"""The sub-blocks a radar is configured and run with, from units to bytes; the RF core's and the main core's.
+"""Commands of a radar's RF core and main core: values in SI-like units, encoded as sub-blocks.
 
-Layouts and codes: ICD (messages.py), at the printed page in each docstring. Reserved fields are zero. Not run on
-hardware yet.
+Layouts and codes: ICD (messages.py), at the printed page in each docstring; reserved fields are zero. The commands for
+calibration data are in `calibration_data`. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -23,16 +23,21 @@ IfMode = Literal["complex1x", "complex2x"]
 
 
 class Command(ABC):
-    """One sub-block that the host sends."""
+    """A command of the host: one sub-block."""
 
     ID: ClassVar[int]
 
+    @property
+    def name(self) -> str:
+        """Name of the command, for logs."""
+        return type(self).__name__
+
     @abstractmethod
     def data(self) -> bytes:
-        """What follows number and length. Raises ValueError when a value does not fit its field."""
+        """Return the data after number and length. Raises struct.error if a value exceeds its field."""
 
     def block(self) -> SubBlock:
-        """As a sub-block. Raises ValueError naming the command."""
+        """Return the sub-block. Raises ValueError with the command if a value exceeds its field."""
         try:
             return SubBlock(self.ID, self.data())
         except struct.error as e:
@@ -40,47 +45,79 @@ class Command(ABC):
 
 
 def start_code(start_hz: float) -> int:
-    """Code of a start frequency."""
+    """Return the code of a start frequency."""
     return round(start_hz / START_HZ_PER_CODE)
 
 
 def slope_code(slope_hz_per_s: float) -> int:
-    """Code of a ramp's slope."""
+    """Return the code of a ramp's slope."""
     return round(slope_hz_per_s / SLOPE_HZ_PER_S_PER_CODE)
 
 
+def gain_code(rx_gain_db: int, rf_gain_target_db: int) -> int:
+    """Return the code of RX gain and RF gain target."""
+    return rx_gain_db | (30, 33, 36).index(rf_gain_target_db) << 6
+
+
 @dataclass(frozen=True)
-class Bare(Command):
-    """A command without data: RF power-up, RF init, and the questions for versions and temperatures."""
+class Fixed(Command):
+    """A command with constant data."""
 
     ID: int  # type: ignore[misc]
+    label: str
+    content: bytes = b""
 
     def __str__(self) -> str:
-        return f"command 0x{self.ID:04X}"
+        return self.label
+
+    @property
+    def name(self) -> str:
+        """The label."""
+        return self.label
 
     def data(self) -> bytes:
-        """Nothing."""
-        return b""
+        """Return the constant data."""
+        return self.content
 
 
-RF_POWER_UP = Bare(0x4000)  # ICD 269; must never be sent again (ICD 20)
-RF_INIT = Bare(0x00C0)
-GET_RF_VERSION = Bare(0x0220)
-GET_DIE_ID = Bare(0x0223)  # ICD 188
-GET_MAIN_VERSION = Bare(0x40E0)
-GET_TEMPERATURES = Bare(0x02EA)
+RF_POWER_UP = Fixed(0x4000, "RfPowerUp")  # ICD 269; must never be sent again (ICD 20)
+RF_INIT = Fixed(0x00C0, "RfInit")
+GET_RF_VERSION = Fixed(0x0220, "GetRfVersion")
+GET_DIE_ID = Fixed(0x0223, "GetDieId")  # ICD 188
+GET_MAIN_VERSION = Fixed(0x40E0, "GetMainVersion")
+GET_TEMPERATURES = Fixed(0x02EA, "GetTemperatures")
+READ_FRAME = Fixed(0x0122, "ReadFrame")  # the answer has the form of Frame (ICD 176)
+
+# Regular ADC mode; low power would limit the IF to 7.5 MHz (ICD 54).
+LOW_POWER_OFF = Fixed(0x0083, "LowPower", struct.pack("<2H", 0, 0))
+# Clock of the data lanes: code 9 is 600 Mbit/s at both edges (ICD 56).
+HSI_CLOCK = Fixed(0x0085, "HsiClock", struct.pack("<2H", 9, 0))
+# Faults (1) and monitoring (1 << 2) reported to the host with a 32-bit CRC, also start and end of frames; no watchdog,
+# as hardware triggers require (ICD 57-58).
+RF_DEVICE = Fixed(0x0086, "RfDevice", struct.pack("<I6BH", 1 | 1 << 2, 0, 0, 0, 0, 1, 0, 0))
+# Bandwidth of synthesizer (icp 1, rz 8) and clock PLL (icp 0x26, rz 9): default row of table 5.15, 266 MHz/us (ICD 69).
+APLL_BANDWIDTH = Fixed(0x008D, "ApllBandwidth", struct.pack("<6B5H", 1, 8, 0x26, 9, 0, 0, 0, 0, 0, 0, 0))
+# LVDS with ADC data in packet 0, packet 1 suppressed (ICD 272).
+DATA_PATH = Fixed(0x4042, "DataPath", struct.pack("<8B", 1, 1, 0, 2, 0, 0, 0, 0))
+# Four lanes, as a DCA1000 requires (ICD 275), 600 Mbit/s at both edges (ICD 276).
+LANE_ENABLE = Fixed(0x4043, "LaneEnable", struct.pack("<2H", 0b1111, 0))
+DATA_PATH_CLOCK = Fixed(0x4044, "DataPathClock", struct.pack("<BBH", 1, 1, 0))
+# Lanes in the order of receivers, most significant bit first (ICD 277).
+LVDS_LANES = Fixed(0x4045, "LvdsLanes", struct.pack("<2H", 0, 1))
+# Events of the main core with a 32-bit CRC from now on, no log (ICD 293).
+DEVICE_CONFIGURATION = Fixed(0x404C, "DeviceConfiguration", struct.pack("<BBHII", 1, 0, 0, 0, 0))
 
 
 @dataclass(frozen=True)
 class Channels(Command):
-    """Antennas that are powered, as bit masks; a single chip, its 40 MHz output off (ICD 50)."""
+    """Powered antennas, as bit masks; a single chip, its 40 MHz output off (ICD 50)."""
 
     ID = 0x0080
     rx: int = 0b1111
     tx: int = 0
 
     def data(self) -> bytes:
-        """RX, TX, cascading, pins."""
+        """Pack RX, TX, cascading, pins."""
         return struct.pack("<4H", self.rx, self.tx, 0, 1 << 5)
 
 
@@ -92,76 +129,22 @@ class AdcOutput(Command):
     if_mode: IfMode
 
     def data(self) -> bytes:
-        """Bits, full scale not reduced, format."""
+        """Pack bits, full scale reduction 0, format."""
         return struct.pack("<IHH", 2 | (1 if self.if_mode == "complex1x" else 2) << 16, 0, 0)
 
 
 @dataclass(frozen=True)
-class LowPower(Command):
-    """ADC mode: regular, or low power (IF up to 7.5 MHz) (ICD 54)."""
-
-    ID = 0x0083
-    low: bool = False
-
-    def data(self) -> bytes:
-        """Reserved, mode."""
-        return struct.pack("<2H", 0, self.low)
-
-
-@dataclass(frozen=True)
-class HsiClock(Command):
-    """Rate code of the data lanes' clock: 9 is 600 Mbit/s at both edges (ICD 56)."""
-
-    ID = 0x0085
-    code: int = 9
-
-    def data(self) -> bytes:
-        """Code."""
-        return struct.pack("<2H", self.code, 0)
-
-
-@dataclass(frozen=True)
-class RfDevice(Command):
-    """Events to the host with a 32-bit CRC; start and end of frames told; watchdog off, as hardware triggers need.
-
-    ICD 57-58.
-    """
-
-    ID = 0x0086
-
-    def data(self) -> bytes:
-        """Directions of events, their control, watchdog, CRC type."""
-        faults_to_host, monitoring_to_host, watchdog = 1, 1 << 2, 0
-        return struct.pack("<I6BH", faults_to_host | monitoring_to_host, 0, 0, 0, watchdog, 1, 0, 0)
-
-
-@dataclass(frozen=True)
-class ApllBandwidth(Command):
-    """Bandwidth of synthesizer and clock PLL; the default row of table 5.15: 266 MHz/us at most (ICD 69)."""
-
-    ID = 0x008D
-    synth_icp: int = 1
-    synth_rz: int = 8
-    apll_icp: int = 0x26
-    apll_rz: int = 9
-
-    def data(self) -> bytes:
-        """Trim codes."""
-        return struct.pack("<6B5H", self.synth_icp, self.synth_rz, self.apll_icp, self.apll_rz, 0, 0, 0, 0, 0, 0, 0)
-
-
-@dataclass(frozen=True)
 class LdoBypass(Command):
-    """RF LDO bypass: with 1.3 V on the RF supplies, as boards usually have it, bypassing may damage the device.
+    """RF LDO bypass, which may damage a device with the usual 1.3 V RF supplies (ICD 202).
 
-    ICD 202. :mod:`polysight.host.radar.constraints` refuses `bypass` without an acknowledgement for that very board.
+    `constraints` refuses `bypass` without an acknowledgement for the board.
     """
 
     ID = 0x02CC
     bypass: bool = False
 
     def data(self) -> bytes:
-        """Bypass, supply monitor 0 %, IO supply 3.3 V."""
+        """Pack bypass, supply monitor 0 %, IO supply 3.3 V."""
         return struct.pack("<HBB", self.bypass, 0, 0)
 
 
@@ -185,7 +168,7 @@ class Profile(Command):
     index: int = 0
 
     def data(self) -> bytes:
-        """VCO chosen by the firmware, calibration tables updated, no phase shift, TX from the ramp's knee."""
+        """Pack the profile: the firmware selects the VCO, no phase shift, TX starts at the ramp's knee."""
         back_off = self.tx_backoff_db * 0x010101
         return struct.pack(
             "<HBB6IhhHHBBHHH",
@@ -205,7 +188,7 @@ class Profile(Command):
             HPF_FIRST_KHZ.index(self.hpf1_khz),
             HPF_SECOND_KHZ.index(self.hpf2_khz),
             0,
-            self.rx_gain_db | (30, 33, 36).index(self.rf_gain_target_db) << 6,
+            gain_code(self.rx_gain_db, self.rf_gain_target_db),
             0,
         )
 
@@ -221,15 +204,15 @@ class Chirp(Command):
     profile: int = 0
 
     def data(self) -> bytes:
-        """Range of indices, profile, four variations of zero, TX."""
+        """Pack the range of indices, profile, four variations of zero, TX."""
         return struct.pack("<4HI4H", self.first, self.last, self.profile, 0, 0, 0, 0, 0, self.tx)
 
 
 @dataclass(frozen=True)
 class Frame(Command):
-    """Frames of `loops` chirps, each started by an edge of SYNC_IN, or all at once by software (ICD 90-94).
+    """Frames of `loops` chirps, started one by one by edges of SYNC_IN, or all at once by software (ICD 90-94).
 
-    `samples` goes where the ICD has a reserved field and TI's library 16-bit words per chirp: twice as many.
+    TI's library writes the number of 16-bit words per chirp (2 x `samples`) into a field that the ICD calls reserved.
     """
 
     ID = 0x0102
@@ -241,7 +224,7 @@ class Frame(Command):
     trigger: int = HARDWARE_TRIGGER
 
     def data(self) -> bytes:
-        """Chirps, loops, frames, words, period, trigger, delay."""
+        """Pack chirps, loops, frames, words, period, trigger, delay."""
         period, delay = (round(t / FRAME_TICK_US) for t in (self.period_us, self.trigger_delay_us))
         words = 2 * self.samples
         return struct.pack("<6HIHHI", 0, 0, 0, self.loops, self.frames, words, period, self.trigger, 0, delay)
@@ -252,11 +235,11 @@ class FrameControl(Command):
     """Start or stop frames (ICD 178). `STOP_WHILE_WAITING` is forbidden while a frame runs."""
 
     ID = 0x0140
-    what: int
+    action: int
 
     def data(self) -> bytes:
-        """What."""
-        return struct.pack("<2H", self.what, 0)
+        """Pack the action."""
+        return struct.pack("<2H", self.action, 0)
 
 
 @dataclass(frozen=True)
@@ -267,82 +250,26 @@ class DataFormat(Command):
     rx: int = 0b1111
 
     def data(self) -> bytes:
-        """RX, bits, format, I/Q order, interleaving."""
+        """Pack RX, bits, format, I/Q order, interleaving."""
         return struct.pack("<3HBBI", self.rx, 2, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
-class DataPath(Command):
-    """LVDS, ADC data only (ICD 272)."""
-
-    ID = 0x4042
-
-    def data(self) -> bytes:
-        """Interface, packet 0, packet 1 suppressed, 16-bit quality words (unused)."""
-        return struct.pack("<8B", 1, 1, 0, 2, 0, 0, 0, 0)
-
-
-@dataclass(frozen=True)
-class LaneEnable(Command):
-    """Data lanes, as a bit mask; a DCA1000 takes four (ICD 275)."""
-
-    ID = 0x4043
-    lanes: int = 0b1111
-
-    def data(self) -> bytes:
-        """Lanes."""
-        return struct.pack("<2H", self.lanes, 0)
-
-
-@dataclass(frozen=True)
-class DataPathClock(Command):
-    """600 Mbit/s a lane, both edges (ICD 276)."""
-
-    ID = 0x4044
-
-    def data(self) -> bytes:
-        """Edges, rate code."""
-        return struct.pack("<BBH", 1, 1, 0)
-
-
-@dataclass(frozen=True)
-class LvdsLanes(Command):
-    """Lanes in the order of receivers, most significant bit first (ICD 277)."""
-
-    ID = 0x4045
-
-    def data(self) -> bytes:
-        """Map, parameters."""
-        return struct.pack("<2H", 0, 1)
-
-
-@dataclass(frozen=True)
-class DeviceConfiguration(Command):
-    """Events of the main core with a 32-bit CRC from now on (ICD 293)."""
-
-    ID = 0x404C
-
-    def data(self) -> bytes:
-        """CRC type, no log."""
-        return struct.pack("<BBHII", 1, 0, 0, 0, 0)
-
-
-@dataclass(frozen=True)
 class FrameApply(Command):
-    """Makes the main core take over the frame's size (ICD 303). Belongs after every :class:`Frame`."""
+    """Apply the frame's size in the main core (ICD 303). Must follow every `Frame`."""
 
     ID = 0x40C0
     samples: int
     chirps: int = 1
 
     def data(self) -> bytes:
-        """Chirps of a frame, 16-bit words of a chirp."""
+        """Pack chirps of a frame and 16-bit words of a chirp."""
         return struct.pack("<IHH", self.chirps, 2 * self.samples, 0)
 
 
 @dataclass(frozen=True)
 class FileChunk(Command):
-    """A part of the firmware image; the first one begins with type and length (ICD 302)."""
+    """Part of a firmware image; the first one starts with type and length (ICD 302)."""
 
     ID = 0x4080
     part: bytes
@@ -351,5 +278,55 @@ class FileChunk(Command):
         return f"{len(self.part)} bytes of a file"
 
     def data(self) -> bytes:
-        """The part itself."""
+        """Return the part."""
         return self.part
+
+
+@dataclass(frozen=True)
+class ReadProfile(Command):
+    """Read back a profile; the answer has the form of `Profile` (ICD 175)."""
+
+    ID = 0x0120
+    index: int = 0
+
+    def data(self) -> bytes:
+        """Pack the index."""
+        return struct.pack("<2H", self.index, 0)
+
+
+@dataclass(frozen=True)
+class ReadChirp(Command):
+    """Read back a chirp; the answer has the form of `Chirp` (ICD 176)."""
+
+    ID = 0x0121
+    index: int = 0
+
+    def data(self) -> bytes:
+        """Pack first and last index."""
+        return struct.pack("<2H", self.index, self.index)
+
+
+@dataclass(frozen=True)
+class StreamTone(Command):
+    """Frequency of continuous streaming without a ramp, for RF tests (ICD 94)."""
+
+    ID = 0x0103
+    start_hz: float
+    sample_rate_hz: float
+    rx_gain_db: int
+    hpf1_khz: float = HPF_FIRST_KHZ[0]
+    hpf2_khz: float = HPF_SECOND_KHZ[0]
+    tx_backoff_db: int = 0
+    rf_gain_target_db: int = 30
+
+    def data(self) -> bytes:
+        """Pack start, back-off, phase, rate, filters, gain; the firmware selects the VCO."""
+        hpf = HPF_FIRST_KHZ.index(self.hpf1_khz), HPF_SECOND_KHZ.index(self.hpf2_khz)
+        back_off, gain = self.tx_backoff_db * 0x010101, gain_code(self.rx_gain_db, self.rf_gain_target_db)
+        rate = round(self.sample_rate_hz / 1e3)
+        return struct.pack("<3IH4BH", start_code(self.start_hz), back_off, 0, rate, *hpf, gain, 0, 0)
+
+
+def stream_commands(on: bool) -> tuple[Fixed, Fixed]:
+    """Return the commands that start or end continuous streaming: main core (ICD 279), then RF core (ICD 97)."""
+    return Fixed(0x4046, "StreamData", struct.pack("<2H", on, 0)), Fixed(0x0104, "Stream", struct.pack("<2H", on, 0))

@@ -1,6 +1,6 @@
-"""Named constraints on what the radars are about to be told, looked at before anything is written.
+"""Constraints of the AWR2243 on a rig file, checked before anything is sent to a board.
 
-Each has its formula, limit and value. Sources: ICD at its printed page; rig facts as in docs/spec/mmwavelink.md.
+Each has a name, a formula, limits and a value. Sources: ICD at its printed page; docs/spec/mmwavelink.md.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 from polysight.host.radar.commands import SLOPE_HZ_PER_S_PER_CODE, START_HZ_PER_CODE, slope_code, start_code
 from polysight.host.radar.program import chirp_us, frame_period_us
 from polysight.shared.config import HPF_FIRST_KHZ, Board, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.geometry import direct_path_m
 from polysight.shared.raster import MIN_PERIOD_US, WIDTH_US
@@ -30,10 +31,7 @@ MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}  # regular ADC mode, 20 M
 
 
 class Constraint(NamedTuple):
-    """One rule: what is compared with what.
-
-    `low <= value <= high` must hold, where a limit is not None; all three are in `unit`.
-    """
+    """One rule: `low <= value <= high`, all in `unit`; a limit of None does not apply."""
 
     name: str
     formula: str
@@ -45,7 +43,7 @@ class Constraint(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether it does."""
+        """True if the value is within the limits."""
         return (self.low is None or self.value >= self.low) and (self.high is None or self.value <= self.high)
 
     def __str__(self) -> str:
@@ -55,9 +53,9 @@ class Constraint(NamedTuple):
 
 
 def direct_if_hz(rig: Instrument, board: Board) -> float:
-    """IF of the direct path without any timing error: slope x path / c + difference of start frequencies, hertz.
+    """Return the IF of the direct path without timing errors: slope x path / c + start frequency difference, hertz.
 
-    With the frequencies that the codes stand for, and the mean over the board's antennas.
+    Frequencies are rounded to the radar's codes; the path is the mean over the board's antennas.
     """
     paths = direct_path_m(rig, board)
     slope = slope_code(rig.chirp.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE
@@ -68,9 +66,9 @@ def direct_if_hz(rig: Instrument, board: Board) -> float:
 
 
 def constraints(rig: Instrument, frames: int) -> list[Constraint]:
-    """Every constraint on a rig, for rows of `frames` frames; only what is no number, where something is none.
+    """Return every constraint on a rig for rows of `frames` frames; if values are not finite, only those.
 
-    Whatever the rig file holds, this raises nothing; what breaks none of them can be encoded (`program`).
+    Raises nothing for any rig file. A rig file that keeps all constraints can be encoded by `program`.
     """
     if unusable := list(_finite(rig)):
         return unusable
@@ -78,18 +76,19 @@ def constraints(rig: Instrument, frames: int) -> list[Constraint]:
 
 
 def require(rig: Instrument, frames: int) -> None:
-    """Refuse a rig that breaks a constraint. Raises ConfigError naming each broken one and what to change."""
+    """Raise ConfigError if a constraint is broken, with each broken one and its remedy."""
     broken = [c for c in constraints(rig, frames) if not c.holds]
     if broken:
         raise ConfigError(
-            "the radars would refuse or misunderstand this: " + "; ".join(str(c) for c in broken),
-            "the rig file asks for what an AWR2243 cannot do safely",
+            "the radars would refuse or misinterpret these settings: " + "; ".join(str(c) for c in broken),
+            "the rig file exceeds the limits of the AWR2243",
             "; ".join(dict.fromkeys(c.remedy for c in broken)),
+            code=ErrorCode.VALUE_INVALID,
         )
 
 
 def _finite(rig: Instrument) -> Iterator[Constraint]:
-    """What breaks every formula: infinities, and what is not a number."""
+    """Yield a broken constraint for each value that is infinite or not a number."""
     tables = {"chirp": rig.chirp, "burst": rig.burst, "radar": rig.radar}
     tables |= {f"boards.{b.name}": b for b in rig.boards}
     for table, part in tables.items():
@@ -102,9 +101,9 @@ def _finite(rig: Instrument) -> Iterator[Constraint]:
 
 def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
     period, chirps = frame_period_us(rig), chirp_us(rig)
-    slower = "raise burst.period_us"
-    yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "take fewer points or pulses a row")
-    yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", slower)
+    longer_period = "raise burst.period_us"
+    yield Constraint("frames", "frames of a row", frames, 1, 65535, "", "reduce the points or pulses of a row")
+    yield Constraint("frame period", "frame period", period, *FRAME_PERIOD_US, "us", longer_period)
     yield Constraint(
         "chirps", "chirps of a frame", rig.burst.chirps, 1, 255, "", "set burst.chirps to 1..255"
     )  # ICD 91
@@ -114,9 +113,13 @@ def _timing(rig: Instrument, frames: int) -> Iterator[Constraint]:
             "chirp spacing", "idle + ramp - chirp_us", chirps - rig.burst.chirp_us, -0.006, 0.006, "us", apart
         )
     rest = period - rig.burst.chirps * chirps
-    yield Constraint("inter-frame time", "frame period - chirps", rest, INTER_FRAME_US, None, "us", slower)  # ICD 91
+    yield Constraint(
+        "inter-frame time", "frame period - chirps", rest, INTER_FRAME_US, None, "us", longer_period
+    )  # ICD 91
     gap = rig.burst.period_us - period
-    yield Constraint("pulse gap", "pulse period - frame period", gap, AFTER_FRAME_US, None, "us", slower)  # ICD 93
+    yield Constraint(
+        "pulse gap", "pulse period - frame period", gap, AFTER_FRAME_US, None, "us", longer_period
+    )  # ICD 93
     yield Constraint("pulse width", "SYNC_IN pulse", rig.burst.width_us, *WIDTH_US, "us", "set burst.width_us")
 
 
@@ -142,13 +145,13 @@ def _chirp(rig: Instrument) -> Iterator[Constraint]:
     yield Constraint("ADC start", "ADC start", c.adc_start_us, 0, 40.95, "us", "lower chirp.adc_start_us")
     yield Constraint("ramp", "ramp end", c.ramp_end_us, 0, 5000, "us", "lower chirp.ramp_end_us")
     yield Constraint("idle", "idle time", rig.radar.idle_us, 0, 5242.87, "us", "lower radar.idle_us")
-    served_here = all(n.place.startswith("tcp://127.") for n in rig.radar.native.values())
-    if not served_here or (c.hpf1_khz and c.hpf2_khz):  # simulated radars may have none; a device always filters
+    simulated = all(n.place.startswith("tcp://127.") for n in rig.radar.native.values())
+    if not simulated or (c.hpf1_khz and c.hpf2_khz):  # only simulated radars work without filters
         lowest = min(c.hpf1_khz, c.hpf2_khz)
-        corner = "set the corners that the devices have: chirp.hpf1_khz 175 and hpf2_khz 350 at least"
+        corner = "set corners of the devices: chirp.hpf1_khz of at least 175 and hpf2_khz of at least 350"
         yield Constraint("high-pass filters", "lower corner", lowest, HPF_FIRST_KHZ[0], None, "kHz", corner)
     gain = rig.radar.rx_gain_db
-    # ICD table 5.24; the text of error 52 says 24..52, which not every temperature and RF target reaches.
+    # ICD table 5.24; the 24..52 dB of error 52 are not reached at every temperature and RF target.
     yield Constraint("RX gain", "RX gain", gain, 32, 52, "dB", "set radar.rx_gain_db to 32..52, even")
     yield Constraint("RX gain step", "RX gain modulo 2", gain % 2, None, 0, "dB", "set an even radar.rx_gain_db")
     yield Constraint("TX back-off", "back-off", rig.radar.tx_backoff_db, 0, 20, "dB", "lower radar.tx_backoff_db")
@@ -163,7 +166,9 @@ def _of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
     yield Constraint(f"sweep{here}", "start + offset + slope x ramp end", top, *BAND_HZ, "Hz", offset)
     if board.name in rig.radar.native:
         native = rig.radar.native[board.name]
-        named = native.usb_serial and native.ldo_bypass_acknowledged == native.usb_serial  # a USB path names no board
+        named = (
+            native.usb_serial and native.ldo_bypass_acknowledged == native.usb_serial
+        )  # a USB path does not identify a board
         unacknowledged = native.ldo_bypass and not named
         yield Constraint(
             f"LDO bypass{here}",
@@ -172,8 +177,8 @@ def _of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
             None,
             0,
             "",
-            f"leave ldo_bypass{here} off: on a board with 1.3 V RF supplies, as TI's usually are, it may destroy the"
-            " device. Only where 1.0 V was measured on them: its USB serial number in ldo_bypass_acknowledged",
+            f"disable ldo_bypass{here}: with the 1.3 V RF supplies of most TI boards it may destroy the device. Only if"
+            " you measured 1.0 V, write the board's USB serial number into ldo_bypass_acknowledged",
         )
     if board.role == "transmit":
         return
@@ -186,10 +191,10 @@ def _of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
     better = board.start_offset_hz + (low + high) / 2 - found
     yield Constraint(
         f"IF budget{here}",
-        "slope x direct path / c + start offsets, 5 ns of trigger either way",
+        "slope x direct path / c + start offsets, with +-5 ns of trigger",
         found,
         low + spread,
         high - spread,
         "Hz",
-        f"set start_offset_hz{here}; {better:.0f} puts its direct path in the middle",
+        f"set start_offset_hz{here}; with {better:.0f} its direct path is in the middle of the band",
     )

@@ -1,6 +1,6 @@
-"""What a radar says by itself, in words: asynchronous events, and the numbers of refused commands.
+"""Decode a radar's asynchronous events, and describe the error numbers of refused commands.
 
-ICD pages at each table; which ones are fatal: ICD 337. A fatal one ends in a reset and a new configuration.
+The ICD page is at each table; ICD 337 lists the fatal events, which require a reset and a new configuration.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ MAIN_POWER_UP, RF_POWER_UP_DONE = 0x5000, 0x5001
 MAIN_CPU_FAULT, MAIN_ESM_FAULT, BOOT_STATUS, RF_ERROR = 0x5002, 0x5003, 0x5005, 0x5008
 
 
-STARTED_ANEW = frozenset({MAIN_POWER_UP})  # outside a reset: everything that was set is gone
+RESTARTED = frozenset({MAIN_POWER_UP})  # without a reset: the board has lost its settings
 
 
 class InitBit(NamedTuple):
-    """A calibration of the RF init: `of_transmitter` when only a board that transmits needs it to have passed."""
+    """A calibration of the RF init. `of_transmitter`: required only on a transmitting board."""
 
     name: str
     of_transmitter: bool = False
@@ -47,16 +47,16 @@ _INIT_NAMES = {bit: one.name for bit, one in INIT_BITS.items()}
 
 
 def failed_calibrations(event: Event, transmits: bool, run: int) -> list[str]:
-    """What a board cannot be used without and did not pass in its RF init.
+    """Return the calibrations that failed in the RF init and that the board needs.
 
-    `run` masks the calibrations that were asked for beside clock and synthesizers, which run at every start.
+    `run` is the mask of requested calibrations besides clock and synthesizers, which run at every start.
     """
     passed = event.values.get("passed")
     if not isinstance(passed, int):
-        return ["a report that can be read"]
-    asked = run | 0b1110
+        return ["unreadable report"]
+    requested = run | 0b1110
     needed = {bit: one.name for bit, one in INIT_BITS.items() if transmits or not one.of_transmitter}
-    return [name for bit, name in needed.items() if asked >> bit & 1 and not passed >> bit & 1]
+    return [name for bit, name in needed.items() if requested >> bit & 1 and not passed >> bit & 1]
 
 
 _CPU_FAULTS = (  # ICD 212, 317
@@ -85,7 +85,7 @@ _RF_TESTS = 0x07FFFFFF  # bits 0..26 of 0x5001, 1 = passed
 _RF_GROUP1_FATAL = 1 << 25  # programmable filter, double bit error (ICD 216); its parity error is reserved there
 _MAIN_GROUP1_FATAL = 1 << 22  # FRC lockstep (ICD 320)
 
-# Boot status (ICD table 7.3), bit: what it means. The first group says that the flash is empty or its image broken.
+# Boot status (ICD table 7.3), bit: meaning. The first group means an empty flash or a damaged image.
 _FLASH_BITS = {
     2: "image 1 not authentic",
     3: "image 2 not authentic",
@@ -172,10 +172,10 @@ class Event:
     Attributes
     ----------
     fatal
-        Whether the device must be reset.
+        True if the device must be reset.
     values
-        What a manifest keeps of it. Of a boot status, `cure` is "firmware" when the flash is empty or broken, which a
-        download mends, "hardware" when the device found a fault of its own, and "" otherwise.
+        Numbers for the manifest. In a boot status, `cure` is "firmware" if the flash is empty or damaged, which a
+        download repairs, "hardware" if the device reports a defect, otherwise "".
     """
 
     id: int
@@ -189,14 +189,14 @@ class Event:
 
 
 def describe_refusal(number: int | None, block: int | None) -> str:
-    """Error number and sub-block of a refused command, in words."""
+    """Describe error number and sub-block of a refused command."""
     if number is None or block is None:
-        return "it does not say why"
+        return "without a reason"
     return f"{REFUSALS.get(number, 'see the interface control document')} (error {number}, sub-block 0x{block:04X})"
 
 
 def decode_event(block: SubBlock) -> Event:
-    """An event from its sub-block; unknown and short ones are told as such. A fault too short to be read is fatal."""
+    """Decode an event; an unknown or truncated one keeps its bytes. A truncated fault is fatal."""
     known = _EVENTS.get(block.id)
     if known is None:
         return Event(block.id, f"event 0x{block.id:04X}", block.data.hex())
@@ -204,7 +204,7 @@ def decode_event(block: SubBlock) -> Event:
     try:
         detail, fatal, values = read(block.data)
     except (struct.error, IndexError):
-        fatal = block.id in _FATAL_UNREAD
+        fatal = block.id in _FATAL_IF_TRUNCATED
         return Event(block.id, name, f"only {len(block.data)} bytes: {block.data.hex()}", fatal)
     return Event(block.id, name, detail, fatal, values)
 
@@ -249,37 +249,37 @@ def _init_done(data: bytes) -> _Read:
     status, updated, temperature, _, stamp = struct.unpack_from("<IIhHI", data)
     failed = sum(1 << b for b in INIT_BITS if not status >> b & 1)
     values = {"passed": status, "updated": updated, "temperature_c": temperature, "device_ms": stamp}
-    return f"{temperature} C" + (f"; not passed: {_bits(_INIT_NAMES, failed)}" if failed else ""), False, values
+    return f"{temperature} C" + (f"; failed: {_bits(_INIT_NAMES, failed)}" if failed else ""), False, values
 
 
 def _analog(data: bytes) -> _Read:
     kind, _, _, signals = struct.unpack_from("<BBHI", data)
-    return _bits(_ANALOG, signals) or "no signal named", bool(kind), {"signals": signals}
+    return _bits(_ANALOG, signals) or "no signal reported", bool(kind), {"signals": signals}
 
 
 def _boot(data: bytes) -> _Read:
-    """Power-up time and status; 16 bytes from the ROM of a first-generation device with empty flash, else 20.
+    """Decode power-up time and status: 20 bytes, or 16 from the ROM of a first-generation device with empty flash.
 
-    The short form's order is that of the one that was received (tests/support/radar/received.py): status, time, tests.
+    The short form has status, time, tests, as in a message that was received (tests/support/radar/received.py).
     """
     if len(data) < 20:
         boot, ticks, tests = struct.unpack_from("<IIQ", data)
     else:
         ticks, boot, tests = struct.unpack_from("<IQQ", data)
-    told = [_bits(_BOOT_BITS, boot, "bit")] if boot else []
+    parts = [_bits(_BOOT_BITS, boot, "bit")] if boot else []
     if tests:
-        told.append(f"self-tests failed 0x{tests:X}")
+        parts.append(f"self-tests failed 0x{tests:X}")
     hardware, flash = (any(boot >> bit & 1 for bit in bits) for bits in (_HARDWARE_BITS, _FLASH_BITS))
     cure = "hardware" if hardware else "firmware" if flash else ""
     values = {"power_up_us": ticks * 0.005, "boot_errors": boot, "tests_failed": tests, "cure": cure}
-    return "; ".join(told), False, values
+    return "; ".join(parts), False, values
 
 
 def _rf_power_up(data: bytes) -> _Read:
     passed, ticks = struct.unpack_from("<II", data)
     failed = _RF_TESTS & ~passed
-    told = f"self-tests not passed 0x{failed:07X}" + (", none did" if failed == _RF_TESTS else "") if failed else ""
-    return told, False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
+    text = f"self-tests failed 0x{failed:07X}" + (", all of them" if failed == _RF_TESTS else "") if failed else ""
+    return text, False, {"tests_passed": passed, "power_up_us": ticks * 0.005}
 
 
 def _rf_error(data: bytes) -> _Read:
@@ -287,7 +287,7 @@ def _rf_error(data: bytes) -> _Read:
     return _word(_RF_ERRORS, flag), flag in (1, 2, 4), {"flag": flag}
 
 
-_FATAL_UNREAD = (RF_CPU_FAULT, RF_ESM_FAULT, ANALOG_FAULT, MAIN_CPU_FAULT, MAIN_ESM_FAULT, RF_ERROR)
+_FATAL_IF_TRUNCATED = (RF_CPU_FAULT, RF_ESM_FAULT, ANALOG_FAULT, MAIN_CPU_FAULT, MAIN_ESM_FAULT, RF_ERROR)
 _EVENTS: dict[int, tuple[str, Callable[[bytes], _Read]]] = {
     RF_CPU_FAULT: ("RF core fault", _cpu(_RF_CODES)),
     RF_ESM_FAULT: ("RF core error signal", _esm(_RF_GROUP1_FATAL)),

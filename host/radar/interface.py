@@ -1,9 +1,8 @@
-"""The one interface to radars that start a frame at each SYNC_IN pulse.
+"""Interface of the backends to radars that start a frame at each SYNC_IN pulse.
 
-A row uses it like this (docs/spec/row.md): `arm` before its cards record, `states` while it runs and at its end. A
-backend says only what it knows. Over a control line that never answers a board stays `UNKNOWN`, and whether it was
-armed shows by its data alone: an armed radar sends nothing before its first pulse, so no card can tell it from one that
-is not.
+Each row calls `arm` before its cards record, and `states` during the row and at its end (docs/spec/row.md). A backend
+reports only what it knows: a board behind a control line without replies stays `UNKNOWN`, and only its data shows that
+it was armed, because an armed radar sends nothing before its first pulse.
 """
 
 from __future__ import annotations
@@ -15,54 +14,50 @@ from typing import NamedTuple
 
 
 class RadarState(Enum):
-    """What is known of one radar."""
+    """Known state of one radar."""
 
-    UNKNOWN = "nobody tells"
-    ARMED = "waits for pulses, or makes frames"
-    DONE = "has made all the frames it was armed for"
-    FAULT = "has stopped by itself"
+    UNKNOWN = "not reported"
+    ARMED = "waits for pulses, or sends frames"
+    DONE = "all its frames have ended"
+    FAULT = "has stopped with a fault"
 
 
 class BoardState(NamedTuple):
-    """A radar's state, and what its backend can say about it."""
+    """A radar's state with a description."""
 
     state: RadarState
     detail: str = ""
 
 
 class RadarControl(ABC):
-    """The radars of a rig. A context manager; leaving it lets go of them."""
+    """The radars of a rig; a context manager that closes the connections."""
 
     @abstractmethod
     def arm(self, frames: int) -> None:
-        """Make every board start a frame at each of the next `frames` pulses.
+        """Arm every board for a frame at each of the next `frames` pulses.
 
-        What it proves when it returns is told by :meth:`states`: `ARMED` where the radar said so itself.
-
-        Raises
-        ------
-        DeviceError
-            when a board, or what controls it, does not do its part.
+        Afterwards `states` returns `ARMED` for boards that confirmed it. Raises DeviceError if a board or its control
+        server fails.
         """
 
     @abstractmethod
     def states(self) -> dict[str, BoardState]:
-        """How each board is, by name, without waiting; boards of which nothing can be said may be left out."""
+        """Return the states by board name, without waiting; boards without any information may be missing."""
 
-    def row_begins(self) -> None:  # noqa: B027 - not every backend tells waiting from running
-        """Pulses may come from now on."""
+    def row_begins(self) -> None:  # noqa: B027 - optional
+        """Note that pulses may come from now on."""
 
-    def wait_done(self, limit_s: float) -> list[str]:
-        """After the row's last pulse: boards that do not say within the limit that all their frames ended."""
-        del limit_s
+    def wait_done(self, timeout_s: float) -> list[str]:
+        """Wait after the row's last pulse; return the boards whose frames did not end within the timeout, seconds."""
+        del timeout_s
         return []
 
     def report(self) -> dict[str, object]:
-        """What the manifest keeps of the radars, since the last report; empty when there is nothing."""
+        """Return the radars' report for the manifest since the last call; empty if there is none."""
         return {}
 
-    def close(self) -> None:  # noqa: B027 - not every backend holds something
-        """Let go of the radars. Twice is once."""
+    def close(self) -> None:  # noqa: B027 - optional
+        """Close the connections; may be called twice."""
 
     def __enter__(self) -> RadarControl:
         return self

@@ -1,7 +1,7 @@
-"""mmWaveLink messages as bytes: sync word, header, sub-blocks, CRC.
+"""Encode and decode mmWaveLink messages: sync word, header, sub-blocks, CRC.
 
-Source of every number: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3. The
-bytes are described in docs/spec/mmwavelink.md. Not run on hardware yet.
+Source of all numbers: TI, mmWave Radar Interface Control Document, revision 2.23 ("ICD"), sections 2.3 and 3. The
+format is described in docs/spec/mmwavelink.md. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from polysight.shared.errors import ProtocolError
 
 HOST_SYNC = bytes.fromhex("34122143")
 DEVICE_SYNC = bytes.fromhex("badccdab")
-READY_TO_READ = bytes.fromhex("78566587") + b"\xff" * 12  # "CNYS": what the host writes when the interrupt is high
+READY_TO_READ = bytes.fromhex("78566587") + b"\xff" * 12  # "CNYS": written by the host when the interrupt is high
 SYNC_BYTES = 4
 HEADER_BYTES = 12
 CRC_BYTES = 4
@@ -28,12 +28,12 @@ _HEADER = struct.Struct("<6H")
 _BLOCK = struct.Struct("<2H")
 _PAD = b"\xff"
 _RETRY, _NO_CRC, _CRC32 = 0x0003, 0x0300, 0x0400
-_WHY = "noise on the SPI lines, or a device that has lost its place"
-_DO = "asked for again by itself; check the 60-pin connector and the USB cable if it stays"
+_WHY = "noise on the SPI lines, or a device out of step"
+_DO = "retried automatically; check the 60-pin connector and the USB cable if it happens again"
 
 
 class Direction(IntEnum):
-    """Who speaks to whom (ICD table 2.2)."""
+    """Direction of a message (ICD table 2.2)."""
 
     HOST_TO_RF = 1
     RF_TO_HOST = 2
@@ -42,7 +42,7 @@ class Direction(IntEnum):
 
 
 class Kind(IntEnum):
-    """What a message is."""
+    """Type of a message."""
 
     COMMAND = 0
     RESPONSE = 1
@@ -52,20 +52,20 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class SubBlock:
-    """One configuration or report: its number (message id x 32 + n) and its data without the four bytes before it."""
+    """A setting or a report: its number (message id x 32 + n) and its data without number and length."""
 
     id: int
     data: bytes = b""
 
     @property
     def message_id(self) -> int:
-        """The message this sub-block travels in."""
+        """Id of the message that contains this sub-block."""
         return self.id // BLOCKS_PER_MESSAGE_ID
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message (one chunk), without what the codec computes."""
+    """One message (one chunk) without length and checksums."""
 
     direction: Direction
     kind: Kind
@@ -77,10 +77,10 @@ class Message:
 
     @property
     def error(self) -> tuple[int | None, int | None] | None:
-        """Error number and sub-block of a response that refuses the command; None of any other message.
+        """Error number and sub-block number of a refusal; None for any other message.
 
-        A refusal has message id 0, whatever was asked (ICD 4.4), and the sub-block of ICD table 5.1. Both are None when
-        it has no body, as first-generation devices send it.
+        A refusal has message id 0 (ICD 4.4) and the sub-block of ICD table 5.1. Both numbers are None in a refusal
+        without a body, as first-generation devices send it.
         """
         if self.kind is not Kind.RESPONSE:
             return None
@@ -93,7 +93,7 @@ class Message:
 
 @dataclass(frozen=True)
 class Header:
-    """A checked header: what is still to be read, and with which CRC."""
+    """A valid header."""
 
     direction: int
     kind: Kind
@@ -105,17 +105,17 @@ class Header:
 
     @property
     def body_bytes(self) -> int:
-        """Bytes that follow the header, CRC included."""
+        """Number of bytes after the header, with the CRC."""
         return self.length - HEADER_BYTES
 
     @property
     def crc_bytes(self) -> int:
-        """0, 2 or 4: the first event after power-up still has 16 bits (ICD 293)."""
+        """Size of the CRC: 0, 2 or 4; the first event after power-up has 16 bits (ICD 293)."""
         if self.flags & _NO_CRC == _NO_CRC:
             return 0
         bits = self.flags >> 10 & 3
         if bits > 1:
-            raise ProtocolError(f"a message with CRC length code {bits}; 0 and 1 are understood", _WHY, _DO)
+            raise ProtocolError(f"a message with CRC length code {bits}; only 0 and 1 are known", _WHY, _DO)
         return 2 << bits
 
     @property
@@ -125,13 +125,13 @@ class Header:
 
     @property
     def is_bare_refusal(self) -> bool:
-        """True of an error response that announces a sub-block and holds none, as an AWR1243 sends it."""
+        """True for an error response that announces a sub-block but has none, as sent by an AWR1243."""
         refused = self.kind is Kind.RESPONSE and self.message_id == ERROR_MESSAGE
         return refused and self.length == HEADER_BYTES + self.crc_bytes
 
 
 def command(blocks: tuple[SubBlock, ...], *, sequence: int = 0, retry: bool = False, remaining: int = 0) -> Message:
-    """A command of sub-blocks of one message id; main core or RF core by that id (0x200 and above: main)."""
+    """Create a command of sub-blocks with one message id, for the main core (0x200 and above) or the RF core."""
     ids = {b.message_id for b in blocks}
     if len(ids) != 1:
         raise ValueError(f"sub-blocks of one command share one message id, these have {sorted(ids)}")
@@ -141,7 +141,7 @@ def command(blocks: tuple[SubBlock, ...], *, sequence: int = 0, retry: bool = Fa
 
 
 def checksum(words: bytes) -> int:
-    """Ones-complement of the ones-complement sum of little-endian 16-bit words (ICD 12; RFC 1071)."""
+    """Compute the ones-complement of the ones-complement sum of little-endian 16-bit words (ICD 12; RFC 1071)."""
     total = sum(struct.unpack(f"<{len(words) // 2}H", words))
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)
@@ -149,14 +149,10 @@ def checksum(words: bytes) -> int:
 
 
 def encode(message: Message) -> bytes:
-    """The bytes of a message, sync word first, with a 32-bit CRC.
+    """Encode a message: sync word, header, body, 32-bit CRC.
 
-    The body is padded with 0xFF to a multiple of four bytes before its CRC (ICD 9: length less CRC is a multiple of 4).
-
-    Raises
-    ------
-    ValueError
-        when a field does not fit its bits, or the message is longer than one chunk may be.
+    The body is padded with 0xFF so that the length without CRC is a multiple of 4 (ICD 9). Raises ValueError if a field
+    exceeds its bits or the message the size of a chunk.
     """
     body = b"".join(_BLOCK.pack(b.id, len(b.data) + _BLOCK.size) + b.data for b in message.blocks)
     body += _PAD * (-len(body) % 4)
@@ -174,31 +170,25 @@ def encode(message: Message) -> bytes:
 
 
 def decode_header(raw: bytes) -> Header:
-    """Check sync word and checksum of the first 16 bytes of a message. Raises ProtocolError."""
+    """Decode the first 16 bytes of a message, sync word and header. Raises ProtocolError."""
     if len(raw) < SYNC_BYTES + HEADER_BYTES or raw[:SYNC_BYTES] not in (HOST_SYNC, DEVICE_SYNC):
         raise ProtocolError(f"no sync word in {raw[:16].hex()}", _WHY, _DO)
     head = raw[SYNC_BYTES : SYNC_BYTES + HEADER_BYTES]
-    opcode, length, flags, remaining, count, told = _HEADER.unpack(head)
-    if checksum(head[:-2]) != told:
-        raise ProtocolError(f"header {head.hex()}: checksum {told:04x} is wrong", _WHY, _DO)
+    opcode, length, flags, remaining, count, expected = _HEADER.unpack(head)
+    if checksum(head[:-2]) != expected:
+        raise ProtocolError(f"header {head.hex()}: checksum {expected:04x} is wrong", _WHY, _DO)
     header = Header(opcode & 0xF, Kind(opcode >> 4 & 3), opcode >> 6, length, flags, remaining, count)
     if not HEADER_BYTES + header.crc_bytes <= length <= MESSAGE_LIMIT - SYNC_BYTES:
-        raise ProtocolError(f"header {head.hex()}: a length of {length} bytes is impossible", _WHY, _DO)
+        raise ProtocolError(f"header {head.hex()}: invalid length of {length} bytes", _WHY, _DO)
     return header
 
 
 def decode(raw: bytes) -> Message:
-    """A message from its bytes, sync word first.
-
-    Raises
-    ------
-    ProtocolError
-        when sync word, checksum, CRC, length or sub-blocks are wrong.
-    """
+    """Decode a message. Raises ProtocolError if sync word, checksum, CRC, length or sub-blocks are wrong."""
     header = decode_header(raw)
     inner = raw[SYNC_BYTES:]
     if len(inner) != header.length:
-        raise ProtocolError(f"{len(inner)} bytes of a message that says {header.length}", _WHY, _DO)
+        raise ProtocolError(f"{len(inner)} bytes of a message of {header.length}", _WHY, _DO)
     end = header.length - header.crc_bytes
     if crc(inner[:end], header.crc_bytes) != inner[end:]:
         raise ProtocolError(f"message {inner.hex()}: its CRC is wrong", _WHY, _DO)
@@ -218,7 +208,7 @@ def decode(raw: bytes) -> Message:
 
 
 def crc(data: bytes, size: int) -> bytes:
-    """CRC of 0, 2 or 4 bytes (ICD table 2.7): 16 bit CCITT from 0xFFFF, 32 bit as of Ethernet; little-endian."""
+    """Compute a CRC of 0, 2 or 4 bytes (ICD table 2.7): CCITT from 0xFFFF, or that of Ethernet; little-endian."""
     if size == 0:
         return b""
     value = zlib.crc32(data) if size == 4 else binascii.crc_hqx(data, 0xFFFF)

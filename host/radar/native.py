@@ -1,7 +1,7 @@
-"""Radars that this host configures and arms itself, over USB: the backend `native`.
+"""The backend `native`: this host configures and arms the radars over USB.
 
-A board that failed is reset and configured anew when the next row, or the same one again, is armed; where its link is
-gone, that is opened anew. Not run on hardware yet.
+After a fault a board is reset and configured again when the next row, or the retake of a row, is armed; a lost link is
+reopened. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from polysight.host.radar.usb import SCHEME, open_tcp, open_usb
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError, DeviceError
 
-_LOOK_S = 0.005
-_REOPEN_S = 5.0  # USB takes a moment to find a chip again
-_REOPEN_EVERY_S = 0.25
-_TOLD = {
+_POLL_S = 0.005
+_REOPEN_TIMEOUT_S = 5.0  # USB needs some time to find a chip again
+_REOPEN_INTERVAL_S = 0.25
+_STATES = {
     State.ARMED: RadarState.ARMED,
     State.RUNNING: RadarState.ARMED,
     State.DONE: RadarState.DONE,
@@ -36,27 +36,27 @@ _TOLD = {
 
 
 def open_board(place: str, slow: bool = False) -> WordLink:
-    """A board's word link by its USB serial number, `usb:PATH`, or `tcp://address:port`.
+    """Open a board's word link by its USB serial number, `usb:PATH`, or `tcp://address:port`.
 
-    `slow` sends words one by one at 1 MHz. Raises ConfigError, DeviceError.
+    `slow`: send words one by one at 1 MHz. Raises ConfigError, DeviceError.
     """
     return open_tcp(place, slow) if place.startswith(SCHEME) else open_usb(place, slow)
 
 
 def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmware: Image | None) -> RadarBoard:
-    """One board of a rig behind a word link, with the firmware that the rig file asks for."""
+    """Create a board of a rig with its word link and firmware."""
     native = rig.radar.native[name]
-    made = program(rig, rig.by_name(name))
-    settings = b"".join(one.block().data for one in (*made.basic, *made.waveform))
+    commands = program(rig, rig.by_name(name))
+    settings = b"".join(one.block().data for one in (*commands.basic, *commands.waveform))
     folder = rig.radar.calibration_dir
     calibration = CalibrationFiles(Path(folder), settings) if folder else None
-    return RadarBoard(name, words, clock, made, firmware, native.die_id, calibration)
+    return RadarBoard(name, words, clock, commands, firmware, native.die_id, calibration)
 
 
 def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
-    """Each constraint with its value, and, where all hold, the settings of each board as hexadecimal; whether they do.
+    """Return lines with each constraint and, if all hold, each board's commands in hexadecimal; and whether all hold.
 
-    Beside the settings a board is sent power-up and RF init, questions and the start of its frames.
+    Power-up, RF init, queries and the start of frames are not among the commands.
     """
     frames = rig.grid.columns * rig.burst.pulses
     found = constraints(rig, frames)
@@ -66,17 +66,17 @@ def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
     if not all(c.holds for c in found):
         return [*lines, "\nnothing would be sent"], False
     for board in rig.boards:
-        lines.append(f"\n{board.name}, its settings, numbered as if they alone were sent:")
-        made = program(rig, board)
-        for number, sent in enumerate((*made.basic, *made.waveform, *made.frames(frames))):
+        lines.append(f"\n{board.name}, its settings, with sequence numbers as if only they were sent:")
+        commands = program(rig, board)
+        for number, sent in enumerate((*commands.basic, *commands.waveform, *commands.frames(frames))):
             raw = encode(command((sent.block(),), sequence=number % 16))
-            lines.append(f"  {type(sent).__name__:19} {raw.hex()}")
-    lines.append("\nnot shown: power-up, RF init, frame start, and questions (versions, die id, temperatures)")
+            lines.append(f"  {sent.name:19} {raw.hex()}")
+    lines.append("\nnot shown: power-up, RF init, frame start, and queries (versions, die id, temperatures)")
     return lines, True
 
 
 def firmware_of(rig: Instrument) -> Image | None:
-    """The image that a rig file wants in its boards' RAM, checked. Raises ConfigError."""
+    """Read and check the firmware image of a rig file; None if it has none. Raises ConfigError."""
     if not rig.radar.firmware:
         return None
     try:
@@ -87,31 +87,31 @@ def firmware_of(rig: Instrument) -> Image | None:
         ) from None
 
 
-class _NoLink:
-    """In place of a link that did not come back: whatever is asked of it fails as opening it did."""
+class _LostLink:
+    """Replaces a link that could not be reopened; every call raises the error of opening it."""
 
     def __init__(self, error: DeviceError) -> None:
         self._error = error
 
     def write(self, words: Sequence[int]) -> None:
         del words
-        raise self._again()
+        raise self._copy()
 
     def read(self, count: int) -> list[int]:
         del count
-        raise self._again()
+        raise self._copy()
 
     def interrupt(self) -> bool:
-        raise self._again()
+        raise self._copy()
 
     def reset(self, held: bool) -> None:
         del held
-        raise self._again()
+        raise self._copy()
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing."""
 
-    def _again(self) -> DeviceError:
+    def _copy(self) -> DeviceError:
         return DeviceError(self._error.what, self._error.why, self._error.remedy)
 
 
@@ -120,28 +120,30 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise ConfigError(
-            f"radar.trace_dir: {folder} cannot be made: {e.strerror}", "a typing error, or no right", "correct the path"
+            f"radar.trace_dir: {folder} cannot be created: {e.strerror}",
+            "a typing error, or a missing permission",
+            "correct the path",
         ) from None
 
 
 class NativeRadars(RadarControl):
-    """Every board of a rig, each by the serial number of its USB chip.
+    """All boards of a rig, identified by the serial number of their USB chips.
 
     Parameters
     ----------
     rig
-        With `radar.native` for each board. What it asks of the radars is looked at before anything is written.
+        Rig file with `radar.native` for each board; its constraints are checked before anything is sent.
     open_words
-        Opens a board's word link by its place: `open_board`, fast or slow as the rig file says, when None.
+        Opens a board's word link by its place; default: `open_board`.
     clock
-        Time.
+        Default: the system's.
 
     Raises
     ------
     ConfigError
-        when a constraint is broken (:mod:`polysight.host.radar.constraints`), or the USB library is missing.
+        if a constraint is broken, or the USB library is missing.
     DeviceError
-        when a board cannot be opened or configured.
+        if a board cannot be opened or configured.
     """
 
     def __init__(
@@ -164,32 +166,32 @@ class NativeRadars(RadarControl):
                 self._boards[board.name] = radar_board(rig, board.name, words, self._clock, firmware)
             for board in self._boards.values():
                 board.configure()
-            self._tell_apart()
+            self._check_distinct()
             opened.pop_all()
 
     def arm(self, frames: int) -> None:
-        """Start `frames` frames on every board; each has said that it waits for triggers when this returns, or failed.
+        """Start `frames` frames on every board and wait until each waits for triggers or has failed.
 
-        One that failed says so in `states`: that costs a take, not the scan. Raises ConfigError.
+        `states` reports a failed board, which costs a take, not the scan. Raises ConfigError.
         """
         require(self._rig, frames)
         for board in self._boards.values():
             try:
                 board.arm(frames)
-            except DeviceError:  # a chip that went and came back has left a dead link behind
+            except DeviceError:  # a chip that was disconnected and came back leaves a dead link
                 if self._reopen(board):
                     with suppress(DeviceError):
                         board.arm(frames)
 
-    def _tell_apart(self) -> None:
-        """Raises DeviceError when two boards have one die id: they are one board, named twice."""
+    def _check_distinct(self) -> None:
+        """Raise DeviceError if two boards have the same die id, so that two names refer to one board."""
         found: dict[object, str] = {}
         for name, board in self._boards.items():
             die = board.facts.get("die_id", name)
             if die != NO_DIE and die in found:
                 raise DeviceError(
                     f"{found[die]} and {name} have the same die id {die}",
-                    "both names of radar.native lead to one board",
+                    "both names in radar.native refer to one board",
                     "correct usb_serial or usb_path of one of them",
                 )
             found[die] = name
@@ -200,65 +202,65 @@ class NativeRadars(RadarControl):
             return words
         try:
             found = traced(words, self._clock, new_trace(Path(folder), name), self._rig, name)
-        except OSError:  # a disk that is full: the board is worth more than its trace
+        except OSError:  # such as a full disk: continue without a trace
             return words
         self._traces.append(found)
         return found
 
     def _reopen(self, board: RadarBoard) -> bool:
-        """Open a failed board's link anew; False when it does not come back."""
-        with suppress(OSError):  # of a device that is not there any more
+        """Reopen a failed board's link; return False after the timeout."""
+        with suppress(OSError):  # the device is gone
             board.close()
-        deadline = self._clock.now() + _REOPEN_S
+        deadline = self._clock.now() + _REOPEN_TIMEOUT_S
         while True:
             try:
                 board.reconnect(self._open(board.name))
                 return True
             except DeviceError as e:
                 if self._clock.now() > deadline:
-                    board.reconnect(_NoLink(e))
+                    board.reconnect(_LostLink(e))
                     return False
-            self._clock.sleep(_REOPEN_EVERY_S)
+            self._clock.sleep(_REOPEN_INTERVAL_S)
 
     def row_begins(self) -> None:
-        """Pulses may come from now on."""
+        """Note that pulses may come from now on."""
         for board in self._boards.values():
             board.pulses_begin()
 
-    def wait_done(self, limit_s: float) -> list[str]:
-        """Boards that do not say within the limit that all their frames ended: they missed pulses, or failed."""
-        deadline = self._clock.now() + limit_s
+    def wait_done(self, timeout_s: float) -> list[str]:
+        """Wait for the end of all frames; return the boards that missed pulses or failed."""
+        deadline = self._clock.now() + timeout_s
         while waiting := [n for n, b in self._boards.items() if b.poll() in (State.ARMED, State.RUNNING)]:
             if self._clock.now() > deadline:
                 break
-            self._clock.sleep(_LOOK_S)
+            self._clock.sleep(_POLL_S)
         return [n for n, b in self._boards.items() if n in waiting or b.state is State.FAULT]
 
     def states(self) -> dict[str, BoardState]:
-        """What each board has said, by name; a link that is gone is a fault. Boards not armed are left out."""
+        """Return the states by name, without boards that are not armed; a lost link is a fault."""
         found = {}
         for name, board in self._boards.items():
             state = board.poll()
-            if state in _TOLD:
+            if state in _STATES:
                 detail = board.reason if state is State.FAULT else state.value
-                found[name] = BoardState(_TOLD[state], detail)
+                found[name] = BoardState(_STATES[state], detail)
         return found
 
     def report(self) -> dict[str, object]:
-        """For the manifest: what was checked, what each board said of itself, and every byte sent since then."""
-        told: dict[str, object] = {"control": "native", "boards": {n: b.report() for n, b in self._boards.items()}}
+        """Return checked constraints, and the report of each board since the last call, for the manifest."""
+        report: dict[str, object] = {"control": "native", "boards": {n: b.report() for n, b in self._boards.items()}}
         if self._constraints:
-            told["constraints"] = self._constraints
-            told["direct_if_hz"] = {
+            report["constraints"] = self._constraints
+            report["direct_if_hz"] = {
                 b.name: round(direct_if_hz(self._rig, b)) for b in self._rig.boards if b.role != "transmit"
             }
             self._constraints = []
         if self._traces:
-            told["traces"] = [{"file": str(t.file), "ended": t.ended} for t in self._traces]
-        return told
+            report["traces"] = [{"file": str(t.file), "ended": t.ended} for t in self._traces]
+        return report
 
     def close(self) -> None:
-        """Stop what waits, and let go of every board."""
+        """Stop waiting boards and close all links."""
         for board in self._boards.values():
             board.close()
         self._boards = {}

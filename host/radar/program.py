@@ -1,6 +1,6 @@
-"""What a board is told from power-up to its frames.
+"""Sequence of commands for a board, from the rig file.
 
-Order: ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. Not run on hardware yet.
+The order follows ICD section 3 and the notes of each sub-block; docs/spec/mmwavelink.md. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from polysight.host.radar import commands as c
 from polysight.shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instrument
 
 TRIGGER_MARGIN_US = 200.0
-"""From the end of a frame's period to the next pulse: 150 us at least, 300 us at most recommended (ICD 93)."""
+"""Time from the end of a frame's period to the next pulse; 150 us to 300 us are recommended (ICD 93)."""
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,9 @@ class Program:
     Attributes
     ----------
     basic
-        After the RF core is up.
+        After the power-up of the RF core.
     waveform
-        After the RF core is calibrated.
+        After the calibration of the RF core.
     """
 
     basic: tuple[c.Command, ...]
@@ -34,40 +34,40 @@ class Program:
     transmits: bool = False
 
     def frames(self, count: int, trigger: int = c.HARDWARE_TRIGGER) -> tuple[c.Command, ...]:
-        """Frames of the burst: the RF core's part, then the main core's."""
+        """Return the frame commands: for the RF core, then for the main core."""
         frame = c.Frame(count, self.frame_period_us, self.samples, self.chirps, trigger=trigger)
         return (frame, c.FrameApply(self.samples, self.chirps))
 
 
 def frame_period_us(rig: Instrument) -> float:
-    """Frame period that leaves the margin before the next pulse of a burst, microseconds."""
+    """Return the frame period, with a margin before the next pulse of a burst, microseconds."""
     return rig.burst.period_us - TRIGGER_MARGIN_US
 
 
 def chirp_us(rig: Instrument) -> float:
-    """Time of one chirp: idle, ramp, and the 10 ns that a ramp takes longer than programmed (ICD 82)."""
+    """Return the duration of a chirp: idle, ramp, and 10 ns that a ramp takes longer than programmed (ICD 82)."""
     return rig.radar.idle_us + rig.chirp.ramp_end_us + c.CHIRP_TICK_US
 
 
 def tx_mask(rig: Instrument, board: Board) -> int:
-    """The transmitters a board uses: one on the transmitting board, none on the others."""
+    """Return the bit mask of a board's transmitters: one on the transmitting board, none on the others."""
     return 1 << board.tx_antenna if board.name == rig.transmitter.name else 0
 
 
 def program(rig: Instrument, board: Board) -> Program:
-    """The commands for a board of a rig. Raises ValueError when a value fits no field."""
+    """Return the commands for a board. Raises ValueError if a value exceeds its field."""
     chirp, tx = rig.chirp, tx_mask(rig, board)
     native = rig.radar.native[board.name]
     rx = (1 << len(rig.antennas.rx_mm)) - 1
-    made = Program(
+    commands = Program(
         basic=(
             c.Channels(rx, tx),
             c.AdcOutput(chirp.if_mode),
             c.LdoBypass(native.ldo_bypass),
             c.DataFormat(rx),
-            c.LowPower(),
-            c.ApllBandwidth(),
-            c.RfDevice(),
+            c.LOW_POWER_OFF,
+            c.APLL_BANDWIDTH,
+            c.RF_DEVICE,
         ),
         waveform=(
             c.Profile(
@@ -78,24 +78,24 @@ def program(rig: Instrument, board: Board) -> Program:
                 chirp.ramp_end_us,
                 chirp.samples,
                 chirp.sample_rate_hz,
-                chirp.hpf1_khz or HPF_FIRST_KHZ[0],  # 0: a simulated rig without filter, its radars have none to set
+                chirp.hpf1_khz or HPF_FIRST_KHZ[0],  # 0: a simulated rig without filters
                 chirp.hpf2_khz or HPF_SECOND_KHZ[0],
                 rig.radar.rx_gain_db,
                 rig.radar.rf_gain_target_db,
                 rig.radar.tx_backoff_db,
             ),
             c.Chirp(tx),
-            c.DataPath(),
-            c.DataPathClock(),
-            c.HsiClock(),
-            c.LaneEnable(),
-            c.LvdsLanes(),
+            c.DATA_PATH,
+            c.DATA_PATH_CLOCK,
+            c.HSI_CLOCK,
+            c.LANE_ENABLE,
+            c.LVDS_LANES,
         ),
         samples=chirp.samples,
         frame_period_us=frame_period_us(rig),
         chirps=rig.burst.chirps,
         transmits=bool(tx),
     )
-    for command in (*made.basic, *made.waveform):
-        command.block()  # refuses here what fits no field
-    return made
+    for command in (*commands.basic, *commands.waveform):
+        command.block()  # raises ValueError for a value that exceeds its field
+    return commands

@@ -1,9 +1,8 @@
-"""Word links to a board: the DCA1000's FT4232H over USB, or its four channels over TCP.
+"""Word links to a board: the FT4232H of a DCA1000 over USB, or its four channels over TCP.
 
-`UsbWords` turns words, interrupt, reset and sense lines into MPSSE commands on the chip's four channels. `open_usb`
-opens them by serial number or path on the bus with pyftdi (the extra `radar`); `open_tcp` reaches channels that another
-program serves.
-Not run on hardware yet.
+`UsbWords` translates words, interrupt, reset and sense lines to MPSSE commands on the chip's four channels. `open_usb`
+opens them by serial number or USB path with pyftdi (the extra `radar`), `open_tcp` those of a TCP server. Not run on
+hardware yet.
 """
 
 from __future__ import annotations
@@ -16,16 +15,17 @@ from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple, Protocol
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 
 # The FT4232H over USB.
 VENDOR, PRODUCT = 0x0451, 0xFD03
-PATH = "usb:"  # before a path on the bus, "usb:1-4.2"; without it, a serial number
-_READ_S = 0.5
+PATH = "usb:"  # prefix of a USB path, "usb:1-4.2"; without it, a serial number
+_READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
-_CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists what is there"
+_CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
 
-# A board whose channels are served over TCP.
+# Channels over TCP.
 SCHEME = "tcp://"
 _HEAD = struct.Struct("<ccH")
 _TIMEOUT_S = 30.0
@@ -50,34 +50,34 @@ _RESET_S = 0.01
 
 
 class Port(Protocol):
-    """One channel of the chip, opened in its mode."""
+    """One open channel of the chip."""
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the channel. Raises DeviceError when the chip is gone."""
+        """Send bytes. Raises DeviceError if the chip is lost."""
         ...
 
     def read(self, size: int) -> bytes:
-        """Up to so many bytes from the channel. Raises DeviceError when the chip is gone."""
+        """Receive up to `size` bytes. Raises DeviceError if the chip is lost."""
         ...
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the channel."""
         ...
 
 
 def set_up_spi(divisor: int = SPI_DIVISOR) -> bytes:
-    """What channel A is told first."""
+    """Return the initial commands of channel A."""
     clock = bytes((_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _DIVISOR, divisor, 0))
     return clock + bytes((_PINS, IDLE, SPI_DIRECTION, _NO_LOOPBACK))
 
 
 def set_up_interrupt() -> bytes:
-    """What channel B is told first."""
+    """Return the initial commands of channel B."""
     return bytes((_FULL_SPEED, _NO_ADAPTIVE, _THREE_PHASE, _PINS, INTERRUPT_IDLE, INTERRUPT_DIRECTION, _NO_LOOPBACK))
 
 
 def write_words(words: Sequence[int]) -> bytes:
-    """Words out: chip select low, two bytes on the falling edge, chip select high, for each."""
+    """Return commands that shift words out: for each, chip select low, two bytes on the falling edge, select high."""
     select = bytes((_PINS, SELECTED_WRITE, SPI_DIRECTION)) * _SELECT_COMMANDS
     parts = bytearray()
     for word in words:
@@ -86,15 +86,15 @@ def write_words(words: Sequence[int]) -> bytes:
 
 
 def read_words(count: int) -> bytes:
-    """Words in: chip select low, two bytes on the rising edge, chip select high, for each."""
+    """Return commands that shift words in: for each, chip select low, two bytes on the rising edge, select high."""
     select = bytes((_PINS, SELECTED_READ, SPI_DIRECTION)) * _SELECT_COMMANDS
     return (select + bytes((_READ_BYTES, 1, 0)) + _DESELECT) * count + bytes((_NOW,))
 
 
 class UsbWords:
-    """A board behind the four channels of one chip; satisfies :class:`polysight.host.radar.spi.WordLink`.
+    """Word link (`spi.WordLink`) through the four channels of a chip.
 
-    `slow`: one word a USB transfer, 0.1 ms apart, at 1 MHz.
+    `slow`: one word in each USB transfer, every 0.1 ms, at 1 MHz.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class UsbWords:
         words: list[int] = []
         for part in [1] * count if self._slow else [count]:
             self._spi.write(read_words(part))
-            data = _exactly(self._spi, 2 * part)
+            data = _read_exactly(self._spi, 2 * part)
             words += [int.from_bytes(data[at : at + 2], "big") for at in range(0, 2 * part, 2)]
             self._pause()
         return words
@@ -132,31 +132,33 @@ class UsbWords:
             self._sleep(_SLOW_GAP_S)
 
     def interrupt(self) -> bool:
-        """Whether the host interrupt is high. Raises DeviceError."""
+        """Return True if the host interrupt is high. Raises DeviceError."""
         self._interrupt.write(bytes((_READ_PINS, _NOW)))
-        return bool(_exactly(self._interrupt, 1)[0] >> INTERRUPT_BIT & 1)
+        return bool(_read_exactly(self._interrupt, 1)[0] >> INTERRUPT_BIT & 1)
 
     def reset(self, held: bool) -> None:
-        """Sense lines to functional mode, then hold or release the reset. Raises DeviceError."""
+        """Set the sense lines to functional mode, then hold or release the reset. Raises DeviceError."""
         self._sense.write(bytes((FUNCTIONAL_MODE,)))
         self._reset.write(bytes((1 << WARM_RESET_PIN | (0 if held else 1 << RESET_PIN),)))
         self._sleep(_RESET_S)
 
     def close(self) -> None:
-        """Let go of the chip."""
+        """Close the channels."""
         for port in (self._spi, self._interrupt, self._reset, self._sense):
             port.close()
 
 
-def _exactly(port: Port, size: int) -> bytes:
+def _read_exactly(port: Port, size: int) -> bytes:
     data = port.read(size)
     if len(data) != size:
-        raise DeviceError(f"{len(data)} of {size} bytes came over USB", "the cable is loose", "check the USB cable")
+        raise DeviceError(
+            f"timeout: received {len(data)} of {size} bytes over USB", "the cable is loose", "check the USB cable"
+        )
     return data
 
 
 class FtdiPort:
-    """One channel of a chip, in MPSSE or bit-bang mode. Errors of the USB library become DeviceError."""
+    """One channel of a chip over USB, in MPSSE or bit-bang mode; errors of the USB library become DeviceError."""
 
     def __init__(self, place: str, chip: Any, interface: int, direction: int, bit_bang: bool) -> None:
         self._library = _library()
@@ -175,40 +177,40 @@ class FtdiPort:
         except self._library.errors as e:
             self.close()
             what = f"radar USB {place}, channel {'ABCD'[interface - 1]}: cannot be opened: {e}"
-            raise DeviceError(what, _cause(e, "unplugged meanwhile, or libusb is missing"), _CHECK) from None
+            raise DeviceError(what, _cause(e, "it was unplugged, or libusb is missing"), _CHECK) from None
 
     def write(self, data: bytes) -> None:
         """Send bytes. Raises DeviceError."""
         try:
             self._ftdi.write_data(data)
         except self._library.errors as e:
-            raise self._gone(e) from None
+            raise self._lost(e) from None
 
     def read(self, size: int) -> bytes:
-        """Up to so many bytes, after half a second those that came. Raises DeviceError."""
-        found, deadline = bytearray(), time.monotonic() + _READ_S
+        """Receive up to `size` bytes, with a timeout of half a second. Raises DeviceError."""
+        found, deadline = bytearray(), time.monotonic() + _READ_TIMEOUT_S
         try:
             while len(found) < size and time.monotonic() < deadline:
                 found += self._ftdi.read_data_bytes(size - len(found), attempt=4)
         except self._library.errors as e:
-            raise self._gone(e) from None
+            raise self._lost(e) from None
         return bytes(found)
 
     def close(self) -> None:
-        """Let go of it, its pins as they are; of one that is gone, too."""
+        """Close the channel, also of a lost chip; the pins keep their levels."""
         device = self._ftdi.usb_dev
         try:
             self._ftdi.close(freeze=True)
-        except (*self._library.errors, TypeError):  # gone, or pyftdi had opened it halfway
-            self._library.tools.release_device(device)  # which else counts it as open, and gives it to the next
+        except (*self._library.errors, TypeError):  # lost, or not opened completely by pyftdi
+            self._library.tools.release_device(device)  # otherwise pyftdi counts it as open
 
-    def _gone(self, e: BaseException) -> DeviceError:
+    def _lost(self, e: BaseException) -> DeviceError:
         why = _cause(e, "the cable was pulled, or the board lost power")
         return DeviceError(f"radar USB {self._place}: {e}", why, _CHECK)
 
 
 _CAUSES = {
-    errno.EBUSY: "another program holds this chip: mmWave Studio, or a second polysight; end it",
+    errno.EBUSY: "another program uses this chip: mmWave Studio, or a second polysight; end it",
     errno.EACCES: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
     errno.EPERM: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
     errno.ETIMEDOUT: "the chip does not answer: a loose cable, or a hub without power",
@@ -216,7 +218,7 @@ _CAUSES = {
 
 
 def _cause(e: BaseException | None, otherwise: str) -> str:
-    """The likely cause by the error's number; pyftdi keeps that of libusb in the error behind its own."""
+    """Return the likely cause by errno, also from the errors behind `e`, where pyftdi keeps that of libusb."""
     while e is not None:
         if getattr(e, "errno", None) in _CAUSES:
             return _CAUSES[getattr(e, "errno", 0)]
@@ -225,16 +227,14 @@ def _cause(e: BaseException | None, otherwise: str) -> str:
 
 
 def open_usb(place: str, slow: bool = False) -> UsbWords:
-    """A board by the serial number of its USB chip, or by `usb:` and its path on the bus.
-
-    The bus is looked at anew each time, so that a chip that was plugged in since is found.
+    """Open a board by the serial number of its USB chip, or by `usb:` and its path; scans the bus each time.
 
     Raises
     ------
     ConfigError
-        when pyftdi is not installed.
+        if pyftdi is not installed.
     DeviceError
-        when the chip cannot be opened.
+        if the chip cannot be opened.
     """
     library = _library()
     library.tools.flush_cache()
@@ -260,7 +260,7 @@ def open_usb(place: str, slow: bool = False) -> UsbWords:
 
 
 class _Library(NamedTuple):
-    """What is used of pyftdi and pyusb."""
+    """The parts of pyftdi and pyusb that are used here."""
 
     ftdi: Any
     tools: Any
@@ -268,44 +268,46 @@ class _Library(NamedTuple):
     find: Callable[..., Any]
 
     def chip_at(self, place: str) -> Any:
-        """The one chip that is meant. Raises DeviceError when there is none, or more than one."""
-        wanted = place.removeprefix(PATH)
+        """Return the chip with this serial number or path. Raises DeviceError if there is none, or more than one."""
+        name = place.removeprefix(PATH)
         try:
             backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)  # pyftdi's, in its order
             backend = next((b for b in backends if b is not None), None)
             chips = list(self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend))
             paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in chips}
             by_path = place.startswith(PATH)
-            meant = [p for p, d in paths.items() if (p if by_path else self._serial(d)) == wanted]
+            matching = [p for p, d in paths.items() if (p if by_path else self._serial(d)) == name]
         except self.errors as e:
-            raise DeviceError(f"radar USB {place}: {e}", _cause(e, "libusb is missing, or unplugged"), _CHECK) from None
-        there = f"there are {', '.join(sorted(paths))}" if paths else "there is none on the bus"
-        if not meant:
+            raise DeviceError(
+                f"radar USB {place}: {e}", _cause(e, "libusb is missing, or the chip was unplugged"), _CHECK
+            ) from None
+        found = f"chips at {', '.join(sorted(paths))}" if paths else "no chip on the bus"
+        if not matching:
             what = "at this path" if by_path else "with this serial number"
             raise DeviceError(
-                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {there}",
+                f"radar USB {place}: cannot be opened: no chip 0451:fd03 {what}; {found}",
                 "unplugged, another serial number or path, or no permission (a udev rule for 0451:fd03)",
                 _CHECK,
             )
-        if len(meant) > 1:
+        if len(matching) > 1:
             raise DeviceError(
-                f"radar USB {place}: {len(meant)} chips have this serial number, at {', '.join(sorted(meant))}",
-                "which of them is meant cannot be told; none was opened",
-                f'name it by its place instead of usb_serial: usb_path = "{min(meant)}", or another of these',
+                f"radar USB {place}: {len(matching)} chips have this serial number, at {', '.join(sorted(matching))}",
+                "the serial number does not identify the board; none was opened",
+                f'use its path instead of usb_serial: usb_path = "{min(matching)}", or another one',
             )
-        return paths[meant[0]]
+        return paths[matching[0]]
 
     def _serial(self, chip: Any) -> str | None:
-        """A chip's serial number; None of one that has none, or may not be asked."""
+        """Return a chip's serial number; None if it has none or cannot be read."""
         try:
             return self.tools.get_string(chip, chip.iSerialNumber) if chip.iSerialNumber else None
         except self.errors:
             return None
 
     def share(self, chip: Any) -> Any:
-        """A chip for one more of its channels, counted where pyftdi counts them.
+        """Return a chip for one more channel, and count it in pyftdi's list.
 
-        pyftdi's own look-up takes any chip when it is given bus and address alone.
+        pyftdi's own search by bus and address alone returns any chip.
         """
         with self.tools.Lock:
             opened = self.tools.Devices.setdefault((chip.bus, chip.address, VENDOR, PRODUCT), [chip, 0])
@@ -314,7 +316,7 @@ class _Library(NamedTuple):
 
 
 def _library() -> _Library:
-    """pyftdi, loaded only here, so that a host without radars does not need it. Raises ConfigError."""
+    """Import pyftdi, which only this backend needs. Raises ConfigError."""
     try:
         from pyftdi.ftdi import Ftdi
         from pyftdi.usbtools import UsbTools, UsbToolsError
@@ -324,13 +326,14 @@ def _library() -> _Library:
             'radar.control = "native" needs pyftdi, which is not installed',
             "it comes with the host's extra `radar`",
             "pip install 'polysight[radar]' (in this repository: .venv/bin/pip install -e '.[radar]')",
+            code=ErrorCode.PACKAGE_MISSING,
         ) from None
     # FtdiError and USBError are OSErrors
     return _Library(Ftdi, UsbTools, (OSError, ValueError, UsbToolsError), find)
 
 
 class _TcpPort:
-    """One channel on a connection that all four share."""
+    """One channel over TCP; all four share a connection."""
 
     def __init__(self, address: str, connection: socket.socket, channel: bytes) -> None:
         self._address, self._connection, self._channel = address, connection, channel
@@ -340,20 +343,20 @@ class _TcpPort:
         self._send(_HEAD.pack(self._channel, b"W", len(data)) + data)
 
     def read(self, size: int) -> bytes:
-        """Up to so many bytes. Raises DeviceError."""
+        """Receive up to `size` bytes. Raises DeviceError."""
         self._send(_HEAD.pack(self._channel, b"R", size))
         (count,) = struct.unpack("<H", self._receive(2))
         return self._receive(count)
 
     def close(self) -> None:
-        """Close the connection, of all channels."""
+        """Close the connection of all channels."""
         self._connection.close()
 
     def _send(self, data: bytes) -> None:
         try:
             self._connection.sendall(data)
         except OSError as e:
-            raise self._gone(e.strerror or str(e)) from None
+            raise self._lost(e.strerror or str(e)) from None
 
     def _receive(self, size: int) -> bytes:
         data = b""
@@ -361,26 +364,29 @@ class _TcpPort:
             while len(data) < size:
                 part = self._connection.recv(size - len(data))
                 if not part:
-                    raise self._gone("closed by the other side")
+                    raise self._lost("closed by the other side")
                 data += part
         except OSError as e:
-            raise self._gone(e.strerror or str(e)) from None
+            raise self._lost(e.strerror or str(e)) from None
         return data
 
-    def _gone(self, what: str) -> DeviceError:
+    def _lost(self, what: str) -> DeviceError:
         return DeviceError(
             f"radar at {self._address}: {what}", "its USB cable was pulled, or its program ended", "check that machine"
         )
 
 
 def open_tcp(address: str, slow: bool = False) -> UsbWords:
-    """A board by `tcp://address:port`. Raises DeviceError when nobody is there."""
+    """Open a board by `tcp://address:port`. Raises DeviceError if there is no server."""
     host, _, port = address.removeprefix(SCHEME).rpartition(":")
     try:
         connection = socket.create_connection((host, int(port)), _TIMEOUT_S)
     except (OSError, ValueError) as e:
         raise DeviceError(
-            f"radar at {address}: cannot be reached: {e}", "nobody serves a USB chip there", "start it, or correct it"
+            f"radar at {address}: cannot be reached: {e}",
+            "no server for a USB chip at this address",
+            "start it, or correct the address",
+            code=ErrorCode.NO_ANSWER,
         ) from None
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     spi, interrupt, reset, sense = (_TcpPort(address, connection, c) for c in (b"A", b"B", b"C", b"D"))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.products import fresh_part
+from polysight.host.products import temporary_path
 from polysight.host.store import versions
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
@@ -120,7 +120,7 @@ def write_cphd(path: Path, history: PhaseHistory) -> None:
     first = history.channels[0].name
     where = next(k for k, child in enumerate(root) if child.tag.endswith("}Dwell")) + 1
     root.insert(where, cphd.compute_reference_geometry(tree, arrays[first]))
-    part = fresh_part(path)
+    part = temporary_path(path)
     with part.open("wb") as file, cphd.Writer(file, cphd.Metadata(xmltree=tree)) as writer:
         for channel in history.channels:
             writer.write_signal(channel.name, _signal(history, channel))

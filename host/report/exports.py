@@ -17,11 +17,11 @@ import scipy
 from polysight.host.products import (
     CONVENTION,
     SavedProducts,
-    fresh_part,
     full_dataset,
     material_columns,
     read_processed,
     read_products,
+    temporary_path,
     verdict_attributes,
     write_atomically,
     write_netcdf,
@@ -86,7 +86,7 @@ def write_hdf5(path: Path, products: SavedProducts) -> None:
         if h5py is not installed.
     """
     h5py = _h5py()
-    part = fresh_part(path)
+    part = temporary_path(path)
     with h5py.File(part, "w") as f:
         axes = {"y": products.y_m, "x": products.x_m}
         for name, values in axes.items():

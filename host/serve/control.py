@@ -15,12 +15,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
-from polysight.host.acquisition import Wish
+from polysight.host.acquisition import ScanCommand
 from polysight.host.catalogue import NOTES, PROGRAM, Notes, Summary, write_notes
 from polysight.host.jobs.label import save_labels
 from polysight.host.materials import Labels
-from polysight.host.plan import Changes, forecast, numbers
-from polysight.host.products import find_labels, label_place, read_products
+from polysight.host.plan import Changes, forecast, forecast_values
+from polysight.host.products import find_labels, label_folder, read_products
 from polysight.host.serve.guard import cookie_name
 from polysight.host.serve.programs import Programs, program_of
 from polysight.host.serve.site import LIBRARIES, Site
@@ -179,20 +179,20 @@ def _session(site: Site) -> Callable[[Request], Awaitable[Response]]:
 async def _control(site: Site, request: Request, body: Body) -> dict[str, Any]:
     del body
     name, given = site.name(request), request.path_params["wish"]
-    if given not in list(Wish):
+    if given not in list(ScanCommand):
         raise DataError(
-            f"a scan cannot be asked to {given[:40]!r}", "the name is wrong", f"one of {', '.join(Wish)}",
+            f"a scan cannot be asked to {given[:40]!r}", "the name is wrong", f"one of {', '.join(ScanCommand)}",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     watch = await site.read_scan(request, lambda folder: site.watches.of(name, folder))
-    await site.act(watch.ask, Wish(given))
+    await site.act(watch.ask, ScanCommand(given))
     return {"what": "asked"}
 
 
 async def _plan(site: Site, request: Request, body: PlanRequest) -> dict[str, Any]:
     del request
     config = _config(site)
-    plan = await site.read("plan", lambda: numbers(forecast(body.apply(config))))
+    plan = await site.read("plan", lambda: forecast_values(forecast(body.apply(config))))
     rig = load_instrument(config)
     return plan | {"rig": rig.name, "config": str(config), "begun_with": to_builtins(rig)["grid"]}
 
@@ -301,7 +301,7 @@ async def _labels(site: Site, request: Request, body: LabelRequest) -> dict[str,
 
     def save(folder: Path) -> dict[str, Any]:
         products = read_products(folder)
-        place = label_place(products.folder)
+        place = label_folder(products.folder)
         checked, notes = save_labels(place, products, labels)
         return {"what": "saved", "file": str(place / "labels.json"), "metal": checked.metal, "notes": notes}
 

@@ -1,7 +1,9 @@
-"""Scan folders: append-only, self-validating, resumable; and every layout of recorded rows, read through one `Source`.
+"""Scan folders (append-only, self-validating, resumable), and a common `Source` protocol for all recorded layouts.
 
-`ScanFolder` is a scan of ours; `open_source` recognises any layout. The `Source` protocol is rig, plan, the rows that
-hold data, `read_row` and facts about the recording; `raw_source` asks for one with the chirps still in it.
+`ScanFolder` reads and writes our own scans: `manifest` is the log of facts, `events` the Pi's event log, `raw` deletes
+raw data of processed rows, `replace` places rows again from their packets, `validation` checks a folder.
+`open_source` opens any known layout (our own, and the published data in `sources`) as a `Source`: rig, plan, rows with
+data, `read_row`, and facts about the recording. `raw_source` requires a source that contains the chirps.
 """
 
 from polysight.host.store import manifest
@@ -18,9 +20,9 @@ from polysight.host.store.scan_folder import (
     check_same_scan,
     connection_of,
     new_scan_id,
-    reconnected,
     utc_now,
     versions,
+    with_connection,
 )
 from polysight.host.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
 from polysight.host.store.sources.open import is_source, open_source
@@ -67,7 +69,6 @@ __all__ = [
     "raw_source",
     "read_events",
     "read_settings",
-    "reconnected",
     "replace_rows",
     "require_raw",
     "rig_of",
@@ -76,4 +77,5 @@ __all__ = [
     "utc_now",
     "validate",
     "versions",
+    "with_connection",
 ]

@@ -1,15 +1,17 @@
-"""A file that only grows, and whose end is known: what the manifest and the event log are made of.
+"""Append-only file with durable writes, for the manifest and the event log.
 
-Also `sync_folder`, which makes names in a folder durable, and `crc32`, which is zlib-ng's where that is installed.
+Also `sync_folder`, which makes names in a folder durable, and `crc32` (zlib-ng's if installed).
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 from polysight.shared.files import open_to_write
 
@@ -22,24 +24,14 @@ __all__ = ["AppendFile", "crc32", "sync_folder"]
 
 
 class AppendFile:
-    """A file open for durable appending. No buffer: what one call could not write, no later call writes by surprise.
+    """A file open for durable, unbuffered appending; with `create`, made if missing.
 
-    Parameters
-    ----------
-    path
-        The file.
-    create
-        Make it when it is absent.
-
-    Attributes
-    ----------
-    length
-        Bytes that count. What a failed :meth:`append` has left behind them is overwritten or cut off.
+    `length` is the number of valid bytes; bytes behind them, from a failed :meth:`append`, are overwritten or cut off.
 
     Raises
     ------
     DeviceError
-        when it cannot be opened.
+        if the file cannot be opened.
     """
 
     def __init__(self, path: Path, create: bool) -> None:
@@ -53,12 +45,12 @@ class AppendFile:
                 self.length = os.fstat(self._file.fileno()).st_size
                 stack.pop_all()
         except OSError as e:
-            raise self._failed("made" if fresh else "opened", e) from None
+            raise self._failed("created" if fresh else "opened", e) from None
 
     def lock(self) -> bool:
-        """Keep other programs from locking this file, until it is closed; False when one has.
+        """Lock this file until it is closed; return False if another program has locked it.
 
-        Raises DeviceError when the file system cannot lock; the file is closed then.
+        Raises DeviceError if the file system cannot lock, and closes the file then.
         """
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -70,20 +62,21 @@ class AppendFile:
                 f"{self.path}: cannot be locked: {e.strerror}",
                 "a network disk whose server offers no locks, or the disk fails",
                 "put the scan on a local disk, or have its server offer locks",
+                code=ErrorCode.FILE_UNREADABLE,
             ) from None
         return True
 
     def cut(self, length: int) -> None:
-        """Forget what follows the first `length` bytes. Raises DeviceError."""
+        """Truncate the file to `length` bytes. Raises DeviceError."""
         try:
             os.ftruncate(self._file.fileno(), length)
             os.fsync(self._file.fileno())
         except OSError as e:
-            raise self._failed("cut at its last whole record", e) from None
+            raise self._failed("cut at its last complete record", e) from None
         self.length = length
 
     def append(self, data: bytes) -> None:
-        """Write `data` behind the end; it is durable when this returns. Raises DeviceError, and the end stays."""
+        """Append `data` durably. After a DeviceError the file has its former length."""
         left, end = memoryview(data), self.length
         try:
             while left:
@@ -97,19 +90,20 @@ class AppendFile:
         self.length = end
 
     def close(self) -> None:
-        """Close the file. Twice is once."""
+        """Close the file. Safe to repeat."""
         self._file.close()
 
     def _failed(self, done: str, e: OSError) -> DeviceError:
         return DeviceError(
             f"{self.path}: cannot be {done}: {e.strerror}",
             "the disk is full, read-only or fails",
-            f"free space; `polysight resume {self.path.parent}` goes on from the last committed row",
+            f"free space; `polysight resume {self.path.parent}` continues after the last committed row",
+            code=ErrorCode.DISK_FULL if e.errno == errno.ENOSPC else ErrorCode.FILE_UNREADABLE,
         )
 
 
 def sync_folder(path: Path) -> None:
-    """Make names made, renamed or removed in a folder durable. Raises DeviceError."""
+    """Make names that were created, renamed or removed in a folder durable. Raises DeviceError."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -120,5 +114,6 @@ def sync_folder(path: Path) -> None:
         raise DeviceError(
             f"{path}: cannot be made durable: {e.strerror}",
             "the disk is full or fails",
-            f"free space below {path}, then go on",
+            f"free space below {path}, then continue",
+            code=ErrorCode.DISK_FULL,
         ) from None

@@ -1,7 +1,7 @@
-"""The Pi's journalled events as received: msgpack maps one after another in `events.msgpack`, in order, without gaps.
+"""Event log of a scan: the Pi's journalled events as consecutive msgpack maps in `events.msgpack`, without gaps.
 
-Any msgpack reader can stream the file. Each map has a CRC-32, as each line of the manifest has. What a kill or power
-cut has left behind the last whole event is cut off before appending; the Pi's journal has it.
+Any msgpack reader can stream the file. Each map has a CRC-32, as each line of the manifest has. A torn last event,
+after a kill or power cut, is cut off before appending; the Pi's journal contains it.
 """
 
 from __future__ import annotations
@@ -14,41 +14,30 @@ from pathlib import Path
 import msgpack
 
 from polysight.host.store.append_only import AppendFile
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError, ProtocolError
-from polysight.shared.messages import AnyEvent, pack_kept, unpack_kept
+from polysight.shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
 
-DAMAGED = ".damaged"  # suffix of the copy that is kept of a damaged file
+DAMAGED = ".damaged"  # suffix of the copy of a damaged file
 
 
 @dataclass
 class EventLog:
-    """What an event file holds.
+    """Content of an event file."""
 
-    Attributes
-    ----------
-    events
-        The whole events from the beginning up to the first that is not.
-    length
-        Their bytes.
-    torn
-        Whether the beginning of an event, or zeros, or both follow: what a kill or power cut leaves.
-    damage
-        What else follows; empty when nothing does.
-    """
-
-    events: list[AnyEvent]
-    length: int
-    torn: bool = False
-    damage: str = ""
+    events: list[AnyEvent]  # up to the first that is torn or damaged
+    length: int  # their bytes
+    torn: bool = False  # the beginning of an event or zeros follow, as after a kill or power cut
+    damage: str = ""  # description of anything else that follows
 
 
 def read_events(path: Path) -> EventLog:
-    """Read an event file up to its first damage; an absent one is empty. Raises DataError when it cannot be read."""
+    """Read an event file up to its first damage; a missing file is empty. Raises DataError if it is unreadable."""
     raw = _bytes_of(path)
     log = EventLog([], 0)
     try:
         for end in _ends(raw):
-            log.events.append(unpack_kept(raw[log.length : end]))
+            log.events.append(unpack_with_crc(raw[log.length : end]))
             log.length = end
     except ProtocolError as e:
         log.damage = f"event {len(log.events) + 1} is damaged: {e.what}"
@@ -56,13 +45,13 @@ def read_events(path: Path) -> EventLog:
         log.damage = f"event {len(log.events) + 1} is damaged: not msgpack at byte {log.length}"
     tail = raw[log.length :]
     if log.damage and _is_beginning(tail.rstrip(b"\0")):
-        log.damage = ""  # the file grew, and the power was cut before all its bytes were on the disk
+        log.damage = ""  # the file had grown, but not all its bytes were on the disk at a power cut
     log.torn = bool(tail) and not log.damage
     return log
 
 
 def _is_beginning(raw: bytes) -> bool:
-    """Whether this could be the beginning of an event, and no more."""
+    """True if this may be the incomplete beginning of an event."""
     try:
         return not any(True for _ in _ends(raw))
     except (ValueError, msgpack.UnpackException):
@@ -76,12 +65,15 @@ def _bytes_of(path: Path) -> bytes:
         return b""
     except OSError as e:
         raise DataError(
-            f"{path}: cannot be read: {e.strerror}", "no permission, or the disk fails", f"check {path.parent}"
+            f"{path}: cannot be read: {e.strerror}",
+            "no permission, or the disk fails",
+            f"check {path.parent}",
+            code=ErrorCode.FILE_UNREADABLE,
         ) from None
 
 
 def _ends(raw: bytes) -> Iterator[int]:
-    """Where each whole msgpack object ends."""
+    """Yield the end of each complete msgpack object."""
     unpacker = msgpack.Unpacker(raw=True, max_buffer_size=max(len(raw), 1))
     unpacker.feed(raw)
     while True:
@@ -93,19 +85,14 @@ def _ends(raw: bytes) -> Iterator[int]:
 
 
 class EventWriter:
-    """Appends events to a file; they are on the disk after :meth:`sync`.
+    """Appends events to a file; they are durable after :meth:`sync`. `last_seq` is the newest sequence number.
 
-    What follows the last whole event is cut off; a copy of the file as it was is kept beside it.
-
-    Attributes
-    ----------
-    last_seq
-        Sequence number of the newest event.
+    Torn or damaged data behind the last complete event is cut off, and the file kept as a copy.
 
     Raises
     ------
     DataError, DeviceError
-        when the file cannot be read or written.
+        if the file cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -127,12 +114,12 @@ class EventWriter:
         self.last_seq = max((e.seq for e in log.events), default=0)
 
     def append(self, event: AnyEvent) -> None:
-        """Take one event; :meth:`sync` writes it."""
-        self._batch.append(pack_kept(event))
+        """Add one event; :meth:`sync` writes it."""
+        self._batch.append(pack_with_crc(event))
         self.last_seq = event.seq
 
     def sync(self) -> None:
-        """Make everything durable. After a DeviceError nothing is lost: the next call tries again."""
+        """Make all events durable. After a DeviceError the next call retries."""
         data = b"".join(self._batch)
         if data:
             self._file.append(data)
@@ -140,9 +127,9 @@ class EventWriter:
             self._batch.clear()
 
     def digest(self) -> dict[str, int | str]:
-        """Length and CRC-32 of what is on the disk, for the manifest."""
+        """Length and CRC-32 of the file on disk, for the manifest."""
         return {"bytes": self._file.length, "crc32": f"{self._crc:08x}"}
 
     def close(self) -> None:
-        """Close the file; what :meth:`sync` has not written is left to the Pi's journal. Twice is once."""
+        """Close the file without writing pending events, which the Pi's journal contains. Safe to repeat."""
         self._file.close()

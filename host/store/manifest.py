@@ -1,8 +1,8 @@
-"""The manifest of a scan: one JSON line per fact, each with its CRC-32, only ever appended to.
+"""The manifest of a scan: an append-only log with one JSON line per fact, each with its CRC-32.
 
-A line counts when it is complete and its CRC is right. The last line may be torn by a kill or power cut: reading stops
-before it and says so, and appending cuts it off first. Lines form a chain: each carries its count and a digest of the
-line before, so that a line that is gone is noticed. Lines of earlier releases have no chain and are read all the same.
+A line is valid if it is complete and its CRC is right. A last line torn by a kill or power cut is reported by readers
+and cut off before appending. Lines form a chain: each has its count and a digest of the line before, so that missing
+lines are found. Lines of earlier releases have no chain and are still read.
 """
 
 from __future__ import annotations
@@ -12,33 +12,23 @@ import json
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from polysight.host.store.append_only import AppendFile
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError, PolysightError, no_such
-from polysight.shared.files import MOST_JSON_BYTES, read_bounded
+from polysight.shared.files import MAX_JSON_BYTES, read_bounded
 
 Fact = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class ManifestFault:
-    """A line that is damaged, or a place where lines are missing, replaced or out of order.
+    """A damaged line, or a place where lines are missing, replaced or out of order."""
 
-    Attributes
-    ----------
-    line
-        Number of the line in the file, from 1.
-    what
-        What is wrong there.
-    lost
-        Facts that are lost with it.
-    """
-
-    line: int
+    line: int  # number in the file, from 1
     what: str
-    lost: int = 0
+    lost: int = 0  # number of facts lost
 
     def __str__(self) -> str:
         return f"manifest.jsonl line {self.line}: {self.what}"
@@ -46,34 +36,16 @@ class ManifestFault:
 
 @dataclass
 class Manifest:
-    """What a manifest holds.
+    """Content of a manifest."""
 
-    Attributes
-    ----------
-    facts
-        The facts in order, without CRC and chain.
-    numbers
-        Of each fact, the number of its line (from 1).
-    length
-        Bytes up to the end of the last whole line.
-    torn
-        Whether bytes follow that are not a whole line.
-    damaged
-        Line numbers (from 1) before the end whose CRC or form is wrong; they are not among the facts.
-    faults
-        The same, and every place where the chain is broken.
-    count, digest
-        Count of the next line, and the digest that it has to carry.
-    """
-
-    facts: list[Fact] = field(default_factory=list)
-    numbers: list[int] = field(default_factory=list)
-    length: int = 0
-    torn: bool = False
-    damaged: list[int] = field(default_factory=list)
-    faults: list[ManifestFault] = field(default_factory=list)
-    count: int = 0
-    digest: str = ""
+    facts: list[Fact] = field(default_factory=list)  # in order, without CRC and chain
+    numbers: list[int] = field(default_factory=list)  # line number (from 1) of each fact
+    length: int = 0  # bytes up to the end of the last complete line
+    torn: bool = False  # an incomplete line follows
+    damaged: list[int] = field(default_factory=list)  # numbers of lines with a wrong CRC or form
+    faults: list[ManifestFault] = field(default_factory=list)  # damaged lines and breaks in the chain
+    count: int = 0  # of the next line
+    digest: str = ""  # that the next line must have
 
 
 def crc_of(fact: Fact) -> str:
@@ -83,18 +55,18 @@ def crc_of(fact: Fact) -> str:
 
 
 def encode_line(fact: Fact) -> bytes:
-    """A fact as its line, CRC and line end included."""
+    """Encode a fact as a line with CRC and line end."""
     line = json.dumps({**fact, "crc": crc_of(fact)}, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return line.encode("ascii") + b"\n"
 
 
 def digest_of(line: bytes) -> str:
-    """What the next line carries of this one: 16 hex digits of the SHA-256 of its bytes without the line end."""
+    """Return the digest that the next line stores: 16 hex digits of the SHA-256 of the line without its end."""
     return hashlib.sha256(line).hexdigest()[:16]
 
 
 def decode_line(line: bytes) -> Fact | None:
-    """A line's fact without its CRC; None when the line is not one or its CRC is wrong."""
+    """Decode a line to its fact without CRC; None if the line is malformed or its CRC is wrong."""
     try:
         fact = json.loads(line)
     except (ValueError, RecursionError):
@@ -136,66 +108,70 @@ def parse(raw: bytes) -> Manifest:
 
 
 def _take_link(fact: Fact) -> tuple[int, str] | None:
-    """Take count and digest of the line before out of a fact; None for a line without chain."""
+    """Remove and return a fact's count and its digest of the line before; None for a line without chain."""
     if not isinstance(fact.get("count"), int) or not isinstance(fact.get("previous"), str):
         return None
     return fact.pop("count"), fact.pop("previous")
 
 
 def _compare(link: tuple[int, str], found: Manifest, due: int, number: int) -> None:
-    """Compare a line's link with what was read before it, and add what is wrong to the faults."""
+    """Compare a line's link with the lines before it, and add faults."""
     count, previous = link
-    missing, damaged = count - found.count, due < found.count  # damaged: the line before is
-    if missing > 0 and damaged:  # a damaged line end makes one line of two
+    missing, damaged = count - found.count, due < found.count  # damaged: the line before
+    if missing > 0 and damaged:  # a damaged line end joins two lines
         last = found.faults.pop()
         found.faults.append(ManifestFault(last.line, last.what, last.lost + missing))
     elif missing > 0:
         what = f"{missing} lines before it are missing" if missing > 1 else "a line before it is missing"
-        found.faults.append(ManifestFault(number, f"{what} (count {count}, {found.count} was due)", missing))
+        found.faults.append(ManifestFault(number, f"{what} (count {count}, {found.count} expected)", missing))
     elif count < due:
-        what = f"repeated or out of order (count {count}, {due} was due)"
+        what = f"repeated or out of order (count {count}, {due} expected)"
         found.faults.append(ManifestFault(number, what))
     elif not damaged and previous != found.digest:
-        what = "the line before is not the one that it was written after: replaced"
+        what = "the line before it was replaced"
         found.faults.append(ManifestFault(number, what, 1))
 
 
 def read(path: Path) -> Manifest:
-    """Read a manifest. Raises DataError when the file is absent or unreadable."""
+    """Read a manifest. Raises DataError if the file is absent or unreadable."""
     try:
-        return parse(read_bounded(path, MOST_JSON_BYTES))
+        return parse(read_bounded(path, MAX_JSON_BYTES))
     except OSError as e:
         if not path.parent.exists():
             raise no_such(path.parent) from None
         raise DataError(
-            f"{path}: cannot be read: {e.strerror}", f"{path.parent} is not a scan folder", "give the folder of a scan"
+            f"{path}: cannot be read: {e.strerror}",
+            f"{path.parent} is not a scan folder",
+            "give the folder of a scan",
+            code=ErrorCode.FILE_MISSING if isinstance(e, FileNotFoundError) else ErrorCode.FILE_UNREADABLE,
         ) from None
 
 
 class ManifestWriter:
-    """Appends facts durably; holds a lock, so that two programs never write one scan. A torn last line is cut off.
+    """Appends facts durably and locks the scan against other programs. A torn last line is cut off.
 
     Raises
     ------
     DeviceError
-        when another program holds the scan, or the file cannot be written.
+        if another program holds the scan, or the file cannot be written.
     """
 
     def __init__(self, path: Path, create: bool) -> None:
         if create == path.exists():
-            raise DeviceError(
-                f"{path}: cannot be {'created: it exists' if create else 'opened: it does not exist'}",
-                f"{path.parent} holds a scan already" if create else f"{path.parent} is no scan folder",
-                f"choose another folder, or `polysight resume {path.parent}` to go on with it"
-                if create
-                else "give the folder of a scan",
-            )
+            if create:
+                raise DeviceError(
+                    f"{path}: exists already",
+                    f"{path.parent} holds a scan",
+                    f"choose another folder, or `polysight resume {path.parent}`",
+                    code=ErrorCode.FILE_EXISTS,
+                )
+            what, why = f"{path}: does not exist", f"{path.parent} is no scan folder"
+            raise DeviceError(what, why, "give the folder of a scan", code=ErrorCode.FILE_MISSING)
         self._file = AppendFile(path, create)
         if not self._file.lock():
             self._file.close()
-            raise DeviceError(
-                f"{path}: another program is writing this scan", "a scan runs", "wait for it, or stop it first"
-            )
+            what = f"{path}: another program is writing this scan"
+            raise DeviceError(what, "a scan runs", "wait for it, or stop it first", code=ErrorCode.BUSY)
         try:
             found = read(path)
             self._count, self._digest = found.count, found.digest
@@ -205,19 +181,17 @@ class ManifestWriter:
             raise
 
     def append(self, fact: Fact) -> None:
-        """Write one fact; it is durable when this returns. Raises DeviceError, and then it is not there."""
+        """Append one fact durably. After a DeviceError the manifest does not contain it."""
         line = encode_line({**fact, "count": self._count, "previous": self._digest})
         self._file.append(line)
         self._count, self._digest = self._count + 1, digest_of(line[:-1])
 
     def close(self) -> None:
-        """Release the scan. Twice is once."""
+        """Close the file and release the lock. Safe to repeat."""
         self._file.close()
 
     def __enter__(self) -> ManifestWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

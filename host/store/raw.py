@@ -1,7 +1,7 @@
-"""Raw rows dropped by choice once they are processed: the digest stays in the manifest, the payload goes.
+"""Delete raw data of processed rows on request; the manifest keeps the digests.
 
-A row's line is written before its files are removed, and says which: whatever ends the program in between, what the
-manifest calls dropped may still be there, and what it does not is there. Running it again removes the rest.
+A row's `raw_dropped` line is written before its files are deleted. After a crash in between, files listed as dropped
+may still exist; dropping again deletes them. Files that are not listed always exist.
 """
 
 from __future__ import annotations
@@ -12,26 +12,27 @@ from pathlib import Path
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact
 from polysight.host.store.scan_folder import CommittedRow, ScanFolder, utc_now
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError, ScanError
 
 Digests = dict[str, dict[int, str]]
-"""CRC-32 (hex) of the payload a product was made from, by board and row."""
+"""CRC-32 (hex) of the payload from which a product was made, by board and row."""
 
 
 @dataclass(frozen=True)
 class Droppable:
-    """What may be dropped: files by row, and why the other rows may not."""
+    """Raw files that may be deleted."""
 
-    files: dict[int, dict[str, Path]]
+    files: dict[int, dict[str, Path]]  # by row and board
     bytes: int
-    kept: list[str] = field(default_factory=list)
+    kept: list[str] = field(default_factory=list)  # files that must be kept, with the reason
 
 
 def dropped_files(scan: ScanFolder) -> dict[str, Fact]:
-    """Payload files, relative to the scan folder, that were dropped by choice, each with the fact that says so."""
+    """Return the payload files (relative to the scan folder) that were dropped, each with its `raw_dropped` fact."""
     files: dict[str, tuple[int, Fact]] = {}
     for fact in scan.content.facts:
-        if fact["fact"] in ("row_committed", "row_withdrawn"):  # taken again: its files are new
+        if fact["fact"] in ("row_committed", "row_withdrawn"):  # taken again, with new files
             files = {file: row_fact for file, row_fact in files.items() if row_fact[0] != fact["row"]}
         elif fact["fact"] == "raw_dropped":
             files |= {board["file"]: (fact["row"], fact) for board in fact["boards"].values()}
@@ -39,30 +40,31 @@ def dropped_files(scan: ScanFolder) -> dict[str, Fact]:
 
 
 def require_raw(scan: ScanFolder) -> None:
-    """Refuse what needs the raw rows of a scan whose rows were dropped. Raises DataError."""
+    """Check that no raw data of the scan was dropped. Raises DataError."""
     facts = list(dropped_files(scan).values())
     if facts:
         raise DataError(
-            f"{scan.path}: the raw data of {len({f['row'] for f in facts})} rows is not there any more",
+            f"{scan.path}: the raw data of {len({f['row'] for f in facts})} rows was dropped",
             f"it was dropped on {facts[-1]['dropped_utc'][:10]}, after it was processed into {facts[-1]['products']}",
             "use those products; a new scan is needed to process again, or the raw folder of a copy",
+            code=ErrorCode.NO_DATA,
         )
 
 
 def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
-    """The files of every row that was processed as it was committed, and that are still there and the same.
+    """Find the files that may be deleted: unchanged since their commit, and processed with the same digest.
 
     Parameters
     ----------
     scan
         A finished scan.
     processed
-        What the saved products were made from.
+        Digests of the data from which the saved products were made.
 
     Raises
     ------
     ScanError
-        when rows are missing: they could still be taken, and the image made again from all of them.
+        if rows are missing, for which the scan can still be resumed and processed again.
     """
     rows = scan.committed()
     missing = scan.plan.rows - len(rows)
@@ -71,6 +73,7 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
             f"{scan.path}: {missing} of {scan.plan.rows} rows are not committed",
             "the image of the whole scan needs the raw data of every row",
             f"`polysight resume {scan.path}` first",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     files: dict[int, dict[str, Path]] = {}
     kept: list[str] = []
@@ -84,30 +87,30 @@ def droppable(scan: ScanFolder, processed: Digests) -> Droppable:
                 if path.stat().st_size == board.bytes and f"{crc32(path.read_bytes()):08x}" == board.crc32:
                     files.setdefault(row.row, {})[name] = path
                 else:
-                    kept.append(f"{board.file}: not the bytes that were committed")
+                    kept.append(f"{board.file}: differs from the committed data")
             elif board.file not in dropped_files(scan):
-                why = "not processed" if digest is None else "not the bytes the products were made from"
+                why = "not processed" if digest is None else "differs from the data of the products"
                 kept.append(f"{board.file}: {why}")
     there = [path for boards in files.values() for path in boards.values()]
     return Droppable(files, sum(path.stat().st_size for path in there), kept)
 
 
 def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
-    """Write down and remove, row by row, what :func:`droppable` finds once nobody else writes the scan.
+    """Lock the scan, then record and delete, row by row, the files that :func:`droppable` finds.
 
     Raises
     ------
     DeviceError
-        when the scan is in use, or the disk fails; what was not removed yet is removed by the next call.
+        if the scan is in use, or the disk fails; the next call deletes the rest.
     """
-    sync_folder(products)  # what was made from them must not be lost to a power cut
+    sync_folder(products)  # a power cut must not lose the products
     inside = products.resolve().is_relative_to(scan.path.resolve())
     where = str(products.resolve().relative_to(scan.path.resolve()) if inside else products.resolve())
     with scan.writer() as writer:
         scan.reload()
-        what, told, rows = droppable(scan, processed), dropped_files(scan), scan.committed()
-        for index, files in what.files.items():
-            if any(str(path.relative_to(scan.path)) not in told for path in files.values()):
+        found, recorded, rows = droppable(scan, processed), dropped_files(scan), scan.committed()
+        for index, files in found.files.items():
+            if any(str(path.relative_to(scan.path)) not in recorded for path in files.values()):
                 writer.append(_fact(rows[index], list(files), where))
             for path in files.values():
                 try:
@@ -116,9 +119,10 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
                     raise DeviceError(
                         f"{path}: cannot be removed: {e.strerror}",
                         "you may not write there, or the disk fails",
-                        f"then `polysight drop-raw {scan.path}` goes on",
+                        f"mend that, then `polysight drop-raw {scan.path}` deletes the rest",
+                        code=ErrorCode.FILE_UNREADABLE,
                     ) from None
-        for folder in {path.parent for files in what.files.values() for path in files.values()}:
+        for folder in {path.parent for files in found.files.values() for path in files.values()}:
             sync_folder(folder)
     scan.reload()
 

@@ -1,7 +1,7 @@
-"""Rows placed again from their packets: what today's placement makes of what was observed then.
+"""Place committed rows again from their stored packets, with the present placement algorithm.
 
-A row that comes out differently is written to new files and committed by a new line; the old files go after that. So a
-kill at any moment leaves the row as it was or as it is to be.
+A row with a different result is written to new files and committed with a new line; the old files are deleted
+afterwards. A crash at any moment leaves either the old or the new row.
 """
 
 from __future__ import annotations
@@ -27,31 +27,32 @@ from polysight.host.capture import (
 from polysight.host.store.append_only import crc32, sync_folder
 from polysight.host.store.manifest import Fact, ManifestWriter
 from polysight.host.store.scan_folder import BoardRow, ScanFolder, utc_now
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 
 @dataclass(frozen=True)
 class Replaced:
-    """One board's row: bytes missing before and now, and why it was left as it was ("" when it was not)."""
+    """Result for one board's row."""
 
     row: int
     board: str
-    before: int
-    after: int
-    left: str = ""
+    before: int  # missing bytes as committed
+    after: int  # missing bytes now
+    left: str = ""  # why the row was left unchanged
     changed: bool = False
-    damaged: bool = False  # it was left because its files are not those that were committed, or cannot be read
+    damaged: bool = False  # left unchanged because its files differ from the commit or are unreadable
 
 
 @dataclass(frozen=True)
 class PlacedAgain:
-    """A row's packets placed by today's program: what was observed, the result, its bytes, the committed gaps."""
+    """A row placed again from its packets."""
 
     evidence: Evidence
     placed: Placed
-    out: np.ndarray
-    missing: list[tuple[int, int]]
-    moved: bool  # its frames were moved to their pulses: it stays as it is
+    out: np.ndarray  # uint8, the payload
+    missing: list[tuple[int, int]]  # the committed gaps
+    moved: bool  # the committed frames were moved to their pulses: the row is left unchanged
 
 
 def place_again(path: Path) -> PlacedAgain:
@@ -60,7 +61,8 @@ def place_again(path: Path) -> PlacedAgain:
         row = np.fromfile(path, dtype=np.uint8)
     except OSError as e:
         why = "the path is wrong, or the raw data was dropped"
-        raise DataError(f"{path}: cannot be read: {e.strerror}", why, "give SCAN/raw/BOARD/ROW.bin") from None
+        what, remedy = f"{path}: cannot be read: {e.strerror}", "give SCAN/raw/BOARD/ROW.bin"
+        raise DataError(what, why, remedy, code=ErrorCode.FILE_UNREADABLE) from None
     facts, _ = read_index(path.with_suffix(".idx"))
     evidence, log = read_packets(path.with_suffix(PACKETS), row)
     e = evidence
@@ -70,24 +72,24 @@ def place_again(path: Path) -> PlacedAgain:
 
 
 def damage_of(scan: ScanFolder, path: Path) -> str:
-    """What is wrong with a row's files beside the manifest; "" when nothing is."""
+    """Compare a row's files with the manifest; return the difference, "" if there is none."""
     for row in scan.committed().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():
                 try:
-                    return _strange(path, board)
+                    return _difference(path, board)
                 except OSError as e:
                     return f"{e.filename}: {e.strerror}"
-    return "the manifest has committed no such row"
+    return "the manifest has no such committed row"
 
 
 def replace_rows(scan: ScanFolder) -> list[Replaced]:
-    """Place every committed row again; those that come out differently are committed anew.
+    """Place every committed row again, and commit those with a different result.
 
     Raises
     ------
     DeviceError
-        when the scan is in use, or the disk fails; rows that were not done yet are as they were.
+        if the scan is in use, or the disk fails; the remaining rows are unchanged.
     """
     found = []
     with scan.writer() as writer:
@@ -108,8 +110,8 @@ def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, Place
     if not board.packets_crc32:
         return Replaced(row, name, before, before, "its packets were not kept"), None
     try:
-        if strange := _strange(path, board):
-            return Replaced(row, name, before, before, strange, damaged=True), None
+        if difference := _difference(path, board):
+            return Replaced(row, name, before, before, difference, damaged=True), None
         again = place_again(path)
     except (DataError, OSError) as e:
         return Replaced(row, name, before, before, str(e), damaged=True), None
@@ -120,21 +122,17 @@ def _place(scan: ScanFolder, row: int, board: BoardRow) -> tuple[Replaced, Place
     return Replaced(row, name, before, after, changed=not same), again
 
 
-def _strange(path: Path, board: BoardRow) -> str:
-    """Which of a row's files is not the one that was committed; "" when all are. Raises OSError."""
-    committed = (
-        (".bin", board.crc32, "its bytes are not those that were committed"),
-        (".idx", board.index_crc32, "its index is not the one that was committed"),
-        (PACKETS, board.packets_crc32, "its packets are not those that were committed"),
-    )
-    for suffix, digest, why in committed:
+def _difference(path: Path, board: BoardRow) -> str:
+    """Return which of a row's files differs from the committed one; "" if none does. Raises OSError."""
+    digests = {".bin": board.crc32, ".idx": board.index_crc32, PACKETS: board.packets_crc32}
+    for suffix, digest in digests.items():
         if digest and f"{crc32(path.with_suffix(suffix).read_bytes()):08x}" != digest:
-            return why
+            return f"its {suffix} file differs from the committed one"
     return ""
 
 
 def _commit(scan: ScanFolder, writer: ManifestWriter, row: int, changed: dict[str, PlacedAgain]) -> None:
-    """Write the new files, then the line; then remove the old files."""
+    """Write the new files, then the line, then delete the old files."""
     fact = next(f for f in reversed(scan.facts("row_committed")) if f["row"] == row)
     boards, old = dict(fact["boards"]), []
     for name, again in changed.items():
@@ -154,7 +152,7 @@ def _commit(scan: ScanFolder, writer: ManifestWriter, row: int, changed: dict[st
 
 
 def _write(scan: ScanFolder, path: Path, again: PlacedAgain) -> Fact:
-    """Write a row's new files durably; what the manifest says of them."""
+    """Write a row's new files durably; return their entry for the manifest."""
     placed, frame = again.placed, scan.instrument.frame_bytes
     facts, _ = read_index(path.with_suffix(".idx"))
     _, log = read_packets(path.with_suffix(PACKETS), np.fromfile(path, dtype=np.uint8))

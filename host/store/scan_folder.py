@@ -1,8 +1,8 @@
-"""The scan folder: raw rows and the manifest that says which of them count (docs/spec/scan-folder.md).
+"""The scan folder: raw rows, and the manifest with the committed rows (docs/spec/scan-folder.md).
 
-`ScanFolder` is a scan on disk, read; its `writer` opens it for appending. A scan is resumed with the rig file it was
-begun with. Only the connection may differ: `connection_of` and `reconnected` take addresses and limits from another rig
-file, and `check_same_scan` refuses one that differs in anything else.
+`ScanFolder` reads a scan; its `writer` opens it for appending. A scan is resumed with the rig file it was begun with.
+Only the connection may change: `connection_of` and `with_connection` take addresses and limits from another rig file;
+`check_same_scan` refuses one that differs in anything else.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from polysight.host.store.source import RowData
 from polysight.host.store.untrusted import check_links, inside
 from polysight.shared import __version__
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, DeviceError
 from polysight.shared.raster import RasterPlan
 from polysight.shared.tables import decode, to_builtins
@@ -34,19 +35,17 @@ from polysight.shared.tables import decode as decode_config
 
 SECTIONS = ("pi", "limits")
 ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
-"""Of each board; `radar.servers` holds the addresses of their control servers."""
-
-
+"""Keys of each board that may change; `radar.servers` has the addresses of their control servers."""
 SERIAL = ("port", "baud")
-"""Of the stage: the Pi has its own. Calibration is not compared either: a scan keeps copies of its files."""
+"""Keys of the stage that are not compared: the Pi has its own. Nor is calibration, of which a scan keeps copies."""
 FORMAT = 1
 MANIFEST = "manifest.jsonl"
 EVENTS = "events.msgpack"
-PART = ".part"  # suffix of a row that is being received
+PART = ".part"  # suffix of a row during reception
 
 
 def connection_of(rig: Instrument) -> dict[str, Any]:
-    """That part of a rig file, as `scan_resumed` records it."""
+    """Return the connection settings of a rig file, as `scan_resumed` stores them."""
     table = to_builtins(rig)
     return {
         **{section: table[section] for section in SECTIONS},
@@ -55,18 +54,18 @@ def connection_of(rig: Instrument) -> dict[str, Any]:
     }
 
 
-def reconnected(begun: Instrument, connection: Mapping[str, Any]) -> Instrument:
-    """The rig a scan was begun with, reached another way. Raises ConfigError."""
+def with_connection(begun: Instrument, connection: Mapping[str, Any]) -> Instrument:
+    """Return the rig with other connection settings. Raises ConfigError."""
     return decode(_with(to_builtins(begun), connection), Instrument, "scan_resumed")
 
 
 def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
-    """Refuse a rig file that differs in more than that from the one a scan was begun with; `name` is for the message.
+    """Check that a rig file differs from the one a scan was begun with only in the connection settings.
 
     Raises
     ------
     ConfigError
-        naming every key in which it does.
+        with every other key that differs; `name` is the rig file's in the message.
     """
     table, other = to_builtins(begun), _with(to_builtins(given), connection_of(begun))
     other["stage"] = {**other["stage"], **{key: table["stage"][key] for key in SERIAL}}
@@ -75,8 +74,9 @@ def check_same_scan(begun: Instrument, given: Instrument, name: str) -> None:
     if found:
         raise ConfigError(
             f"{name} is not the rig file of this scan: {'; '.join(found)}",
-            "a scan goes on as it was begun: only [pi], [limits] and the addresses of the boards may change",
-            "put these back; what has to change needs a new scan",
+            "a scan is resumed with its own settings: only [pi], [limits] and the addresses of the boards may change",
+            "restore these values, or start a new scan",
+            code=ErrorCode.VALUES_CONFLICT,
         )
 
 
@@ -87,7 +87,7 @@ def _with(table: dict[str, Any], connection: Mapping[str, Any]) -> dict[str, Any
 
 
 def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
-    """`key is A in the scan, B in the file`, for every number or text."""
+    """Yield `key is A in the scan and B there` for every value that differs."""
     if isinstance(begun, dict) and isinstance(given, dict):
         for name in dict.fromkeys([*begun, *given]):
             yield from _differences(begun.get(name), given.get(name), f"{key}.{name}".lstrip("."))
@@ -95,15 +95,12 @@ def _differences(begun: Any, given: Any, key: str) -> Iterator[str]:
         for k, pair in enumerate(zip(begun, given, strict=True)):
             yield from _differences(*pair, f"{key}[{k}]")
     elif begun != given:
-        yield f"{key} is {_told(begun)} in the scan and {_told(given)} there"
-
-
-def _told(value: Any) -> str:
-    return "not given" if value is None else repr(value)
+        here, there = ("not given" if value is None else repr(value) for value in (begun, given))
+        yield f"{key} is {here} in the scan and {there} there"
 
 
 class BoardRow(msgspec.Struct, frozen=True):
-    """One board's share of a committed row. `file` is relative to the scan folder; the index is beside it."""
+    """One board's part of a committed row. `file` is relative to the scan folder; the index is beside it."""
 
     file: str
     bytes: int
@@ -116,7 +113,7 @@ class BoardRow(msgspec.Struct, frozen=True):
 
 
 class CommittedRow(msgspec.Struct, frozen=True):
-    """A row that counts."""
+    """A committed row."""
 
     row: int
     take: int
@@ -126,13 +123,13 @@ class CommittedRow(msgspec.Struct, frozen=True):
 
 
 def new_scan_id(now: datetime | None = None) -> str:
-    """A scan's name: when it started, and four hex digits against a second one in that second."""
+    """Return a scan id: the start time and four random hex digits."""
     now = now or datetime.now(UTC)
     return f"{now:%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
 
 
 def versions() -> dict[str, str]:
-    """Releases of everything that shapes the data."""
+    """Return the releases of all software that affects the data."""
     found = {"python": platform.python_version(), "numpy": np.__version__, "polysight": __version__}
     return found | {package: _release(package) for package in ("scipy", "scikit-learn")}
 
@@ -146,7 +143,7 @@ def _release(package: str) -> str:
 
 
 class ScanFolder:
-    """A scan on disk, read. Build with :meth:`create` or :meth:`load`; :meth:`writer` opens it for appending."""
+    """A scan on disk. Construct with :meth:`create` or :meth:`load`; :meth:`writer` opens it for appending."""
 
     mirrored = False
     synchronised = False
@@ -160,8 +157,9 @@ class ScanFolder:
             raise DataError(
                 f"{path / MANIFEST}: no scan_started",
                 "the scan ended before its first line was written, or that line is damaged",
-                f"restore it from a copy: without it rig and plan are unknown; when {path} is otherwise empty, nothing"
-                " was recorded, and `polysight scan` begins there anew",
+                f"restore it from a copy: without it rig and plan are unknown; if {path} is otherwise empty, nothing"
+                " was recorded, and `polysight scan` may use the folder again",
+                code=ErrorCode.FILE_DAMAGED,
             )
         source = f"{path / MANIFEST} (scan_started)"
         try:
@@ -170,13 +168,14 @@ class ScanFolder:
             self.scan_id = str(started["scan_id"])
             self.simulated = bool(started["simulated"])
         except KeyError as e:
-            raise DataError(f"{source}: no {e}", "written by another program or release") from None
+            why = "written by another program or release"
+            raise DataError(f"{source}: no {e}", why, code=ErrorCode.KEY_MISSING) from None
         self.instrument = self._latest()
 
     def _latest(self) -> Instrument:
-        """The rig as it was begun with, reached as the last run that said so reached it. Raises ConfigError."""
-        told = [f["rig"] for f in self.facts("scan_resumed") if f.get("rig")]
-        return reconnected(self._begun, told[-1]) if told else self._begun
+        """Return the scan's rig with the connection settings of the last resume. Raises ConfigError."""
+        connections = [f["rig"] for f in self.facts("scan_resumed") if f.get("rig")]
+        return with_connection(self._begun, connections[-1]) if connections else self._begun
 
     @staticmethod
     def create(
@@ -188,12 +187,12 @@ class ScanFolder:
         scan_id: str = "",
         extra: dict[str, Any] | None = None,
     ) -> ScanFolder:
-        """Make a scan folder with its first fact, durably. `extra` adds keys to that fact (calibration, operator...).
+        """Create a scan folder with its first fact, durably; `extra` adds keys to it (calibration, operator...).
 
         Raises
         ------
         DeviceError
-            when the folder holds a scan already or cannot be written.
+            if the folder contains a scan already or cannot be written.
         """
         fact: Fact = {
             **(extra or {}),
@@ -206,16 +205,16 @@ class ScanFolder:
             "plan": msgspec.to_builtins(plan),
             "versions": versions(),
         }
-        _make(path)
+        _make_folder(path)
         if (path / MANIFEST).exists() and not manifest.read(path / MANIFEST).length:
-            (path / MANIFEST).unlink()  # an earlier start ended before its first line was written
+            (path / MANIFEST).unlink()  # left by a start that ended before its first line
         with ManifestWriter(path / MANIFEST, create=True) as writer:
             writer.append(fact)
         return ScanFolder.load(path)
 
     @staticmethod
     def load(path: Path) -> ScanFolder:
-        """Read a scan folder. Raises DataError or ConfigError when it is not one, or links lead out of it."""
+        """Read a scan folder. Raises DataError or ConfigError if it is not one, or links lead out of it."""
         if (path / MANIFEST).exists():
             check_links(path)
         return ScanFolder(path, manifest.read(path / MANIFEST))
@@ -226,29 +225,29 @@ class ScanFolder:
         self.instrument = self._latest()
 
     def writer(self) -> ManifestWriter:
-        """Open the scan for appending; a torn last line is cut off. Raises DeviceError when the scan is in use."""
+        """Open the scan for appending and cut off a torn last line. Raises DeviceError if the scan is in use."""
         writer = ManifestWriter(self.path / MANIFEST, create=False)
         try:
             for board in self.instrument.recorded:
-                _make(self.path / "raw" / board.name)
+                _make_folder(self.path / "raw" / board.name)
         except DeviceError:
             writer.close()
             raise
         return writer
 
     def facts(self, kind: str) -> list[Fact]:
-        """All facts of one kind, in order."""
+        """Return all facts of one kind, in order."""
         return [f for f in self.content.facts if f["fact"] == kind]
 
     def committed(self) -> dict[int, CommittedRow]:
-        """Committed rows by index; the last valid take wins, unless it was withdrawn.
+        """Return committed rows by index: the last committed take of each row, unless it was withdrawn.
 
-        Raises DataError where the manifest names a file outside `raw`.
+        Raises DataError if the manifest names a file outside `raw`.
         """
         return dict(self._committed())
 
     def _committed(self) -> dict[int, CommittedRow]:
-        """The same, made once for the facts at hand: reading a scan asks for every row."""
+        """Return the committed rows from a cache, which is valid until facts are added."""
         if self._rows is None or self._rows[0] is not self.content or self._rows[1] != len(self.content.facts):
             self._rows = (self.content, len(self.content.facts), self._count_rows(self.content.facts))
         return self._rows[2]
@@ -270,17 +269,17 @@ class ScanFolder:
 
     @property
     def manifest_faults(self) -> tuple[ManifestFault, ...]:
-        """Lines of the manifest that are damaged or missing, and an end that counts more rows than there are."""
+        """Damaged and missing lines of the manifest, and a `scan_ended` that counts more rows than are committed."""
         content = self.content
         end = next((k for k in reversed(range(len(content.facts))) if content.facts[k]["fact"] == "scan_ended"), None)
-        told = None if end is None else content.facts[end].get("rows_committed")
-        if end is None or not isinstance(told, int) or told <= len(self._committed()):
+        counted = None if end is None else content.facts[end].get("rows_committed")
+        if end is None or not isinstance(counted, int) or counted <= len(self._committed()):
             return tuple(content.faults)
         known = {*self._count_rows(content.facts[:end]), *self._committed()}  # later withdrawn, or taken again
-        lost = told - len(known)
+        lost = counted - len(known)
         if lost <= sum(fault.lost for fault in content.faults):
             return tuple(content.faults)
-        what = f"scan_ended counts {told} rows, the lines before it commit {len(known)}"
+        what = f"scan_ended counts {counted} rows, the lines before it commit {len(known)}"
         return (*content.faults, ManifestFault(content.numbers[end], what, lost))
 
     @property
@@ -289,7 +288,7 @@ class ScanFolder:
         return [row for row in range(self.plan.rows) if row not in self._committed()]
 
     def recording_facts(self) -> dict[str, Any]:
-        """For quality.json: `rows_retaken`, takes of all runs that did not count; `rows_incomplete`, rows kept so."""
+        """Return `rows_retaken` (rejected takes of all runs) and `rows_incomplete` for quality.json."""
         last = {f["row"]: f for f in self.facts("row_committed") if f["row"] in self._committed()}
         return {
             "rows_retaken": len(self.facts("row_rejected")),
@@ -302,20 +301,20 @@ class ScanFolder:
 
     @property
     def complete(self) -> bool:
-        """Whether every row of the plan is committed."""
+        """True if every row of the plan is committed."""
         return len(self.committed()) == self.plan.rows
 
     def row_path(self, board: str, row: int) -> Path:
-        """Where a committed row's payload is."""
+        """Return the path of a row's payload."""
         return self.path / "raw" / board / f"{row:04d}.bin"
 
     def read_row(self, board_name: str, row: int) -> RowData:
-        """One board's payload of a committed row, checked against its CRC.
+        """Read one board's payload of a committed row and check its CRC.
 
         Raises
         ------
         DataError
-            when the row is not committed, or its files are absent or damaged.
+            if the row is not committed, or its files are missing or damaged.
         """
         found = self._committed().get(row)
         board = None if found is None else found.boards.get(board_name)
@@ -324,18 +323,21 @@ class ScanFolder:
                 f"{self.path}: row {row} of {board_name} is not committed",
                 "the scan was interrupted before it, or the board was not recorded",
                 f"`polysight resume {self.path}` takes the rows that are missing",
+                code=ErrorCode.NO_DATA,
             )
         path = self.path / board.file
         try:
             size = path.stat().st_size
             payload = np.fromfile(path, dtype=np.uint8, count=-1 if size == board.bytes else 0)
         except OSError as e:
-            raise DataError(f"{path}: cannot be read: {e.strerror}", "the file was removed", self._remedy()) from None
+            what = f"{path}: cannot be read: {e.strerror}"
+            raise DataError(what, "the file was removed", self._remedy(), code=ErrorCode.FILE_MISSING) from None
         if payload.size != board.bytes or f"{crc32(payload.data):08x}" != board.crc32:
             raise DataError(
-                f"{path}: not the bytes that were committed ({size} bytes, {board.bytes} expected)",
+                f"{path}: differs from the committed data ({size} bytes, {board.bytes} expected)",
                 "the file was changed, truncated or damaged after the scan",
                 self._remedy(),
+                code=ErrorCode.FILE_DAMAGED,
             )
         chirps = board.frames_expected * self.instrument.burst.chirps
         return RowData(payload, self._missing(path.with_suffix(".idx"), board), chirps, board.crc32)
@@ -347,7 +349,8 @@ class ScanFolder:
         missing = [(int(a), int(b)) for a, b in facts.get("missing", [])]
         damaged = board.index_crc32 and f"{crc32(path.read_bytes()):08x}" != board.index_crc32
         if damaged or sum(b - a for a, b in missing) != board.missing_bytes:
-            raise DataError(f"{path}: not the index that was committed", "the file was changed", self._remedy())
+            what = f"{path}: differs from the committed index"
+            raise DataError(what, "the file was changed", self._remedy(), code=ErrorCode.FILE_DAMAGED)
         return missing
 
     def _remedy(self) -> str:
@@ -357,11 +360,11 @@ class ScanFolder:
         )
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     """Make a folder and those above it, durably. Raises DeviceError."""
     if folder.is_dir():
         return
-    _make(folder.parent)
+    _make_folder(folder.parent)
     try:
         folder.mkdir(exist_ok=True)
     except OSError as e:
@@ -369,10 +372,11 @@ def _make(folder: Path) -> None:
             f"{folder}: cannot be made: {e.strerror}",
             "the disk is full or read-only",
             "free space, or choose another folder",
+            code=ErrorCode.FILE_UNREADABLE,
         ) from None
     sync_folder(folder.parent)
 
 
 def utc_now() -> str:
-    """The time for people, ISO 8601 in UTC."""
+    """Return the present time, ISO 8601 in UTC."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")

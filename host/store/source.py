@@ -1,4 +1,4 @@
-"""What processing needs from recorded data, wherever it comes from."""
+"""The `Source` protocol: recorded rows of one scan in any layout, as processing reads them."""
 
 from __future__ import annotations
 
@@ -12,30 +12,19 @@ from numpy.typing import NDArray
 
 from polysight.host.store.manifest import ManifestFault
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan
 
 
 @dataclass(frozen=True)
 class RowData:
-    """One board's recording of one row.
+    """One board's recording of one row."""
 
-    Attributes
-    ----------
-    payload
-        uint8 [frames_expected * bytes of a chirp]: the card's payload as sent, zero where bytes are missing.
-    missing
-        Byte ranges (start, stop) of `payload` that never arrived: sorted, not touching, half open.
-    frames_expected
-        Chirps in `payload`: points of the row x chirps of a position. Most frames are one chirp.
-    crc32
-        Digest the payload was recorded with, hexadecimal; empty where the recording keeps none.
-    """
-
-    payload: NDArray[np.uint8]
-    missing: list[tuple[int, int]]
-    frames_expected: int
-    crc32: str = ""
+    payload: NDArray[np.uint8]  # [frames_expected * bytes of a chirp], as sent by the card; zero where missing
+    missing: list[tuple[int, int]]  # byte ranges (start, stop) that never arrived: sorted, not touching, half open
+    frames_expected: int  # chirps in `payload`: points of the row x chirps of a position; most frames are one chirp
+    crc32: str = ""  # digest of the recorded payload, hexadecimal; "" if the recording has none
 
     @property
     def missing_bytes(self) -> int:
@@ -44,7 +33,7 @@ class RowData:
 
     @property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Bool [bytes], True where a byte is missing; None when the row is complete."""
+        """Bool [bytes], True where a byte is missing; None if the row is complete."""
         if not self.missing:
             return None
         mask = np.zeros(self.payload.size, dtype=np.bool_)
@@ -55,15 +44,9 @@ class RowData:
 
 @dataclass(frozen=True)
 class CubeRow:
-    """One board's row of a scan that another program has synchronised: no bytes of the card are known of it.
+    """One board's row of a scan that another program has synchronised; the card's data is not available."""
 
-    Attributes
-    ----------
-    cube
-        complex64 [rx, position, sample], positions as they were met, referenced as the other program left them.
-    """
-
-    cube: NDArray[np.complex64]
+    cube: NDArray[np.complex64]  # [rx, position, sample], in the order of recording, with that program's reference
     missing_bytes: int = 0
     crc32: str = ""
 
@@ -74,21 +57,21 @@ class CubeRow:
 
 
 class Scan(Protocol):
-    """What every scan tells, however it was recorded."""
+    """Description of a scan in any layout."""
 
     @property
     def instrument(self) -> Instrument:
-        """The rig file the scan was made with; of a mirrored scan the rig mirrored in x = y."""
+        """The rig file of the scan; mirrored in x = y for a mirrored scan."""
         ...
 
     @property
     def plan(self) -> RasterPlan:
-        """Where every position is."""
+        """The plan of positions."""
         ...
 
     @property
     def simulated(self) -> bool:
-        """Whether the data was simulated."""
+        """True for simulated data."""
         ...
 
     @property
@@ -102,52 +85,47 @@ class Source(Scan, Protocol):
 
     @property
     def mirrored(self) -> bool:
-        """Whether it was recorded column by column: rig, plan and images are then mirrored in x = y."""
+        """True if recorded column by column: rig, plan and images are then mirrored in x = y."""
         ...
 
     @property
     def synchronised(self) -> bool:
-        """Whether another program has synchronised it already: the chirps are not in it."""
+        """True if another program has synchronised the scan and the chirps are not available."""
         ...
 
     @property
     def manifest_faults(self) -> tuple[ManifestFault, ...]:
-        """Damaged and missing lines of the manifest; empty for a recording that keeps none."""
+        """Damaged and missing lines of the manifest; empty for a recording without one."""
         ...
 
     def rows(self) -> Iterator[int]:
-        """Indices of the rows that hold data, ascending."""
+        """Indices of the rows with data, ascending."""
         ...
 
     def read_row(self, board_name: str, row: int) -> RowData | CubeRow:
-        """One board's recording of one row. Raises DataError when it is absent or damaged."""
+        """Read one board's recording of one row. Raises DataError if it is missing or damaged."""
         ...
 
     def recording_facts(self) -> dict[str, Any]:
-        """Entries of quality.json on how the scan was recorded: rows retaken, losses by board, notices."""
+        """Entries of quality.json about the recording: rows retaken, losses by board, notices."""
         ...
 
 
 class RawSource(Source, Protocol):
-    """A source with the chirps still in it. Build with :func:`raw_source`."""
+    """A source that contains the chirps. Construct with :func:`raw_source`."""
 
     def read_row(self, board_name: str, row: int) -> RowData:
-        """One board's recording of one row. Raises DataError when it is absent or damaged."""
+        """Read one board's recording of one row. Raises DataError if it is missing or damaged."""
         ...
 
 
 def raw_source(source: Source, where: Path) -> RawSource:
-    """The same source, when the chirps are in it.
-
-    Raises
-    ------
-    DataError
-        when another program has synchronised it.
-    """
+    """Return the source if it contains the chirps. Raises DataError if another program has synchronised it."""
     if source.synchronised:
         raise DataError(
-            f"{where}: the chirps are not in it",
+            f"{where}: does not contain the chirps",
             "these cubes were synchronised already, by the authors",
             "give the same scan's unsynced/ folder",
+            code=ErrorCode.NO_DATA,
         )
     return cast(RawSource, source)

@@ -1,4 +1,4 @@
-"""Folders and files from elsewhere: no path leads out of a scan, and no small archive takes much memory."""
+"""Checks for untrusted scan folders and archives: paths that leave the folder, links, and oversized arrays."""
 
 from __future__ import annotations
 
@@ -13,30 +13,22 @@ from typing import Any
 import numpy as np
 
 from polysight.host.capture import kind_of
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import open_regular
 
 _MAY_BE_LINK = "products"
 MOST_BYTES = 2 << 30
-"""Of arrays in one archive: a hundred times the images of the published scan."""
+"""Largest size of the arrays in one archive: a hundred times the images of the published scan."""
 
 
 def inside(folder: Path, name: str, within: str = "") -> Path:
-    """The path of a file that a scan's manifest names, relative to the scan folder.
-
-    Parameters
-    ----------
-    folder
-        The scan folder.
-    name
-        What the manifest says.
-    within
-        Folder in the scan in which it has to lie; "" for anywhere.
+    """Return the path of a file that a manifest names, relative to the scan folder and inside its folder `within`.
 
     Raises
     ------
     DataError
-        when it lies elsewhere, links followed.
+        if the path, with links followed, is elsewhere.
     """
     path, root = folder / name, (folder / within).resolve()
     try:
@@ -49,19 +41,15 @@ def inside(folder: Path, name: str, within: str = "") -> Path:
             f"{folder}: its manifest names {name!r}, which lies outside {folder / within}",
             "the manifest was made by another program or changed, or a link leads out of the scan",
             "nothing there is read, written or removed; `polysight validate` a copy of the scan as it was recorded",
+            code=ErrorCode.PATH_OUTSIDE,
         )
     return path
 
 
 def check_links(folder: Path) -> None:
-    """Refuse a scan folder in which a link leads out of it, or in which there is a pipe or a device.
+    """Check that a scan folder contains no link that leads out of it, no pipe and no device.
 
-    Only `products` may be a link: they are replaced as a whole, and only where products are.
-
-    Raises
-    ------
-    DataError
-        naming it.
+    Only `products` may be such a link, because products are only replaced as a whole. Raises DataError.
     """
     root, left = folder.resolve(), [folder]
     while left:
@@ -71,12 +59,12 @@ def check_links(folder: Path) -> None:
                     path = Path(entry.path)
                     if entry.is_symlink():
                         if path != folder / _MAY_BE_LINK and not _leads_into(path, root):
-                            raise _strange(folder, path, "is a link that leads out of it")
+                            raise _refused(folder, path, "is a link that leads out of it", ErrorCode.PATH_OUTSIDE)
                     elif entry.is_dir(follow_symlinks=False):
                         left.append(path)
                     elif not entry.is_file(follow_symlinks=False):
-                        raise _strange(folder, path, "is neither a file nor a folder")
-        except OSError:  # gone meanwhile, or not to be listed: whoever wants a file there says so
+                        raise _refused(folder, path, "is neither a file nor a folder", ErrorCode.FILE_FOREIGN)
+        except OSError:  # deleted in the meantime, or not readable: reported when a file is read
             continue
 
 
@@ -87,24 +75,25 @@ def _leads_into(link: Path, root: Path) -> bool:
         return False
 
 
-def _strange(folder: Path, path: Path, what: str) -> DataError:
+def _refused(folder: Path, path: Path, what: str, code: ErrorCode) -> DataError:
     return DataError(
         f"{folder}: {path.relative_to(folder)} {what}",
-        "the folder was made by another program or changed: what is done with the scan would be done there",
-        f"nothing was read or written; remove it (rm '{path}'), or put what it leads to in its place",
+        "the folder was made by another program or changed; reading or writing the scan would affect other files",
+        f"nothing was read or written; remove it (rm '{path}'), or replace it by a copy of its target",
+        code=code,
     )
 
 
 @contextmanager
 def open_npz(path: Path) -> Iterator[Any]:
-    """Open an archive of arrays, without pickled objects, once what it says of its size is believable.
+    """Open an archive of arrays, without pickled objects, after a check of its uncompressed size.
 
     Raises
     ------
     DataError
-        when it is no regular file, or its arrays would take more than :data:`MOST_BYTES`.
+        if it is no regular file, or its arrays exceed :data:`MOST_BYTES`.
     OSError, ValueError, KeyError, EOFError
-        when it is no such archive, as numpy does.
+        if it is not an archive of arrays, as numpy does.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "it is a folder", str(path))
@@ -117,9 +106,10 @@ def open_npz(path: Path) -> Iterator[Any]:
             raise ValueError(f"it is {kind_of(f.read(512))}, not an archive of arrays ({e})") from None
         if size > MOST_BYTES:
             raise DataError(
-                f"{path}: its arrays take {size} bytes, more than the {MOST_BYTES} bytes that are read",
+                f"{path}: its arrays take {size} bytes, the limit is {MOST_BYTES} bytes",
                 "it was not made by this program, or is damaged",
                 "process the scan again, or cut the image area ([image] of the rig file)",
+                code=ErrorCode.FILE_TOO_LARGE,
             )
         f.seek(0)
         try:

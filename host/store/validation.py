@@ -1,4 +1,4 @@
-"""Checks a scan folder by itself and names every fault."""
+"""Validate a scan folder: compare every file with the manifest and list all faults."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from polysight.host.store.events import read_events
 from polysight.host.store.manifest import ManifestFault
 from polysight.host.store.raw import dropped_files
 from polysight.host.store.scan_folder import EVENTS, MANIFEST, PART, BoardRow, CommittedRow, ScanFolder
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, PolysightError
 from polysight.shared.raster import plan_raster
 
@@ -26,26 +27,24 @@ _FETCHED = "resume fetches the rest from the Pi's journal"
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault (`error`), or something worth knowing that damages nothing (`note`)."""
+    """A fault (`error`), or information about an undamaged folder (`note`)."""
 
     severity: Literal["error", "note"]
     where: str
     what: str
     remedy: str = ""
-    unreadable: bool = False  # the disk did not say what is there: it may be whole
+    unreadable: bool = False  # a read error: the file may be undamaged
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.where}: {self.what}" + (f" ({self.remedy})" if self.remedy else "")
 
 
 def validate(path: Path) -> list[Finding]:
-    """Every fault of a scan folder; empty when it is whole and finished. Raises DataError when it is no scan."""
+    """List the faults of a scan folder; empty if it is complete and undamaged. Raises DataError if it is no scan."""
     content = manifest.read(path / MANIFEST)
     found = []
     if content.torn:
-        found.append(
-            Finding("note", MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off and goes on")
-        )
+        found.append(Finding("note", MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
     try:
         scan = ScanFolder(path, content)
         rows = scan.committed()
@@ -71,27 +70,28 @@ def validate(path: Path) -> list[Finding]:
 
 
 def damaged_rows(scan: ScanFolder) -> dict[int, list[str]]:
-    """Committed rows that are not, on the disk, what was committed: row to what is wrong with it. Reads every byte.
+    """Return the committed rows whose files differ from the commit, with the faults of each; reads every byte.
 
-    Raises DeviceError when the disk does not give a file back: it may be whole, and must not be taken again.
+    Raises DeviceError on a read error: the row may be undamaged and must not be taken again.
     """
     found = {row.row: _row(scan, row) for row in scan.committed().values()}
     if unreadable := [f for faults in found.values() for f in faults if f.unreadable]:
         raise DeviceError(
             f"{scan.path / unreadable[0].where}: {unreadable[0].what}",
             f"the disk fails, or its server is away ({len(unreadable)} files); nothing was changed",
-            f"see that the disk is well, then `polysight resume {scan.path}` once more",
+            f"check the disk, then `polysight resume {scan.path}`",
+            code=ErrorCode.FILE_UNREADABLE,
         )
     return {row: [str(f) for f in faults] for row, faults in found.items() if faults}
 
 
 def _lost_lines(fault: ManifestFault, lost: str) -> Finding:
-    """A fault of the manifest; a note where nothing is `lost`."""
+    """Return a fault of the manifest as a finding; a note if no row is `lost`."""
     return Finding("error" if lost else "note", f"{MANIFEST} line {fault.line}", fault.what, lost or _ALL_THERE)
 
 
 def _what_is_lost(scan: ScanFolder) -> str:
-    """Which rows are not committed; "" when every row is, whatever a lost line said."""
+    """Describe the rows that are not committed; "" if every row is, so that lost lines do not matter."""
     absent = scan.rows_absent
     if not absent:
         return ""
@@ -128,14 +128,14 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
         )
     kept = board.file not in dropped_files(scan) or path.exists()
     try:
-        # Of a payload dropped by choice the committed digest is what is left.
+        # Only the committed digest is left of a dropped payload.
         size, crc = _digest(path) if kept else (board.bytes, int(board.crc32, 16))
     except OSError as e:
         return [*found, _not_read(where, e)]
     if size != board.bytes:
         found.append(Finding("error", where, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
-        found.append(Finding("error", where, "not the bytes that were committed (CRC)", _COPY))
+        found.append(Finding("error", where, "differs from the committed data (CRC)", _COPY))
     index = path.with_suffix(".idx")
     found += _packets(scan, board, path.with_suffix(PACKETS))
     where = str(index.relative_to(scan.path))
@@ -147,7 +147,7 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     except OSError as e:
         return [*found, _not_read(where, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
-        return [*found, Finding("error", where, "not the bytes that were committed (CRC)", _COPY)]
+        return [*found, Finding("error", where, "differs from the committed data (CRC)", _COPY)]
     try:
         facts, _ = read_index(index)
         gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
@@ -161,7 +161,7 @@ def _board(scan: ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
 
 
 def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
-    """Compare the row's packets with what was committed. Rows of earlier releases have none."""
+    """Compare the row's packet file with its digest; rows of earlier releases have none."""
     if not board.packets_crc32:
         return []
     where = str(path.relative_to(scan.path))
@@ -172,7 +172,7 @@ def _packets(scan: ScanFolder, board: BoardRow, path: Path) -> list[Finding]:
     except OSError as e:
         return [_not_read(where, e)]
     right = f"{crc:08x}" == board.packets_crc32
-    return [] if right else [Finding("error", where, "not the bytes that were committed (CRC)", _COPY)]
+    return [] if right else [Finding("error", where, "differs from the committed data (CRC)", _COPY)]
 
 
 def _not_read(where: str, e: OSError) -> Finding:
@@ -233,7 +233,7 @@ def _events(scan: ScanFolder) -> list[Finding]:
 
 
 def _committed_events(path: Path, length: int, fact: dict[str, Any]) -> list[Finding]:
-    """Compare the events with their digest at the last commit."""
+    """Compare the event log with its digest at the last commit."""
     size, crc, when = fact["events"]["bytes"], fact["events"]["crc32"], f"row {fact['row']} was committed"
     if length < size:
         return [Finding("error", EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
@@ -244,5 +244,5 @@ def _committed_events(path: Path, length: int, fact: dict[str, Any]) -> list[Fin
 
 
 def to_json(findings: list[Finding]) -> str:
-    """Findings for machines."""
+    """Return the findings as JSON."""
     return json.dumps([vars(f) for f in findings], indent=2)

@@ -17,35 +17,33 @@ static inline void weighted(const float *restrict halves, const float *restrict 
     }
 }
 
-/* The middle two of `count` values in order, by quickselect; reorders them. */
-static void middle_two(float *values, int count, float *lower, float *upper)
+/* Medians of the magnitudes of sixteen spectra of `size` powers, an even number: the bits of a positive number are in its
+   order, so the upper one of the middle two is found bit by bit, by counting the smaller ones. */
+static inline void medians(const int32_t *restrict powers, int size, double *restrict median)
 {
-    int low = 0, high = count - 1, wanted = count / 2;
-    while (low < high) {
-        float pivot = values[(low + high) / 2];
-        int i = low, j = high;
-        while (i <= j) {
-            for (; values[i] < pivot; i++)
-                ;
-            for (; values[j] > pivot; j--)
-                ;
-            if (i <= j) {
-                float other = values[i];
-                values[i++] = values[j];
-                values[j--] = other;
-            }
-        }
-        if (wanted <= j)
-            high = j;
-        else if (wanted >= i)
-            low = i;
-        else
-            break;
+    int32_t upper[LANES] = {0}, lower[LANES] = {0}, tried[LANES], count[LANES] = {0};
+    for (int bit = 30; bit >= 0; bit--) {
+        for (int k = 0; k < LANES; k++)
+            tried[k] = upper[k] | 1 << bit, count[k] = 0;
+        for (int i = 0; i < size; i++)
+            for (int k = 0; k < LANES; k++)
+                count[k] += powers[LANES * i + k] < tried[k];
+        for (int k = 0; k < LANES; k++)
+            upper[k] = count[k] <= size / 2 ? tried[k] : upper[k];
     }
-    *upper = *lower = values[wanted];
-    *lower = values[0];
-    for (int i = 1; i < wanted; i++)
-        *lower = values[i] > *lower ? values[i] : *lower;
+    memset(count, 0, sizeof count);
+    for (int i = 0; i < size; i++)
+        for (int k = 0; k < LANES; k++) {
+            int32_t power = powers[LANES * i + k], below = power < upper[k];
+            count[k] += below;
+            lower[k] = below && power > lower[k] ? power : lower[k];
+        }
+    for (int k = 0; k < LANES; k++) {
+        float one, other;
+        memcpy(&one, count[k] == size / 2 ? &lower[k] : &upper[k], sizeof one);
+        memcpy(&other, &upper[k], sizeof other);
+        median[k] = (sqrt(one) + sqrt(other)) / 2;
+    }
 }
 
 /* `numpy_direct_path.search` of one spectrum: power [size]. */
@@ -77,12 +75,12 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
                  int farthest, const double *comparable, int32_t *bins, double *median)
 {
     int count = RX * blocks;
-    float *memory = reserve((size_t)(2 * LANES + 5) * size + 2 * (size_t)count + 64);
+    float *memory = reserve((size_t)(3 * LANES + 4) * size + 2 * (size_t)count + 64);
     if (!memory)
         return 1;
     float *re = memory, *im = re + LANES * size, *c = im + LANES * size, *s = c + size, *power = s + size;
-    float *spare = power + size, *x = spare + size, *y = x + count;
-    int *bin = (int *)(y + count);
+    float *x = power + size, *y = x + count;
+    int32_t *bin = (int32_t *)(y + count), *bits = bin + size;
     roots_of_unity(size, c, s);
     for (int i = 0; i < size; i++)
         bin[i] = bin_at(i, size);
@@ -99,14 +97,15 @@ int NAME(search)(const float *halves, const float *weights, int positions, int b
         transform(re, im, size, c, s);
         for (int i = 0; i < LANES * size; i++)
             re[i] = re[i] * re[i] + im[i] * im[i];
+        double middle[LANES];
+        memcpy(bits, re, sizeof *bits * LANES * size);
+        medians(bits, size, middle);
         for (int k = 0; k < lanes; k++) {
-            float lower, upper;
             int p = first + k;
             for (int i = 0; i < size; i++)
-                power[bin[i]] = spare[i] = re[LANES * i + k];
+                power[bin[i]] = re[LANES * i + k];
             choose_peaks(power, size, nearest, farthest, (float)*comparable, bins + p, bins + positions + p);
-            middle_two(spare, size, &lower, &upper);
-            median[p] = (sqrt(lower) + sqrt(upper)) / 2;
+            median[p] = middle[k];
         }
     }
     release(memory);

@@ -1,10 +1,9 @@
-"""The DCA1000 capture cards of a simulated rig: SYNC_IN edges in, UDP data packets out.
+"""Simulated DCA1000 capture cards: SYNC_IN edges in, UDP data packets out.
 
-`sync_in` tells which pulse starts a frame and where the stage is then; `dca1000` is the card's state machine, bytes and
-times only; `card` gives it sockets and a radar; `sender` sends many packets a call; `fault_draws` decides what goes
-wrong and when; `adversary` is a card and a network at their worst, by itself. `server` runs the cards of one process,
-and `python -m polysight.simulators.cards` is that process.
-Specification: docs/spec/simulated-rig.md.
+`sync_in` decides which pulses start a frame, and where the stage is then; `dca1000` is the card's state machine without
+sockets; `card` adds sockets and a radar; `sender` sends many packets per call; `fault_draws` draws faults from a seed;
+`adversary` is a stand-alone card and network with every kind of trouble. `server` runs the cards of one process
+(`python -m polysight.simulators.cards`). Specification: docs/spec/simulated-rig.md.
 """
 
 from polysight.simulators.cards.adversary import KINDS, Adversary, Arrival, Sent

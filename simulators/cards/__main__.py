@@ -16,6 +16,7 @@ from pathlib import Path
 from threading import Event
 
 from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, PolysightError
 from polysight.shared.wires import WireClient
 from polysight.simulators.cards.card import SimulatedCard
@@ -48,7 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--offset-in-rig",
         action="store_true",
-        help="the rig file tells the start frequencies, the scene's offset with it",
+        help="the rig file's start frequencies include the scene's offset",
     )
     parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene")
     parser.add_argument("--time-scale", type=float, default=1.0, help="wire time over wall time")
@@ -56,25 +57,28 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--boards", default="", help="names, with commas; default: every board")
     parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table")
     parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")
-    parser.add_argument("--no-wait", action="store_true", help="send whether or not the receiver keeps up")
+    parser.add_argument("--no-wait", action="store_true", help="send even if the receiver does not keep up")
     parser.add_argument(
         "--real-pacing",
         action="store_true",
-        help="each packet by itself when it is due; takes a core; not with waiting",
+        help="send each packet individually when it is due; occupies a core; implies --no-wait",
     )
-    parser.add_argument("--report", type=Path, help="JSON file for what was counted, written at the end")
+    parser.add_argument("--report", type=Path, help="JSON file for the counts, written at the end")
     parser.add_argument("--cache", type=Path, help="folder where the scene's object fields are kept between runs")
     return parser
 
 
 def _check_arguments(args: argparse.Namespace, known: tuple[str, ...]) -> tuple[str, ...]:
     if args.time_scale <= 0:
-        raise ConfigError(f"--time-scale {args.time_scale}", "time runs forwards", "give a number above 0")
+        what = f"--time-scale {args.time_scale}"
+        raise ConfigError(what, "it must be positive", "give a number above 0", code=ErrorCode.VALUE_INVALID)
     if args.scene is None and not args.pattern:
-        raise ConfigError("neither --scene nor --pattern", "the cards need something to send", "give one of them")
+        why = "the cards need something to send"
+        raise ConfigError("neither --scene nor --pattern", why, "give one of them", code=ErrorCode.KEY_MISSING)
     names = tuple(args.boards.split(",")) if args.boards else known
     if unknown := sorted(set(names) - set(known)):
-        raise ConfigError(f"--boards {','.join(unknown)}: no such board", f"the boards are {known}", "correct it")
+        what = f"--boards {','.join(unknown)}: no such board"
+        raise ConfigError(what, f"the boards are {known}", "correct it", code=ErrorCode.KEY_UNKNOWN)
     return names
 
 
@@ -84,7 +88,7 @@ def _source(args: argparse.Namespace, rig: Instrument, scene: Scene | None, name
     radars = SimulatedRig(rig, scene, args.seed, args.cache)
     recorded = [b.name for b in rig.recorded if b.name in names]
     if recorded:
-        radars.prepare(*recorded)  # now, so that the first burst of a scan does not wait for it
+        radars.prepare(*recorded)  # before the first burst of a scan
     return radars
 
 
@@ -129,7 +133,7 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
 
 
 def _report(cards: list[SimulatedCard], path: Path | None) -> None:
-    """What each card counted: one line each on stderr, all of it into the file; then the sockets are closed."""
+    """Write each card's counts: a line on stderr, all into the file; then close the sockets."""
     reports = {card.board.name: card.report() for card in cards}
     for name, report in reports.items():
         sys.stderr.write(f"{name}: " + ", ".join(f"{k} {v}" for k, v in report.items() if v != 0) + "\n")

@@ -1,8 +1,8 @@
-"""A capture card and a network that do their worst, for records of a few packets to thousands.
+"""A capture card and a network with every kind of trouble, for records of a few packets to thousands.
 
-Every kind of trouble in `KINDS` is something a card or a network can do (docs/spec/simulated-rig.md says which was
-seen): the card numbers the packets of its records as `dca1000.Packetiser` does, is reset, ends a record early or begins
-one by itself; the network loses, doubles, delays and reorders. What a packet carries stays known: `Arrival.record`.
+`KINDS` lists what a card or a network can do (docs/spec/simulated-rig.md marks what was seen): the card is reset, ends
+a record early or starts one by itself; the network loses, duplicates, delays and reorders packets. Each packet's record
+stays known: `Arrival.record`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _GAP_NS = 20_000  # between packets
 
 @dataclass(frozen=True)
 class Arrival:
-    """One packet as it comes: when (ns), its bytes, and of which record (number) it is."""
+    """One packet at the receiver: arrival time (ns), bytes, and the number of its record."""
 
     t_ns: int
     packet: bytes
@@ -48,32 +48,20 @@ class Arrival:
 
 @dataclass
 class Sent:
-    """One record as it was asked for, and what came while the host received it.
-
-    `data` is what the row should hold, `arrivals` come in this order, `first_pulse_ns`: its first pulse.
-    """
+    """One record, and the packets that arrived while the host received it."""
 
     number: int
-    data: bytes
+    data: bytes  # that the row should contain
     first_pulse_ns: int
-    arrivals: list[Arrival] = field(default_factory=list)
-    whole: bool = True  # the card sent the whole record, from one counter to the next
+    arrivals: list[Arrival] = field(default_factory=list)  # in this order
+    whole: bool = True  # the card sent the complete record, with consecutive counters
     troubles: tuple[str, ...] = ()
 
 
 class Adversary:
-    """A card whose records go through trouble.
+    """A card and network with troubles drawn from `chance`.
 
-    Parameters
-    ----------
-    chance
-        Where all that is random comes from.
-    frame_bytes
-        Bytes of a frame.
-    byte_count, sequence
-        Counters at the first record.
-    payload_bytes
-        Of a full packet.
+    `byte_count` and `sequence` are the counters at the first record, `payload_bytes` those of a full packet.
     """
 
     def __init__(
@@ -87,20 +75,17 @@ class Adversary:
         self._chance, self._frame, self._payload = chance, frame_bytes, payload_bytes
         self._card = Packetiser(payload_bytes, sequence, byte_count)
         self._now_ns, self._number = 1_000_000_000, 0
-        self._late: list[Arrival] = []  # what comes in a later record
+        self._late: list[Arrival] = []  # packets that arrive in a later record
         self.resets = 0
 
     def take_late(self, share: float) -> list[Arrival]:
-        """Some of what is still on its way comes now, a share of it on the average."""
+        """Return delayed packets that arrive now, on average this share of them."""
         coming = [a for a in self._late if self._chance.random() < share]
         self._late = [a for a in self._late if not any(a is c for c in coming)]
         return coming
 
     def record(self, frames: int, troubles: tuple[str, ...] = (), data: bytes = b"") -> Sent:
-        """Send one record of so many frames through these troubles; what is delayed comes with the records after it.
-
-        Without `data` its bytes are drawn.
-        """
+        """Send one record with these troubles; delayed packets arrive with later records. Without `data`, draw it."""
         chance, self._number = self._chance, self._number + 1
         if not data:
             draw = np.random.default_rng(chance.getrandbits(32))
@@ -121,7 +106,7 @@ class Adversary:
         return sent
 
     def _packets(self, sent: Sent, data: bytes) -> list[bytes]:
-        """The packets of one record as the card puts them out."""
+        """Return the packets of one record as the card sends them."""
         troubles, chance, frame = sent.troubles, self._chance, self._frame
         frames = len(data) // frame
         if "miss_frames" in troubles and frames > 1:
@@ -147,7 +132,7 @@ class Adversary:
         return out + self._stream(data) + self._end()
 
     def forget_late(self) -> None:
-        """What is still on its way never comes: the host's program was started anew."""
+        """Drop delayed packets: the host's program was restarted."""
         self._late.clear()
 
     def _reset(self) -> None:
@@ -160,7 +145,7 @@ class Adversary:
         return [bytes(row) for row in self._card.flush()]
 
     def _network(self, packets: list[bytes], sent: Sent) -> list[bytes]:
-        """What comes in time, in its order; what is late is kept."""
+        """Return the packets that arrive in time, in order; keep the delayed ones."""
         t, chance, n = sent.troubles, self._chance, len(packets)
         gone: set[int] = set(range(n)) if "lose_all" in t else set()
         if "lose" in t:

@@ -1,7 +1,7 @@
-"""One board of a simulated rig: its radar's SYNC_IN, its DCA1000 on the network, and what goes wrong in them.
+"""One board of a simulated rig: its radar's SYNC_IN, its DCA1000 on the network, and their faults.
 
-:class:`CardEndpoint` is the card alone: its state machine, its sockets, and the faults between it and the host.
-:class:`SimulatedCard` joins it to a radar that turns SYNC_IN pulses into frames.
+:class:`CardEndpoint` is the card alone: state machine, sockets, and the faults between card and host.
+:class:`SimulatedCard` connects it to a radar that turns SYNC_IN pulses into frames.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from polysight.simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, S
 from polysight.simulators.faults import Faults
 from polysight.simulators.radars import RadarBoard
 
-NO_DATA_FLOOR_S = 10.0  # wall time: at many times real time the card's 30 s would be over before the stage has moved
+NO_DATA_FLOOR_S = 10.0  # wall time: with a large time scale the card's 30 s would end before the stage has moved
 if TYPE_CHECKING:
     from polysight.simulators.scene import SignalSource
 
@@ -53,7 +53,7 @@ class CardEndpoint:
     Parameters
     ----------
     name
-        Of the board: keys the faults' random numbers.
+        Name of the board, which also seeds the faults' random numbers.
     network
         Addresses in its EEPROM.
     time_scale
@@ -61,12 +61,12 @@ class CardEndpoint:
     clock_s
         Wall clock.
     lanes
-        LVDS lanes of the radar; None suits every configuration.
+        LVDS lanes of the radar; None fits every configuration.
 
     Raises
     ------
     DeviceError
-        when the card's addresses cannot be taken.
+        if the card's addresses cannot be bound.
     """
 
     def __init__(
@@ -116,17 +116,17 @@ class CardEndpoint:
         self.bindings += 1
 
     def fileno(self) -> int:
-        """The command socket, for select. Another one when `bindings` has grown."""
+        """Return the command socket, for select; it changes when `bindings` grows."""
         return self._commands.fileno()
 
     def wire_s(self) -> float:
-        """Wire time by the wall clock."""
+        """Return the present wire time."""
         return self._clock_s() * self._time_scale
 
     def power_cycle(self) -> None:
-        """Switch the card off and on: the addresses in its EEPROM are taken.
+        """Switch the card off and on, which activates the addresses in its EEPROM.
 
-        Raises DeviceError when those are not addresses of this machine.
+        Raises DeviceError if those are not addresses of this machine.
         """
         before = self.card.network
         self.card.power_cycle()
@@ -139,22 +139,22 @@ class CardEndpoint:
             self._bind(self.card.network)
 
     def reset(self) -> None:
-        """Reset the FPGA, as command 0x01 does, by itself."""
+        """Reset the FPGA, as command 0x01 does, without a command."""
         self.counts["resets"] += 1
         self.card.reset_fpga()
 
     def take_link_down(self, seconds: float) -> None:
-        """Hear nothing, and send no messages, for so long from now, in wire time."""
+        """Neither receive nor send for this time (wire time)."""
         self.counts["link_downs"] += 1
         self._link_up_s = self._clock_s() + seconds / self._time_scale
 
     @property
     def link_is_down(self) -> bool:
-        """Whether requests cannot reach the card now."""
+        """True if requests cannot reach the card now."""
         return self._clock_s() < self._link_up_s
 
     def serve_commands(self) -> None:
-        """Answer the requests that have come."""
+        """Answer pending requests."""
         while True:
             try:
                 datagram = self._commands.recv(2048)
@@ -187,7 +187,7 @@ class CardEndpoint:
         self.emit(more)
 
     def emit(self, outputs: Sequence[Output], link_is_up: bool = True) -> None:
-        """Send what the card puts out, through the faults of the network."""
+        """Send the card's output through the faults of the network."""
         for output in outputs:
             if isinstance(output, Message):
                 if not self.card.recording:
@@ -215,16 +215,16 @@ class CardEndpoint:
 
     @property
     def due(self) -> bool:
-        """Whether the record ends now if nothing more comes."""
+        """True if the record's deadline has passed, unless more data is pending."""
         deadline_s = self.card.deadline_s
         return deadline_s is not None and self.wire_s() >= deadline_s
 
     def tick(self, link_is_up: bool = True) -> None:
-        """End the record when its time has come."""
+        """End the record if its deadline has passed."""
         self.emit(self.card.tick(self.wire_s()), link_is_up)
 
     def flush(self) -> float | None:
-        """Send what may be sent now; seconds until there is more to do, None when all is sent."""
+        """Send data that is due; return the seconds until more is due, None if all is sent."""
         return self.sender.flush(self._clock_s, self.card.packet_delay_s / self._time_scale)
 
     def _keep_sender_counts(self) -> None:
@@ -232,7 +232,7 @@ class CardEndpoint:
             self.counts[key] += value
 
     def report(self) -> dict[str, int | None]:
-        """Everything counted so far."""
+        """Return all counts."""
         report: dict[str, int | None] = dict(self.counts)
         for key, value in self.sender.counts().items():
             report[key] = self.counts[key] + value
@@ -247,7 +247,7 @@ class CardEndpoint:
 
 
 def _runs(pulses: list[Pulse]) -> Iterator[list[Pulse]]:
-    """Runs of consecutive numbers, of at most FRAMES_PER_CALL."""
+    """Yield runs of consecutive pulse numbers, at most FRAMES_PER_CALL long."""
     first = 0
     for i in range(1, len(pulses) + 1):
         if i == len(pulses) or i - first == FRAMES_PER_CALL or pulses[i].number != pulses[i - 1].number + 1:
@@ -256,13 +256,7 @@ def _runs(pulses: list[Pulse]) -> Iterator[list[Pulse]]:
 
 
 class SimulatedCard:
-    """One board: its radar, its DCA1000.
-
-    Raises
-    ------
-    DeviceError
-        when the card's addresses cannot be taken.
-    """
+    """One board with its radar and its DCA1000. Raises DeviceError if the card's addresses cannot be bound."""
 
     def __init__(
         self,
@@ -283,9 +277,7 @@ class SimulatedCard:
         self.endpoint = CardEndpoint(board.name, network, faults, seed, time_scale, clock_s, pace)
         self._burst = rig.burst
         later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
-        dead_s = (
-            later_us + rig.chirp.ramp_end_us + RECOVERY_US
-        ) * 1e-6  # pulses at a time scale are less regular than real ones
+        dead_s = (later_us + rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6
         native = rig.radar.control == "native"
         die = 1 + [b.name for b in rig.boards].index(board.name)
         self.radar = (
@@ -295,13 +287,13 @@ class SimulatedCard:
         self._events = PulseEvents(faults)
         self._pulse_faults = PulseFaults(faults, seed, board.name)
         self._overflow = OverflowFaults(faults, seed, board.name)
-        self._down_ns = (0, 0)  # the link is down from .. to, in the wire time of the pulses
+        self._down_ns = (0, 0)  # start and end of the link's outage, wire time
         self._last_pulse_ns = 0
         self._pulses = 0
         self.last_data_wall_s = 0.0
 
     def rearm(self) -> None:
-        """Its control server has told the radar to wait for the pulses of a row."""
+        """Arm the radar for the pulses of a row, as its control server does."""
         self._sync.arm()
 
     @property
@@ -310,7 +302,7 @@ class SimulatedCard:
         return self.endpoint.card
 
     def pulses(self, rising_ns: list[int], track: StageTrack) -> None:
-        """SYNC_IN rose at these wire times."""
+        """Process rising edges of SYNC_IN at these wire times."""
         pulses = [Pulse(self._pulses + i, t) for i, t in enumerate(rising_ns)]
         self._pulses += len(pulses)
         for part in self._events.parts(pulses):
@@ -374,7 +366,7 @@ class SimulatedCard:
         self.endpoint.tick(self._link_is_up(self._last_pulse_ns + round(TAIL_S * 1e9)))
 
     def report(self) -> dict[str, int | None]:
-        """Everything counted so far: what really happened, for comparison with what a host found out."""
+        """Return all counts, for comparison with those of a host."""
         radar = {"pulses": self._pulses, "too_soon": self._sync.too_soon, "missed": self._pulse_faults.missed}
         radar |= {"rearmed": self._sync.rearmed, "unarmed": self._sync.unarmed}
         return {"frames": 0, **radar, **self.endpoint.report()}

@@ -1,7 +1,7 @@
-"""State machine of one DCA1000EVM capture card: commands in, replies and data packets out. Bytes and times only.
+"""State machine of one DCA1000EVM capture card: commands in, replies and data packets out, without sockets or clocks.
 
-What is modelled is what docs/spec/simulated-rig.md lists; "inferred" there marks behaviour that no document or capture
-shows. Times are seconds of any clock the caller keeps, as long as it is one clock.
+docs/spec/simulated-rig.md lists the modelled behaviour; "inferred" there marks behaviour that no document or capture
+shows. Times are in seconds of any one clock of the caller.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from polysight.shared.errors import ProtocolError
 
 REQUEST_HEADER = 0xA55A
 REQUEST_FOOTER = 0xEEAA
-SOURCE_PORT = 1024  # replies and data leave the card from here (seen)
+SOURCE_PORT = 1024  # of replies and data (seen)
 DATA_HEADER_BYTES = 10  # u32 sequence, u48 byte count
 PACKET_OVERHEAD_BYTES = 14  # "packet size 1470" carries 1456 bytes of payload
 TAIL_S = 2.0  # from the last LVDS data to the short last packet (seen)
@@ -64,7 +64,7 @@ class Status(IntFlag):
 
 
 class Network(NamedTuple):
-    """Addresses kept in the card's EEPROM; taken at power-up."""
+    """Addresses in the card's EEPROM, active from the next power-up."""
 
     host_address: str
     card_address: str
@@ -74,7 +74,7 @@ class Network(NamedTuple):
 
     @staticmethod
     def decode(body: bytes) -> Network:
-        """Parse the 18 bytes of command 0x04. Raises ProtocolError when there are not 18."""
+        """Parse the 18 bytes of command 0x04. Raises ProtocolError if there are not 18."""
         if len(body) != 18:
             raise ProtocolError(f"EEPROM body of {len(body)} bytes, expected 18")
         host, card, mac = body[3::-1], body[7:3:-1], body[13:7:-1]
@@ -95,7 +95,7 @@ class Packets(NamedTuple):
 
     @property
     def payload_bytes(self) -> int:
-        """Bytes of LVDS data in them."""
+        """Number of bytes of LVDS data."""
         return self.rows.size - DATA_HEADER_BYTES * len(self.rows)
 
 
@@ -103,12 +103,12 @@ Output = Message | Packets
 
 
 def message(code: int, status: int) -> Message:
-    """A reply, or with code 0x0A an asynchronous status."""
+    """Return a reply, or with code 0x0A an asynchronous status."""
     return Message(struct.pack("<HHHH", REQUEST_HEADER, code, status, REQUEST_FOOTER))
 
 
 def parse_request(datagram: bytes) -> tuple[int, bytes, bool] | None:
-    """Code, body and whether size and footer are right; None for what does not begin like a request."""
+    """Return code, body, and True if size and footer are right; None if the header is not a request's."""
     if len(datagram) < 8:
         return None
     header, code, size = struct.unpack_from("<HHH", datagram)
@@ -140,7 +140,7 @@ class Packetiser:
         self._rest = np.empty(0, np.uint8)
 
     def feed(self, lvds: NDArray[np.generic]) -> Bytes2D:
-        """Full packets, uint8 [n, 10 + payload], that the stream now fills; the rest is kept."""
+        """Return the packets that the stream now fills, uint8 [n, 10 + payload]; keep the rest."""
         fresh = np.ascontiguousarray(lvds).view(np.uint8).reshape(-1)
         stream = np.concatenate([self._rest, fresh])
         n = len(stream) // self.payload_bytes
@@ -149,12 +149,12 @@ class Packetiser:
         return self._pack(stream[:used].reshape(n, self.payload_bytes))
 
     def flush(self) -> Bytes2D:
-        """The short last packet as [1, 10 + rest]; [0, 10] when nothing is left."""
+        """Return the short last packet, [1, 10 + rest]; [0, 10] if nothing is left."""
         rest, self._rest = self._rest, np.empty(0, np.uint8)
         return self._pack(rest.reshape(1 if len(rest) else 0, len(rest)))
 
     def discard(self) -> int:
-        """Forget what is not sent yet; the number of bytes lost."""
+        """Discard bytes that are not sent yet; return their number."""
         lost, self._rest = len(self._rest), np.empty(0, np.uint8)
         return lost
 
@@ -178,16 +178,15 @@ class Card:
     Parameters
     ----------
     network
-        What its EEPROM holds.
+        Content of its EEPROM.
     sequence, byte_count
-        Counters at power-up, to begin anywhere (also just before they wrap).
+        Counters at power-up.
     no_data_floor_s
-        Shortest time after record start at which the card gives up for want of LVDS data; the timer of command 0x03 is
-        used when it is longer.
+        Shortest timeout after record start without LVDS data; the timer of command 0x03 applies if it is longer.
     stop_discards
-        On record stop, lose what does not fill a packet instead of sending it as the short last packet.
+        On record stop, lose bytes that do not fill a packet instead of sending them as the short last packet.
     lanes
-        LVDS lanes of the radar: a card configured for another number records nothing. None suits either.
+        LVDS lanes of the radar: a card configured for another number records nothing. None fits either.
     """
 
     def __init__(
@@ -217,17 +216,17 @@ class Card:
         self.packet_delay_s = 0.0
 
     def power_cycle(self) -> None:
-        """Switch off and on: the EEPROM's addresses are taken, everything else starts afresh."""
+        """Switch off and on: activate the EEPROM's addresses, reset everything else."""
         self.network = self._eeprom
         self._power_up(1, 0)
 
     def reset_fpga(self) -> None:
-        """Start afresh with the same addresses. A record is over without its last packet and without a status."""
+        """Reset everything but the addresses. A record ends without its last packet and without a status."""
         self._power_up(1, 0)
 
     @property
     def recording(self) -> bool:
-        """Between record start and the end of the record."""
+        """True between record start and the end of the record."""
         return self._recording
 
     @property
@@ -237,7 +236,7 @@ class Card:
 
     @property
     def deadline_s(self) -> float | None:
-        """When :meth:`tick` will end the record if no LVDS data comes; None when nothing is recorded."""
+        """Time at which :meth:`tick` ends the record if no LVDS data comes; None without a record."""
         if not self._recording:
             return None
         if self._last_data_s is None:
@@ -245,7 +244,7 @@ class Card:
         return self._last_data_s + TAIL_S
 
     def command(self, datagram: bytes, now_s: float) -> list[Output]:
-        """Carry out one request; what the card sends in answer, in order. Nothing for what is not a request."""
+        """Execute one request and return the card's answers, in order; [] if it is not a request."""
         request = parse_request(datagram)
         if request is None:
             return []
@@ -267,7 +266,7 @@ class Card:
         if code == Code.RESET_FPGA:
             self.reset_fpga()
         elif code == Code.CONFIGURE_FPGA:
-            # Clients send bodies of wrong length or without sense; they are answered all the same (seen).
+            # The card also answers bodies of wrong length or content (seen).
             if well_formed and len(body) == 6 and all(1 <= b <= n for b, n in zip(body, _CHOICES, strict=False)):
                 raw_ethernet = (body[0], *body[2:5]) == (1, 1, 2, 3)  # raw, capture, ethernet, 16 bit
                 self._suits_radar = raw_ethernet and self._lanes in (None, _LANES[body[1]])
@@ -277,7 +276,7 @@ class Card:
                 size, ticks, _ = struct.unpack("<HHH", body)
                 if size < _MIN_PACKET:
                     return 1
-                # mmWave Studio and most clients ask for 1472, are told "done", and get 1456 as with 1470 (read).
+                # mmWave Studio and most clients request 1472, get "done", and 1456 as with 1470 (read).
                 self._packetiser.payload_bytes = min(size, _MAX_PACKET) - PACKET_OVERHEAD_BYTES
                 self.packet_delay_s = ticks * DELAY_TICK_S
         elif code == Code.EEPROM:
@@ -291,7 +290,7 @@ class Card:
         return 0
 
     def lvds(self, data: NDArray[np.generic], now_s: float) -> list[Output]:
-        """LVDS data from the radar: the packets it fills. Nothing while not recording or wrongly configured."""
+        """Process LVDS data of the radar; return the packets it fills, [] without a record or if wrongly configured."""
         if not self._recording or not self._suits_radar:
             return []
         self._last_data_s = now_s
@@ -299,15 +298,15 @@ class Card:
         return [Packets(rows)] if len(rows) else []
 
     def overflow(self, status: Status = Status.LVDS_BUFFER_FULL) -> list[Output]:
-        """Say that LVDS data was lost before packetising: no gap in the sequence numbers shows it."""
+        """Report LVDS data lost before packetising, which leaves no gap in the sequence numbers."""
         return [message(Code.STATUS, status)] if self._recording else []
 
     def end_record(self) -> list[Output]:
-        """End the record now, as if the LVDS data had ended 2 s ago; the radar may well go on."""
+        """End the record now, as if the LVDS data had ended 2 s ago."""
         return self._end(Status.RECORD_COMPLETED) if self._recording else []
 
     def tick(self, now_s: float) -> list[Output]:
-        """End the record when :attr:`deadline_s` has come: the short last packet, and the status at once after it."""
+        """End the record if :attr:`deadline_s` has passed: the short last packet, then the status."""
         deadline = self.deadline_s
         if deadline is None or now_s < deadline:
             return []

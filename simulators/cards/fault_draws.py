@@ -1,7 +1,7 @@
-"""Faults of a simulated capture card as they happen: drawn from a seed, the same in every run, and counted.
+"""Draw and count the faults of a simulated capture card, reproducibly from a seed.
 
-Every board and every kind of fault has a generator of its own, so that one fault does not shift another; and no draw
-depends on how packets, frames or pulses are grouped into calls.
+Every board and every kind of fault has its own generator, so that one fault does not shift another; draws do not depend
+on how packets, frames or pulses are grouped into calls.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Rows = NDArray[np.uint8]
 
 
 def fault_generator(seed: int, board_name: str, what: str) -> np.random.Generator:
-    """The generator of one kind of fault of one board."""
+    """Return the generator of one kind of fault of one board."""
     return np.random.default_rng([seed, zlib.crc32(f"{board_name}/{what}".encode())])
 
 
 class NetworkFaults:
-    """What happens to data packets between card and host. `counts` keeps how often."""
+    """Faults of data packets between card and host, counted in `counts`."""
 
     def __init__(self, faults: Faults, seed: int, board_name: str, counts: Counter[str] | None = None) -> None:
         self._faults = faults
@@ -41,7 +41,7 @@ class NetworkFaults:
         self._lose = frozenset(faults.lose_packets)
 
     def carry(self, rows: Rows) -> list[Rows]:
-        """Packets [n, size] in the order they arrive, as arrays of packets of one size."""
+        """Return packets [n, size] in the order of arrival, as arrays of packets of one size."""
         if not self._faults.disturbs_network:
             return [rows]
         arrived: list[Rows] = []
@@ -62,7 +62,7 @@ class NetworkFaults:
         return arrived
 
     def _suffers(self, draws: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which of the next packets anything may happen to, bool [n]."""
+        """Select the packets with a possible fault, bool [n]."""
         f = self._faults
         suffers = np.any(draws < (f.loss, f.reorder, f.late, f.truncate, f.duplicate), axis=1)
         numbers = self._index + np.arange(len(draws))
@@ -114,14 +114,14 @@ class NetworkFaults:
         return rows
 
     def skip(self, rows: Rows) -> None:
-        """These packets never reached the network; the draws of those after them stay what they are."""
+        """Skip packets that never reached the network, so that later draws do not change."""
         if self._faults.disturbs_network:
             self._rng.random((len(rows), 5))
             self._corrupt_rng.random((len(rows) if self._faults.corrupts else 0, 3))
             self._index += len(rows)
 
     def drain(self) -> list[Rows]:
-        """What is still held back when the record ends."""
+        """Return the packets held back at the end of the record."""
         return self._release(None)
 
     def _release(self, index: int | None) -> list[Rows]:
@@ -142,7 +142,7 @@ def _turn_bit(row: Rows, bit: int) -> None:
 
 
 class CommandFaults:
-    """What happens to requests and replies. `counts` keeps how often."""
+    """Faults of requests and replies, counted in `counts`."""
 
     def __init__(self, faults: Faults, seed: int, board_name: str, counts: Counter[str]) -> None:
         self._faults = faults
@@ -155,7 +155,7 @@ class CommandFaults:
             self._bits[code] = self._bits.get(code, 0) | 1 << bit
 
     def heard(self) -> bool:
-        """Whether the next request reaches the card and will be answered."""
+        """True if the next request reaches the card and will be answered."""
         draw, self._draw_reply = self._rng.random(2)
         if self._answers_left == 0:
             self._counts["requests_unanswered"] += 1
@@ -166,15 +166,15 @@ class CommandFaults:
         return True
 
     def refused(self, code: int) -> bool:
-        """Whether the card fails to carry this command out."""
+        """True if the card refuses this command."""
         return code in self._faults.refuse
 
     def status_after(self, code: int) -> int:
-        """Status bits that follow the reply to this command; 0 for none."""
+        """Return the status bits that follow the reply to this command; 0 for none."""
         return self._bits.get(code, 0)
 
     def reply_arrives(self) -> bool:
-        """Whether the reply to the request just heard reaches the host."""
+        """True if the reply to the request just heard reaches the host."""
         if self._answers_left is not None:
             self._answers_left -= 1
         if self._draw_reply < self._faults.reply_loss:
@@ -193,7 +193,7 @@ class PulseFaults:
         self.missed = 0
 
     def seen(self, pulses: list[Pulse]) -> list[Pulse]:
-        """The pulses that the radar notices."""
+        """Return the pulses that the radar sees."""
         draws = self._rng.random(len(pulses))
         seen = [
             p for p, draw in zip(pulses, draws, strict=True) if p.number not in self._miss and draw >= self._probability
@@ -203,7 +203,7 @@ class PulseFaults:
 
 
 class LvdsRun(NamedTuple):
-    """LVDS data, int16, and the status that tells of `lost_bytes` lost at its end (None: nothing was lost)."""
+    """LVDS data, int16, and the status that reports `lost_bytes` lost at its end (None: nothing was lost)."""
 
     data: NDArray[np.int16]
     status: Status | None
@@ -224,23 +224,23 @@ class OverflowFaults:
         ]
 
     def split(self, frames: NDArray[np.int16]) -> list[LvdsRun]:
-        """Frames int16 [n, ...] as runs, each with what was lost at its end."""
-        told: dict[int, Status] = {}
+        """Split frames, int16 [n, ...], into runs with a loss at their end."""
+        lost: dict[int, Status] = {}
         for probability, status, rng in self._kinds:
             for i in np.flatnonzero(rng.random(len(frames)) < probability):
-                told.setdefault(int(i), status)
+                lost.setdefault(int(i), status)
         runs, first = [], 0
-        for i in sorted(told):
+        for i in sorted(lost):
             whole, frame = frames[first:i].reshape(-1), frames[i].reshape(-1)
             kept = len(frame) // 2
             run = np.concatenate([whole, frame[:kept]])
-            runs.append(LvdsRun(run, told[i], (len(frame) - kept) * frame.itemsize))
+            runs.append(LvdsRun(run, lost[i], (len(frame) - kept) * frame.itemsize))
             first = i + 1
         return [*runs, LvdsRun(frames[first:], None, 0)] if first < len(frames) else runs
 
 
 class EventKind(Enum):
-    """What happens to a card before a pulse."""
+    """Events of a card before a pulse."""
 
     LINK_DOWN = "link_down"
     STATUS = "pulse_status"
@@ -260,7 +260,7 @@ class PulseEvents:
                 self._at.setdefault(pulse, []).append((kind, value))
 
     def parts(self, pulses: list[Pulse]) -> list[list[Pulse]]:
-        """The pulses, cut before each that something happens at."""
+        """Split the pulses before each one with an event."""
         if not pulses or not self._at:
             return [pulses] if pulses else []
         first, end = pulses[0].number, pulses[0].number + len(pulses)
@@ -268,5 +268,5 @@ class PulseEvents:
         return [pulses[a:b] for a, b in pairwise(cuts)]
 
     def before(self, pulse: Pulse) -> list[tuple[EventKind, float]]:
-        """What happens before this pulse: kind, and its seconds or status bit."""
+        """Return the events before this pulse: kind, and its seconds or status bit."""
         return self._at.get(pulse.number, [])

@@ -1,4 +1,4 @@
-"""The UDP side of a simulated card: many packets a call, never more at once than the receiver's buffer takes."""
+"""UDP sender of a simulated card: many packets per call, never more at once than the receiver's buffer holds."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
 from polysight.simulators.cards.dca1000 import DATA_HEADER_BYTES
 
@@ -20,19 +21,17 @@ Rows = NDArray[np.uint8]
 _UDP_SEGMENT = 103  # linux/udp.h: the kernel cuts one buffer into equal datagrams
 _CALL_BYTES = 65_000  # below the largest UDP datagram
 _CALL_SEGMENTS = 44
-# Kernel bytes waiting unread at the receiver below which the next 44 packets (some 100 kB there) are sent.
-_UNREAD_BYTES = 128 << 10
-_LOOK_AGAIN_S = 0.001
-# A receiver that reads nothing for this long is not waited for any more: its packets are lost, as with a real card.
-_PATIENCE_S = 2.0
+_UNREAD_BYTES = 128 << 10  # unread at the receiver, below which the next 44 packets (about 100 kB) are sent
+_POLL_S = 0.001
+_WAIT_TIMEOUT_S = 2.0  # for a receiver that does not read; then its packets are lost, as with a real card
 _MAX_QUEUED_BYTES = 64 << 20
-_CATCH_UP_S = 0.01  # a sender of many packets a call that was held up for longer does not make up for all of it
-_TURN_S = 0.02  # how long one call may go on while it spins: commands wait meanwhile
-_SPIN_S = 0.001  # shorter than what a process can sleep for reliably
+_CATCH_UP_S = 0.01  # largest delay that is made up for when sending many packets per call
+_MAX_SPIN_S = 0.02  # in one call: commands wait in the meantime
+_SPIN_S = 0.001  # waits below this spin, because a process cannot reliably sleep that short
 
 
 class ReceiveQueue:
-    """What a UDP socket of this machine has received and not read yet, from the kernel's table of sockets."""
+    """Unread data of a UDP socket of this machine, from the kernel's table of sockets."""
 
     def __init__(self, address: str, port: int, table: Path = Path("/proc/net/udp")) -> None:
         own = struct.unpack("=I", socket.inet_aton(address))[0]
@@ -43,7 +42,7 @@ class ReceiveQueue:
             self._table = None
 
     def look(self) -> tuple[int, int] | None:
-        """Kernel bytes waiting, and datagrams dropped so far; None when no such socket is on this machine."""
+        """Return unread bytes and dropped datagrams; None if the socket is not on this machine."""
         if self._table is None:
             return None
         text = os.pread(self._table, 1 << 20, 0)
@@ -62,7 +61,7 @@ class ReceiveQueue:
 
 
 class Pace(NamedTuple):
-    """How packets leave: not faster than the receiver reads, and in calls of 44 or, as from a card, one by one."""
+    """How packets are sent: not faster than the receiver reads, and in calls of 44 or (as a real card) one by one."""
 
     wait_for_receiver: bool = True
     single: bool = False
@@ -81,7 +80,7 @@ class CardSender:
     Raises
     ------
     DeviceError
-        when the card's address cannot be taken.
+        if the card's address cannot be taken.
     """
 
     def __init__(
@@ -108,7 +107,7 @@ class CardSender:
 
     @property
     def full(self) -> bool:
-        """Whether so much is queued that no more should be made."""
+        """True if the queue is full."""
         return self._queued_bytes > _MAX_QUEUED_BYTES
 
     @property
@@ -118,15 +117,15 @@ class CardSender:
 
     @property
     def idle(self) -> bool:
-        """Whether everything was sent."""
+        """True if everything was sent."""
         return not self._queue and not self._replies
 
     def counts(self) -> dict[str, int]:
-        """Data packets and their payload bytes sent, and how often the receiver was waited for."""
+        """Return the numbers of data packets and payload bytes sent, and of waits for the receiver."""
         return {"packets_sent": self.packets, "bytes_sent": self.payload_bytes, "waits": self.waits}
 
     def dropped_by_receiver(self) -> int | None:
-        """Datagrams the receiving socket had no room for; None when it is not on this machine."""
+        """Return the number of datagrams dropped by the receiving socket; None if it is not on this machine."""
         seen = self._receiver.look()
         return None if seen is None else seen[1]
 
@@ -147,14 +146,9 @@ class CardSender:
         self._queued_bytes += rows.size
 
     def flush(self, clock_s: Callable[[], float], packet_interval_s: float) -> float | None:
-        """Send what may be sent now; seconds until there is more to do, None when all is sent.
+        """Send data that is due; return the seconds until more is due, None if all is sent.
 
-        Parameters
-        ----------
-        clock_s
-            Wall clock.
-        packet_interval_s
-            Shortest mean time between packets: the card's packet delay, on the wall clock.
+        `clock_s` is the wall clock; `packet_interval_s` the shortest mean time between packets, wall time.
         """
         wait = self._flush_queue(clock_s, packet_interval_s)
         while self._replies:
@@ -165,7 +159,7 @@ class CardSender:
         return wait
 
     def _flush_queue(self, clock_s: Callable[[], float], packet_interval_s: float) -> float | None:
-        until_s = clock_s() + _TURN_S
+        until_s = clock_s() + _MAX_SPIN_S
         while self._queue:
             item = self._queue[0]
             if isinstance(item, bytes):
@@ -178,7 +172,7 @@ class CardSender:
                     return self._not_before_s - now
                 continue
             if not self._may_send(now):
-                return _LOOK_AGAIN_S
+                return _POLL_S
             n = 1 if self._pace.single else min(len(item), _CALL_SEGMENTS, max(1, _CALL_BYTES // item.shape[1]))
             self._send(item[:n])
             self._queued_bytes -= n * item.shape[1]
@@ -193,7 +187,7 @@ class CardSender:
         return None
 
     def send_now(self) -> None:
-        """Send everything queued without regard to its pace: before the sockets are closed."""
+        """Send everything queued at once, before the sockets are closed."""
         for item in self._queue:
             if isinstance(item, bytes):
                 self._send_to(item, self._command_to)
@@ -213,7 +207,7 @@ class CardSender:
         if self._waiting_since_s is None:
             self._waiting_since_s = now_s
             self.waits += 1
-        return now_s - self._waiting_since_s > _PATIENCE_S
+        return now_s - self._waiting_since_s > _WAIT_TIMEOUT_S
 
     def _send(self, rows: Rows) -> None:
         size = rows.shape[1]
@@ -245,22 +239,23 @@ class CardSender:
 
 
 def bound_udp(address: str, port: int) -> socket.socket:
-    """A UDP socket bound to an address of this machine. Raises DeviceError saying why it cannot be."""
+    """Return a UDP socket bound to an address of this machine. Raises DeviceError."""
     s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         s.bind((address, port))
     except OSError as e:
         s.close()
         raise DeviceError(
-            f"simulated card: cannot take {address}:{port}: {e.strerror}",
+            f"simulated card: cannot bind {address}:{port}: {e.strerror}",
             "another simulated rig uses this address, or it is not an address of this machine (loopback is 127.x.y.z)",
             "start the rig with `python -m polysight.simulators.rig`, which chooses free loopback addresses",
+            code=ErrorCode.BUSY,
         ) from None
     return s
 
 
 def _can_segment(s: socket.socket) -> bool:
-    """Whether this kernel cuts large buffers into datagrams (UDP_SEGMENT, Linux 4.18 and later)."""
+    """True if this kernel cuts large buffers into datagrams (UDP_SEGMENT, Linux 4.18 and later)."""
     try:
         s.setsockopt(socket.IPPROTO_UDP, _UDP_SEGMENT, 0)
     except OSError:

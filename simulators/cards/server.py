@@ -1,4 +1,4 @@
-"""All cards and radars of one process behind one set of wires: SYNC_IN edges in, frames out as UDP."""
+"""Run all cards and radars of one process on one set of wires: SYNC_IN edges in, frames out as UDP."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from polysight.simulators.cards.sync_in import StageTrack
 from polysight.simulators.radars import LineServer, RadarSocket
 
 EDGES_PER_TURN = 2048
-GATHER_S = 0.01  # between readings of the wires that brought pulses: many frames a call cost less than a few
+GATHER_S = 0.01  # between reads of the wires with pulses: many frames per call cost less than a few
 IDLE_S = 0.1
 
 
@@ -54,21 +54,21 @@ class CardServer:
 
     @property
     def more_expected(self) -> bool:
-        """Whether the stage is in a row, or pulses for its last trigger are still to come."""
+        """True if the stage is in a row, or pulses of its last trigger are pending."""
         return self._track.moving or self._trigger_ns > self._pulse_ns
 
     def serve(self, stop: Event) -> None:
-        """Work until `stop` is set; `power_cycle`, when set, switches every card off and on.
+        """Run until `stop` is set; switch every card off and on if `power_cycle` is set.
 
-        Raises DeviceError when the wires break, or a card's new address cannot be taken.
+        Raises DeviceError if the wires break, or a card's new address cannot be bound.
         """
         timeout: float = 0.0
         while not stop.is_set():
             ready = self._selector.select(0.0 if self._unread and self._listening else timeout)
-            # A radar is re-armed before the row's first pulse is sent, however late this process comes to see both.
+            # Radars are armed before the row's first pulse is sent, so control comes before the wires.
             for server in self._control:
                 server.serve()
-            # Wires first: a pulse sent before a command was sent belongs before it.
+            # Wires before commands: keep the order of a pulse and a later command.
             commands = any(key.fileobj is not self._wires for key, _ in ready)
             if commands or (self._listening and (self._unread or ready)):
                 self._take_edges()
@@ -88,7 +88,7 @@ class CardServer:
                 timeout = min(timeout, gather_s)
 
     def _select_cards(self) -> None:
-        """Listen to the cards' sockets, which are others after a power cycle."""
+        """Register the cards' sockets, which change at a power cycle."""
         changed = [card for card in self._cards if self._bound.get(card, (0,))[0] != card.endpoint.bindings]
         for card in changed:
             if card in self._bound:
@@ -99,9 +99,9 @@ class CardServer:
             self._bound[card] = (card.endpoint.bindings, descriptor)
 
     def _take_edges(self) -> bool:
-        """Read what the wires brought; whether there were pulses."""
+        """Read the wires; return True if there were pulses."""
         rising: dict[int, list[int]] = {card.line: [] for card in self._cards}
-        self._unread = True  # the client may hold lines that its descriptor does not show
+        self._unread = True  # the client may have buffered lines
         for _ in range(EDGES_PER_TURN):
             message = self._wires.receive(0.0)
             if message is None:
@@ -126,10 +126,10 @@ class CardServer:
             rising[edge.line].append(edge.t_ns)
 
     def _work(self, card: SimulatedCard) -> float:
-        """Send, and end the record in time; seconds until this card has more to do."""
+        """Send data and end the record in time; return the seconds until this card has more to do."""
         endpoint = card.endpoint
         wait = endpoint.flush()
-        if wait is None and endpoint.due and not self._take_edges():  # data that is on its way puts the end off
+        if wait is None and endpoint.due and not self._take_edges():  # pending data delays the end
             card.tick(self.more_expected)
             wait = endpoint.flush()
         if wait is not None:
@@ -137,7 +137,7 @@ class CardServer:
         return IDLE_S if card.card.deadline_s is None else min(IDLE_S, max(0.001, 0.1 * TAIL_S / self._time_scale))
 
     def _listen(self, wanted: bool) -> None:
-        """Leave the wires unread for a while: the socket and the hub keep the edges."""
+        """Start or stop reading the wires; unread edges stay in the socket and the hub."""
         if wanted is not self._listening:
             self._listening = wanted
             if wanted:
@@ -146,5 +146,5 @@ class CardServer:
                 self._selector.unregister(self._wires)
 
     def close(self) -> None:
-        """Forget the sockets; their owners close them."""
+        """Close the selector, not the sockets."""
         self._selector.close()

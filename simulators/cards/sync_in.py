@@ -1,4 +1,4 @@
-"""From SYNC_IN edges to frames: when a radar starts a frame, and where the stage is then."""
+"""Decide which SYNC_IN edges start a frame, and where the stage is then."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _KEEP = 4096
 
 
 def sync_line(rig: Instrument, board: Board) -> int:
-    """The GPIO line that drives this board's SYNC_IN: the one line of a fan-out, else the board's own, in file order.
+    """Return the GPIO line of this board's SYNC_IN: the common line of a fan-out, otherwise the board's, in file order.
 
-    Raises ConfigError when there are fewer lines than boards.
+    Raises ConfigError if there are fewer lines than boards.
     """
     if rig.pi.wiring in ("fanout", "spi"):
         return rig.pi.sync_out[0]
@@ -45,8 +45,8 @@ class Pulse(NamedTuple):
 class SyncInput:
     """SYNC_IN of one radar: each rising edge starts a frame, unless it comes too soon, or the radar is not armed.
 
-    With `radar.control = "line_server"` it is armed for the frames of one row at a time, by :meth:`arm`; with "native"
-    the simulated board knows what a pulse does; otherwise it is armed from the start, without end.
+    With `radar.control = "line_server"`, :meth:`arm` arms the radar for the frames of one row; with "native", the
+    simulated board decides; otherwise the radar is always armed.
     """
 
     def __init__(self, rig: Instrument, radar: RadarBoard | None = None) -> None:
@@ -60,15 +60,12 @@ class SyncInput:
         self.too_soon = 0
 
     def arm(self) -> None:
-        """Wait for the pulses of one row, however many frames of the last one were left."""
+        """Arm the radar for the pulses of one row; frames left of the last row are dropped."""
         self._left = self._row_frames
         self.rearmed += 1
 
     def frames(self, pulses: list[Pulse]) -> list[Pulse]:
-        """The pulses that start a frame. The others are counted in `too_soon`; a real radar would fault.
-
-        Those that find the radar not armed are counted in `unarmed`.
-        """
+        """Return the pulses that start a frame; count the others as `too_soon` (a real radar faults) or `unarmed`."""
         if self._radar is not None:
             return self._native(self._radar, pulses)
         started = []
@@ -76,7 +73,7 @@ class SyncInput:
             if self._left == 0:
                 self.unarmed += 1
                 continue
-            # A time that jumps back by more than the dead time is another wire clock (the stage started anew).
+            # A time that jumps back by more than the dead time is of a new wire clock: the stage restarted.
             if self._last_ns is not None and abs(pulse.t_ns - self._last_ns) < self._dead_ns:
                 self.too_soon += 1
                 continue
@@ -101,14 +98,14 @@ class SyncInput:
 
 
 class StageTrack:
-    """Where the stage is at any wire time, from its motion lines: x(t) = x + vx (t - t_line).
+    """Position of the stage at any wire time, from its motion lines: x(t) = x + vx (t - t_line).
 
     Parameters
     ----------
     burst_motion
-        False takes every pulse of a burst where the burst's middle is, as if the stage stood still meanwhile.
+        False places all pulses of a burst at the burst's middle, as if the stage stood still.
     backlash_mm
-        While it moves towards -x the stage is so much further along +x than it says.
+        Offset along +x from the reported position while the stage moves towards -x.
     """
 
     def __init__(self, rig: Instrument, burst_motion: bool = True, backlash_mm: float = 0.0) -> None:
@@ -120,7 +117,7 @@ class StageTrack:
         self._lines: list[WireMotion] = []
 
     def add(self, motion: WireMotion) -> None:
-        """Take in one motion line. A time before the last line's means that the stage's clock began anew."""
+        """Add one motion line; a time before the last line's means that the stage's clock restarted."""
         if self._lines and motion.t_ns < self._lines[-1].t_ns:
             self._lines.clear()
         self._lines.append(motion)
@@ -128,7 +125,7 @@ class StageTrack:
             del self._lines[:_KEEP]
 
     def trigger(self, t_ns: int) -> None:
-        """The stage raised its trigger."""
+        """Record a trigger of the stage."""
         if self._triggers and t_ns < self._triggers[-1]:
             self._triggers.clear()
         self._triggers.append(t_ns)
@@ -137,13 +134,13 @@ class StageTrack:
 
     @property
     def moving(self) -> bool:
-        """Whether the last motion line has the stage moving along x."""
+        """True if the stage moves along x by its last motion line."""
         return bool(self._lines) and self._lines[-1].vx_um_s != 0
 
     def places(self, pulses: list[Pulse]) -> list[Pulse]:
-        """The pulses, renumbered by their place in the plan: row, point and pulse of the burst, in the order of a scan.
+        """Renumber the pulses by their place in the plan: row, point and pulse of the burst, in the order of a scan.
 
-        So a row that is taken again is numbered as it was. A pulse that belongs to no point keeps its number.
+        A retaken row thus keeps its numbers. A pulse that belongs to no point keeps its number.
         """
         found: list[Pulse] = []
         edge_ns, first = -1, None
@@ -159,8 +156,8 @@ class StageTrack:
         return found
 
     def _first_of(self, edge_ns: int) -> int | None:
-        """Number of the first pulse of the point whose trigger rose then; None outside the plan."""
-        plan, (x, y, _) = self._plan, self._told_mm([edge_ns])
+        """Return the number of the first pulse of the point with this trigger; None outside the plan."""
+        plan, (x, y, _) = self._plan, self._reported_mm([edge_ns])
         column = round(x[0] / plan.step_x_mm + (plan.columns - 1) / 2)
         row = round(y[0] / plan.step_y_mm + (plan.rows - 1) / 2)
         if not (0 <= column < plan.columns and 0 <= row < plan.rows):
@@ -169,12 +166,12 @@ class StageTrack:
         return (row * plan.columns + point) * self._burst.pulses
 
     def offsets_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Stage offsets from the grid's middle, x_mm [n] and y_mm [n], at wire times; the middle while unknown."""
-        x, y, backwards = self._told_mm(t_ns)
+        """Return stage offsets from the grid's middle, x_mm [n] and y_mm [n], at wire times; 0 while unknown."""
+        x, y, backwards = self._reported_mm(t_ns)
         return x + self._backlash_mm * backwards, y
 
-    def _told_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """The same as the stage says it, and whether it moves towards -x then."""
+    def _reported_mm(self, t_ns: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the reported offsets, and bool [n], True while the stage moves towards -x."""
         x, y, backwards = np.zeros(len(t_ns)), np.zeros(len(t_ns)), np.zeros(len(t_ns), np.bool_)
         if not self._lines:
             return x, y, backwards

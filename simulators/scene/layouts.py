@@ -18,7 +18,7 @@ from polysight.shared import __version__
 from polysight.shared.config import Instrument
 from polysight.shared.errors import DataError
 from polysight.shared.files import named
-from polysight.shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_kept
+from polysight.shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_with_crc
 from polysight.shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s
 from polysight.shared.tables import to_builtins
 from polysight.shared.units import NS_PER_S, us_to_ns
@@ -172,7 +172,7 @@ class OwnLayout:
     def _event(self, *events: AnyEvent) -> None:
         path = self._path / "events.msgpack"
         with named(path), path.open("ab") as f:
-            f.write(b"".join(map(pack_kept, events)))
+            f.write(b"".join(map(pack_with_crc, events)))
 
     def _stamp(self) -> dict[str, Any]:
         self._seq += 1

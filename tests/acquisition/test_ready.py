@@ -1,4 +1,4 @@
-"""Before a row: the Pi's own reason is what is told of a stage that does not home, and the room is that of the rows."""
+"""Before a row: homing fails with the Pi's own reason, and the disk space checked is that of the rows."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.ready import check_disk, make_ready
 from polysight.host.doctor.check_host import check_time
 from polysight.host.plan.forecast import forecast
-from polysight.shared.errors import ScanError
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.faults import PiFault
-from polysight.shared.stage_line import HOMING_LIMIT_S
+from polysight.shared.stage_line import HOMING_TIMEOUT_S
+from tests.support.refusals import refused
 
 
 class HomingPi:
-    """Homes for ever; gives up after `limit_s` with a reason, as the Pi does."""
+    """Homes forever; fails after `limit_s` with a reason, as the Pi does."""
 
     def __init__(self, limit_s: float) -> None:
         self.now, self._limit_s = 0.0, limit_s
@@ -27,13 +28,13 @@ class HomingPi:
         self.event_socket = SimpleNamespace(poll=self._poll)
 
     def _poll(self, _: int) -> None:
-        self.now += 1.0  # a Pi answers late, too: whole seconds pass between two looks
+        self.now += 1.0
 
     def monotonic(self) -> float:
         return self.now
 
     def home(self) -> None:
-        self._began = self.now + 10.0  # accepted, and begun once the stage has been found
+        self._began = self.now + 10.0  # accepted, and begun later
 
     def status(self) -> SimpleNamespace:
         told = {"homed": False, "scan_id": "", "fault": 0, "reason": ""}
@@ -48,30 +49,22 @@ class HomingPi:
         return []
 
 
-def homing_error(monkeypatch, limit_s: float) -> ScanError:
+@pytest.mark.parametrize(("limit_s", "reason"), [(HOMING_TIMEOUT_S, "not homed after"), (1e9, "'homing'")])
+def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeypatch, limit_s, reason):
     pi: Any = HomingPi(limit_s)
     monkeypatch.setattr(ready, "time", pi)
-    with pytest.raises(ScanError) as e:
+    with refused(ErrorCode.STAGE_NOT_READY, reason):
         make_ready(pi, StopRequest(), lambda *_: None)
-    return e.value
 
 
-def test_the_pi_s_reason_is_told_when_homing_fails(monkeypatch):
-    assert "not homed after" in homing_error(monkeypatch, HOMING_LIMIT_S).what
-
-
-def test_a_pi_that_never_ends_homing_is_not_waited_for_for_ever(monkeypatch):
-    assert "'homing'" in homing_error(monkeypatch, 1e9).what
-
-
-def test_the_machine_and_the_host_wait_by_the_same_limit():
+def test_pi_and_host_have_the_same_homing_timeout():
     from polysight.pi_controller import machine, stage
 
-    assert machine.LIMITS_S["homing"] == stage.MOTION_LIMIT_S == HOMING_LIMIT_S < ready._HOMING_LIMIT_S
+    assert machine.TIMEOUTS_S["homing"] == stage.MOTION_TIMEOUT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
 
 
 @pytest.mark.parametrize("rows", [1, 3, 4])
-def test_room_is_asked_for_what_is_written(make_instrument, tmp_path, monkeypatch, rows):
+def test_disk_space_checked_is_that_of_the_rows(make_instrument, tmp_path, monkeypatch, rows):
     """The law of sizes: rows x boards that are recorded x what one board sends; the same in plan, doctor and scan."""
     rig = make_instrument(free_disk_bytes=1000)
     assert len(rig.recorded) == 2
@@ -79,7 +72,7 @@ def test_room_is_asked_for_what_is_written(make_instrument, tmp_path, monkeypatc
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 1000))
     check_disk(tmp_path, rig, rows)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 999))
-    with pytest.raises(ScanError, match=f"needed for {rows} rows"):
+    with refused(ErrorCode.DISK_FULL, rows):
         check_disk(tmp_path, rig, rows)
 
 

@@ -12,8 +12,9 @@ from polysight.host.capture.dca1000 import Code
 from polysight.host.radar.interface import RadarControl, RadarState
 from polysight.shared import messages
 from polysight.shared.config import Radar
-from polysight.shared.errors import ScanError
+from polysight.shared.error_codes import ErrorCode
 from tests.support.paths import REPO
+from tests.support.refusals import refused
 
 SPEC = (REPO / "docs/spec/row.md").read_text(encoding="utf-8")
 
@@ -75,5 +76,5 @@ def test_only_the_transitions_of_the_table_are_made(state):
             transaction.to(then)
             assert told == [RowState.WAITING, then]
         else:
-            with pytest.raises(ScanError, match=f"from {state} to {then}"):
+            with refused(ErrorCode.OTHER, state, then):
                 transaction.to(then)

@@ -8,7 +8,7 @@ import pytest
 
 from polysight.host.acquisition import scan_loop as running
 from polysight.host.acquisition.control import StopRequest
-from polysight.host.acquisition.progress import time_left, usual_row_s
+from polysight.host.acquisition.progress import time_left, typical_row_s
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.page.snapshot import remaining
 from polysight.host.page.story import Story, seconds
@@ -27,8 +27,8 @@ def test_time_left_is_rows_times_their_time_less_what_has_passed_of_one():
 
 def test_a_row_that_took_long_does_not_change_what_rows_usually_take():
     usual = [11.0, 12.0, 13.0] * 20
-    assert usual_row_s([*usual, 900.0]) == statistics.median(usual)
-    assert usual_row_s([*usual, *[6.0] * 25]) == 6.0, "a rig that was sped up is believed after 25 rows"
+    assert typical_row_s([*usual, 900.0]) == statistics.median(usual)
+    assert typical_row_s([*usual, *[6.0] * 25]) == 6.0, "a rig that was sped up is believed after 25 rows"
 
 
 class Clock:

@@ -83,9 +83,9 @@ def row(**given) -> RowCapture:
     [
         (None, "the radar is not streaming"),
         (row(), "the radar is not streaming"),
-        (row(strangers=7), "7 packets came from another address"),
+        (row(strangers=7), "7 packets"),
         (row(card_status=int(Status.NO_LVDS_DATA)), "the radar sends nothing over LVDS"),
-        (row(card_status=int(Status.NO_HEADER)), "without the header"),
+        (row(card_status=int(Status.NO_HEADER)), "without a header"),
     ],
 )
 def test_a_radar_that_does_not_stream(got, says):

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from polysight.host.capture import dca1000
+from polysight.host.capture import dca1000, kind_of
 from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.inspect import Known, Report, Shape, inspect_bin
 from polysight.host.capture.pcap import inspect_pcap, read_pcap
 from polysight.host.jobs.look import inspect_file, main_text, plot_profile
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from tests.support.capture.recordings import real_row, row, write_pcap
 from tests.support.paths import REAL_CAPTURES
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 needs_real = pytest.mark.skipif(
@@ -103,20 +106,12 @@ def test_what_is_no_capture_has_a_status_of_its_own(tmp_path, capsys, content, i
     assert ("not a capture" in capsys.readouterr().out) is not is_capture
 
 
-def test_faults_are_told(tmp_path):
+def test_empty_and_truncated_recordings_are_told(tmp_path):
     path = tmp_path / "x.bin"
-    words = row(4, False, dead=2)
-    words[8] = 32767
-    words.tofile(path)
-    with path.open("ab") as f:
-        f.write(b"12345")
-    text = main_text(inspect_bin(path))
-    for part in ("RX 2 hold no signal", "1 values are at full scale", "5 bytes after the last whole chirp"):
-        assert part in text
+    path.write_bytes(row(4, False).tobytes() + b"12345")
+    assert "5 bytes after" in main_text(inspect_bin(path))
     np.zeros(4096, dtype=np.uint8).tofile(path)
     assert "every sample is zero" in main_text(inspect_bin(path, Known(4, samples=256, q_first=False)))
-    (row(4, False).view("<u2") ^ 0x8000).tofile(path)
-    assert "offset binary" in main_text(inspect_bin(path, Known(4, samples=256)))
 
 
 @pytest.mark.parametrize("lanes", [4, 2])
@@ -139,27 +134,15 @@ def test_a_layout_that_does_not_fit_is_told(tmp_path, given):
     row(4, False).tofile(path)
     assert inspect_shape(path, Shape(4, True, 256)).remarks == []
     remarks = inspect_shape(path, given).remarks
-    assert any("the data look like 4-lane complex, 256 samples" in text for text in remarks)
+    assert any(str(Shape(4, True, 256)) in text for text in remarks)
 
 
 def test_wrong_order_of_i_and_q_is_told(tmp_path):
     path = tmp_path / "x.bin"
     row(4, True).tofile(path)
-    assert any(
-        "I and Q seem to be in the other order" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks
-    )
+    assert any("I and Q" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks)
     assert inspect_shape(path, Shape(4, True, 256), q_first=True).remarks == []
     assert inspect_shape(path, Shape(4, True, 256), q_first=None).q_first
-
-
-def test_offset_binary_and_constant_offset_are_told(tmp_path):
-    path = tmp_path / "x.bin"
-    (row(4, False).view("<u2") ^ 0x8000).tofile(path)
-    r = inspect_bin(path)
-    assert any("offset binary" in text for text in r.remarks)
-    assert (r.lanes, r.is_complex, r.samples, r.clipped) == (4, True, 256, 0)
-    (row(4, False) + np.int16(4000)).tofile(path)
-    assert any("constant offset of 56" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks)
 
 
 def altered(words: np.ndarray, fault: str) -> np.ndarray:
@@ -179,7 +162,7 @@ def altered(words: np.ndarray, fault: str) -> np.ndarray:
     [
         ("offset binary", "offset binary"),
         ("constant offset", "constant offset of"),
-        ("clipping", "values are at full scale: the receiver clips"),
+        ("clipping", "full scale"),
     ],
 )
 def test_a_fault_is_told_and_the_layout_is_still_recognised(tmp_path, lanes, is_complex, fault, says):
@@ -203,7 +186,7 @@ def test_a_missing_antenna_is_told_in_either_layout(tmp_path, lanes, dead):
     row(lanes, False, dead=dead).tofile(path)
     r = inspect_bin(path)
     assert (r.lanes, r.samples) == (lanes, 256)
-    assert r.remarks == [f"RX {dead} hold no signal: antennas off, or another lane layout"]
+    assert [f"RX {dead} " in remark for remark in r.remarks] == [True]
 
 
 def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
@@ -215,8 +198,7 @@ def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
     path.write_bytes(b"".join(packets))
     r = inspect_bin(path)
     assert (r.lanes, r.samples, r.chirps, r.bytes) == (4, 256, 32, len(data))
-    assert len(r.remarks) == 1
-    assert "whole packets, not payload" in r.remarks[0]
+    assert ["whole packets" in remark for remark in r.remarks] == [True]
     path.write_bytes(data)
     assert inspect_bin(path).remarks == []
 
@@ -233,7 +215,7 @@ def test_plot(tmp_path, kind):
     (row(4, False) if kind == "complex" else real_row(4)).tofile(path)
     plot_profile(inspect_bin(path), png)
     assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    with pytest.raises(DataError, match="cannot be written"):
+    with pytest.raises(DataError):
         plot_profile(inspect_bin(path), tmp_path / "absent" / "x.png")
 
 
@@ -257,9 +239,9 @@ def test_a_packet_capture_is_known_by_its_first_bytes_whatever_its_name(tmp_path
 
 def test_too_small_or_absent(tmp_path):
     (tmp_path / "x.bin").write_bytes(b"")
-    with pytest.raises(DataError, match="not even one chirp"):
+    with refused(ErrorCode.NOT_ENOUGH_DATA):
         inspect_bin(tmp_path / "x.bin")
-    with pytest.raises(DataError, match="cannot be read"):
+    with refused(ErrorCode.FILE_UNREADABLE):
         inspect_bin(tmp_path / "absent.bin")
 
 
@@ -320,3 +302,24 @@ def test_real_commands():
     assert len(names) == 10
     assert {"RESET_FPGA", "RECORD_START", "RECORD_STOP", "CONFIGURE_PACKET", "ALIVE", "VERSION"} <= set(names)
     assert "2.8" in main_text(r)
+
+
+def npy() -> bytes:
+    out = io.BytesIO()
+    np.save(out, np.zeros(3))
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("head", "kind"),
+    [
+        (npy(), "a numpy array"),
+        ("# Überschrift\n".encode() * 40, "text"),
+        (("ä" * 400).encode()[:511], "text"),  # cut within a character
+        (b"\x89PNG\r\n", "a picture (PNG)"),
+        (b"", "empty"),
+        (bytes(range(256)), "unknown bytes"),
+    ],
+)
+def test_other_files_are_recognised_by_their_first_bytes(head, kind):
+    assert kind_of(head) == kind

@@ -9,7 +9,9 @@ import pytest
 
 from polysight.host.capture.packet_log import PacketLog
 from polysight.host.capture.segment import Segment, read_index
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, DeviceError
+from tests.support.refusals import refused
 
 
 def test_memory_is_taken_again_and_clean():
@@ -27,7 +29,7 @@ def test_a_segment_is_what_was_given(tmp_path):
 
 
 def test_no_room_on_the_disk(tmp_path):
-    with pytest.raises(DeviceError, match="cannot reserve"):
+    with refused(ErrorCode.DISK_FULL):
         Segment(tmp_path / "huge.part", 1 << 60)
 
 

@@ -15,7 +15,7 @@ from docs.check.pages import ROOT, read_page
 from polysight.host.capture import dca1000
 from polysight.host.capture.card import EepromSettings
 from polysight.host.radar import commands, events
-from polysight.host.radar.commands import Command, DeviceConfiguration
+from polysight.host.radar.commands import DEVICE_CONFIGURATION, Command
 from polysight.host.radar.messages import Direction, Kind, SubBlock, decode
 from polysight.host.radar.program import program
 from polysight.shared import messages, stage_line
@@ -46,7 +46,7 @@ def shown(page: str, *labels: str) -> bytes:
 
 READERS = {
     "event": messages.unpack_event, "command": messages.unpack_command, "reply": messages.unpack_reply,
-    "kept": messages.unpack_kept,
+    "kept": messages.unpack_with_crc,
 }  # fmt: skip
 
 
@@ -181,7 +181,7 @@ def published_rig():
 def test_sub_blocks_are_those_of_the_published_rig():
     rig = published_rig()
     made = program(rig, rig.by_name("RH"))
-    sent: list[Command] = [DeviceConfiguration(), *made.basic, *made.waveform, *made.frames(rig.grid.columns * 16)]
+    sent: list[Command] = [DEVICE_CONFIGURATION, *made.basic, *made.waveform, *made.frames(rig.grid.columns * 16)]
     table = {row[0]: row[3] for row in rows("mmwavelink.md", "Sub-blocks")}
     for one in sent:
         number = f"0x{one.ID:04X}"
@@ -196,7 +196,7 @@ def test_sub_blocks_are_those_of_the_published_rig():
 def test_the_page_names_every_sub_block_that_is_sent():
     page = text("mmwavelink.md")
     numbers = {c.ID for c in vars(commands).values() if isinstance(c, type) and isinstance(getattr(c, "ID", None), int)}
-    bare = {c.ID for c in vars(commands).values() if isinstance(c, commands.Bare)}
+    bare = {c.ID for c in vars(commands).values() if isinstance(c, commands.Fixed)}
     assert len(numbers | bare) > 20
     assert not [hex(n) for n in numbers | bare if f"0x{n:04X}" not in page]
 

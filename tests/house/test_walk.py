@@ -11,7 +11,7 @@ from types import FrameType
 import pytest
 
 ROOT = Path(__file__).parents[2]
-ROW = re.compile(r"^\| (\d+) \| `([^`]+)` \| `([^`]+)` \|")
+ROW = re.compile(r"^\| (\d+) \| [^|]+ \| `([^`]+)` \| `([^`]+)` \|$")
 PROCESSED_FROM = 6
 """The first stop of processing; before it come the processes of a scan, which tests/e2e runs."""
 

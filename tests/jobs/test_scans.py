@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.host.catalogue import Notes, read_notes
 from polysight.host.cli.main import main
 from polysight.simulators.scene import load_scene, simulate
@@ -64,7 +64,7 @@ def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(r
 
 def test_a_running_scan_is_asked(root, capsys):
     stop = StopRequest()
-    with ControlDesk(root / "one", stop) as desk:
+    with ControlFolder(root / "one", stop) as desk:
         desk.open()
         wait_for((root / "one" / CONTROL / ALIVE).exists, "the first sign of life")
         assert "pause" in told(capsys, "ask", root / "one", "pause")

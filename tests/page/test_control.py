@@ -8,12 +8,21 @@ from pathlib import Path
 import pytest
 
 from polysight.host.acquisition import scan as host_run
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish, ask, last_sign_of_life
+from polysight.host.acquisition.control import (
+    ALIVE,
+    CONTROL,
+    ControlFolder,
+    ScanCommand,
+    StopRequest,
+    last_alive_s,
+    send_command,
+)
 from polysight.host.store import manifest
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validation import validate
-from polysight.shared.errors import ScanError
+from polysight.shared.error_codes import ErrorCode
 from tests.support.processes import wait_for
+from tests.support.refusals import refused
 from tests.support.store.small_scan import SmallScan
 
 
@@ -21,7 +30,7 @@ from tests.support.store.small_scan import SmallScan
 def desk(tmp_path):
     """A desk that is open for the folder of the test."""
     stop = StopRequest()
-    with ControlDesk(tmp_path, stop) as made:
+    with ControlFolder(tmp_path, stop) as made:
         made.open()
         wait_for((tmp_path / CONTROL / ALIVE).exists, "the first sign of life")
         yield tmp_path, stop
@@ -29,22 +38,22 @@ def desk(tmp_path):
 
 def test_wishes_are_heard_once(desk):
     folder, stop = desk
-    ask(folder, Wish.PAUSE)
+    send_command(folder, ScanCommand.PAUSE)
     assert stop.paused
-    ask(folder, Wish.CONTINUE)
+    send_command(folder, ScanCommand.CONTINUE)
     assert not stop.paused
     assert not stop.after_row
-    ask(folder, Wish.STOP)
+    send_command(folder, ScanCommand.STOP)
     assert (stop.after_row, stop.now) == (True, False)
-    ask(folder, Wish.STOP)  # a double click, or two phones
+    send_command(folder, ScanCommand.STOP)  # a double click, or two phones
     assert (stop.after_row, stop.now) == (True, False)
-    ask(folder, Wish.ABORT)
+    send_command(folder, ScanCommand.ABORT)
     assert stop.now
 
 
 def test_abort_is_now(desk):
     folder, stop = desk
-    ask(folder, Wish.ABORT)
+    send_command(folder, ScanCommand.ABORT)
     assert stop.now
 
 
@@ -55,51 +64,51 @@ def test_a_shell_s_touch_is_a_wish(desk):
 
 
 def test_signs_of_life_go_on_and_the_folder_goes_with_the_desk(tmp_path):
-    assert last_sign_of_life(tmp_path) is None
-    with ControlDesk(tmp_path, StopRequest()) as desk:
+    assert last_alive_s(tmp_path) is None
+    with ControlFolder(tmp_path, StopRequest()) as desk:
         desk.open()
         desk.open()
-        wait_for(lambda: last_sign_of_life(tmp_path), "the first sign")
-        first = last_sign_of_life(tmp_path)
-        wait_for(lambda: last_sign_of_life(tmp_path) != first, "the next sign")
+        wait_for(lambda: last_alive_s(tmp_path), "the first sign")
+        first = last_alive_s(tmp_path)
+        wait_for(lambda: last_alive_s(tmp_path) != first, "the next sign")
     assert not (tmp_path / CONTROL).exists()
 
 
 def test_what_was_asked_of_an_earlier_scan_is_forgotten(tmp_path):
     (tmp_path / CONTROL).mkdir()
-    for wish in Wish:
+    for wish in ScanCommand:
         (tmp_path / CONTROL / wish).touch()
     stop = StopRequest()
-    with ControlDesk(tmp_path, stop) as desk:
+    with ControlFolder(tmp_path, stop) as desk:
         desk.open()
-        wait_for(lambda: last_sign_of_life(tmp_path), "the first sign")
-        ask(tmp_path, Wish.CONTINUE)
+        wait_for(lambda: last_alive_s(tmp_path), "the first sign")
+        send_command(tmp_path, ScanCommand.CONTINUE)
     assert (stop.after_row, stop.paused) == (False, False)
 
 
-def test_a_desk_that_was_not_opened_touches_nothing(tmp_path):
-    with ControlDesk(tmp_path, StopRequest()):
+def test_control_folder_that_was_not_opened_touches_nothing(tmp_path):
+    with ControlFolder(tmp_path, StopRequest()):
         pass
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nobody_there_is_said(tmp_path):
-    with pytest.raises(ScanError, match="nobody can be asked to pause"):
-        ask(tmp_path, Wish.PAUSE)
+def test_command_without_a_running_scan_is_refused(tmp_path):
+    with refused(ErrorCode.NO_ANSWER, "pause", tmp_path):
+        send_command(tmp_path, ScanCommand.PAUSE)
 
 
-def test_a_wish_that_is_not_heard_is_withdrawn(tmp_path):
+def test_command_that_is_not_accepted_is_withdrawn(tmp_path):
     (tmp_path / CONTROL).mkdir()
-    with pytest.raises(ScanError, match="did not hear abort"):
-        ask(tmp_path, Wish.ABORT, limit_s=0.2)
+    with refused(ErrorCode.NO_ANSWER, "abort"):
+        send_command(tmp_path, ScanCommand.ABORT, limit_s=0.2)
     assert list((tmp_path / CONTROL).iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
-    with ControlDesk(tmp_path / "not" / "there", StopRequest()) as desk:
+    with ControlFolder(tmp_path / "not" / "there", StopRequest()) as desk:
         desk.open()
-        with pytest.raises(ScanError):
-            ask(tmp_path / "not" / "there", Wish.PAUSE)
+        with refused(ErrorCode.NO_ANSWER):
+            send_command(tmp_path / "not" / "there", ScanCommand.PAUSE)
 
 
 def facts(path: Path) -> list[str]:

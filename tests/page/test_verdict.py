@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from polysight.host.acquisition.control import Wish
+from polysight.host.acquisition.control import ScanCommand
 from polysight.host.page.images import Shown
 from polysight.host.page.listener import Heard
 from polysight.host.page.story import Story, of_fault
@@ -45,7 +45,7 @@ def test_all_is_well_needs_nothing_done(story):
 
 def test_a_dead_program_outranks_everything_but_the_end(story):
     gone = replace(LIVELY, alive=False, alive_s=1.7e9, pi_silent_s=99.0)
-    s = status(story, gone, replace(RUNNING, state="fault"), asked=Wish.ABORT)
+    s = status(story, gone, replace(RUNNING, state="fault"), asked=ScanCommand.ABORT)
     assert (s.level, s.headline) == ("bad", "The scan program is gone")
     assert f"polysight resume {FOLDER}" in s.do
     assert "1 of 3 rows are safe" in s.detail
@@ -109,11 +109,11 @@ def test_rows_without_a_direct_path_are_not_well(story, direct_rad, masked, leve
 
 
 def test_wishes_are_said_until_they_come_to_pass(story):
-    assert status(story, asked=Wish.PAUSE).headline == "Pausing after this row"
+    assert status(story, asked=ScanCommand.PAUSE).headline == "Pausing after this row"
     story.add_fact({"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
-    assert status(story, asked=Wish.PAUSE).headline == "Paused"
-    assert status(story, asked=Wish.STOP).headline == "Stopping after this row"
-    assert status(story, asked=Wish.ABORT).headline == "Stopping now"
+    assert status(story, asked=ScanCommand.PAUSE).headline == "Paused"
+    assert status(story, asked=ScanCommand.STOP).headline == "Stopping after this row"
+    assert status(story, asked=ScanCommand.ABORT).headline == "Stopping now"
 
 
 def test_ends_say_how(story):

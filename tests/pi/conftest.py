@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 import tomli_w
 
 from polysight.pi_controller.service import Service
+from polysight.shared import messages as m
 from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
 from tests.support.pi.fake_stage import FakeStage
 from tests.support.pi.host_side import HostSide
 from tests.support.pi.mini_hub import MiniHub
-from tests.support.rigs import at_stage_port, published_rig
+from tests.support.pi.program import Process
+from tests.support.rigs import at_stage_port, published_rig, timed_by_the_program
 
 
 @pytest.fixture
@@ -38,6 +42,13 @@ def instrument(tmp_path: Path) -> Instrument:
             heartbeat_ms=50,
         ),
     )
+
+
+@pytest.fixture
+def gpio_rig(instrument: Instrument, tmp_path: Path) -> Instrument:
+    """With SYNC_IN on a GPIO line of the stand-in chip (simulators/gpio) at `tmp_path / "chip"`."""
+    rig = timed_by_the_program(instrument)
+    return msgspec.structs.replace(rig, pi=msgspec.structs.replace(rig.pi, gpio_chip=str(tmp_path / "chip")))
 
 
 @pytest.fixture
@@ -75,6 +86,29 @@ def stage(hub: Path, instrument: Instrument) -> Iterator[FakeStage]:
     stage.close()
 
 
+@pytest.fixture
+def start(
+    write_config: Callable[[Instrument], Path], request: pytest.FixtureRequest
+) -> Iterator[Callable[..., tuple[Process, HostSide]]]:
+    """Starts `polysight-pi run` with these arguments and this environment; gives the process and its host.
+
+    The stage is `stage`, unless the rig has a port of its own.
+    """
+    with ExitStack() as started:
+
+        def start(rig: Instrument, *args: object, **environment: Any) -> tuple[Process, HostSide]:
+            if not Path(rig.stage.port).exists():
+                rig = at_stage_port(rig, request.getfixturevalue("stage").port)
+            program = Process(write_config(rig), *args, **environment)
+            started.enter_context(program)
+            assert program.ready, program.popen.communicate()
+            host = HostSide(program.ready[1], program.events[1], rig)
+            started.callback(host.close)
+            return program, host
+
+        yield start
+
+
 class Running:
     """A service in a thread, and the host's end of its sockets."""
 
@@ -98,3 +132,20 @@ def pi(instrument: Instrument, stage: FakeStage, hub: Path) -> Iterator[Running]
     running = Running(at_stage_port(instrument, stage.port), hub)
     yield running
     running.close()
+
+
+@pytest.fixture
+def host(pi: Running) -> HostSide:
+    """The host of `pi`: a run is begun and the stage is homed."""
+    pi.host.accepted(pi.host.begin())
+    pi.host.home()
+    return pi.host
+
+
+@pytest.fixture
+def host_in_row(host: HostSide, stage: FakeStage) -> HostSide:
+    """The same during row 0: its first burst has been sent, and its points are 50 ms apart."""
+    stage.pace_s = 0.05
+    host.start_row()
+    host.wait(m.Capture)
+    return host

@@ -133,6 +133,22 @@ def test_udev_rules_are_well_formed():
 
 
 @pytest.fixture
+def install(bench, tmp_path):
+    """Runs install.sh as copied to the Pi; gives what it ended with."""
+    copied = tmp_path / "copied"
+    shutil.copytree(PI, copied)
+    (copied / "a.whl").touch()
+    shutil.copy(REPO / "instrument.toml", copied)
+
+    def install(*args):
+        return subprocess.run(
+            [copied / "install.sh", *args], env=bench, capture_output=True, text=True, check=False
+        )  # fmt: skip
+
+    return install
+
+
+@pytest.fixture
 def bench(tmp_path):
     """Commands that change nothing outside the test's folder, and the environment in which they are found."""
     for name in ("bin", "home/polysight", "root"):
@@ -151,14 +167,7 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
     """`make pi-install` as a whole, with every command that changes a machine replaced."""
     root, log = tmp_path / "root", tmp_path / "log"
     (tmp_path / "home/polysight/notes").write_text("mine")
-    make = [
-        "make",
-        "pi-install",
-        "HOST=pi@here",
-        f"VENV={tmp_path}",
-        f"BIN={tmp_path / 'bin'}",
-        f"OUT={tmp_path / 'out'}",
-    ]
+    make = ["make", "pi-install", "HOST=pi@here", f"VENV={tmp_path}", f"BIN={tmp_path}/bin", f"OUT={tmp_path}/out"]
     for rig_file in (None, "mine"):
         if rig_file:
             (root / "etc/polysight/instrument.toml").write_text(rig_file)
@@ -189,43 +198,29 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
     assert (opt / "venv/bin/python").is_file()
 
 
-def test_a_release_that_cannot_be_installed_changes_nothing(bench, tmp_path):
-    copied = tmp_path / "copied"
-    shutil.copytree(PI, copied)
-    (copied / "a.whl").touch()
-    shutil.copy(REPO / "instrument.toml", copied)
-    install = [copied / "install.sh"]
-    assert subprocess.run(install, env=bench, check=False).returncode == 0
-    opt = tmp_path / "root/opt/polysight"
+def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):
+    assert install().returncode == 0
+    opt, log = tmp_path / "root/opt/polysight", tmp_path / "log"
     before = sorted(p.name for p in (opt / "releases").iterdir())
     (opt / "venv/bin/python").write_text(STUB + "exit 1\n")
-    assert subprocess.run(install, env=bench, capture_output=True, check=False).returncode == 5
+    log.unlink()
+    failed = install()
+    assert (failed.returncode, "internet" in failed.stderr) == (5, True)
+    assert "systemctl" not in log.read_text(), "the running service goes on"
     assert (opt / "venv").readlink() == Path("releases/1")
     assert sorted(p.name for p in (opt / "releases").iterdir()) == before
 
 
-def test_nobody_goes_back_to_a_release_that_was_not_finished(bench, tmp_path):
-    """The power is cut while pip installs: its folder is there, and it was never in use."""
-    copied = tmp_path / "copied"
-    shutil.copytree(PI, copied)
-    (copied / "a.whl").touch()
-    shutil.copy(REPO / "instrument.toml", copied)
-    install = [copied / "install.sh"]
-    python = tmp_path / "root/opt/polysight/venv/bin/python"
-    assert subprocess.run(install, env=bench, check=False).returncode == 0
+def test_an_unfinished_release_is_never_used(install, tmp_path):
+    """The power is cut while pip installs: the release's folder exists, and was never in use."""
+    opt = tmp_path / "root/opt/polysight"
+    assert install().returncode == 0
+    python = opt / "venv/bin/python"
     whole = python.read_text()
     python.write_text(STUB + "kill -9 $PPID\n")
-    assert subprocess.run(install, env=bench, check=False).returncode == -9
-    opt = tmp_path / "root/opt/polysight"
+    assert install().returncode == -9
     assert (opt / "venv").readlink() == Path("releases/1")
     python.write_text(whole)
-    assert subprocess.run(install, env=bench, check=False).returncode == 0
-    assert subprocess.run([*install, "--roll-back"], env=bench, check=False).returncode == 0
+    assert install().returncode == 0
+    assert install("--roll-back").returncode == 0
     assert (opt / "venv").readlink() == Path("releases/1")
-
-
-def test_a_pi_that_lacks_a_library_and_the_internet_is_told_so(bench, tmp_path):
-    (tmp_path / "bin/pip").write_text(STUB + "exit 1\n")
-    done = subprocess.run([PI / "install.sh"], env=bench, capture_output=True, text=True, check=False)
-    assert (done.returncode, "to the internet once" in done.stderr) == (5, True)
-    assert "systemctl" not in (tmp_path / "log").read_text(), "what runs goes on as it was"

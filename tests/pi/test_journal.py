@@ -16,11 +16,11 @@ from polysight.pi_controller.journal import (
     SPARE_BYTES,
     Journal,
     JournalFile,
-    JournalFullError,
 )
-from polysight.shared.errors import ConfigError, DataError, DeviceError
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.messages import RunStopped, unpack_event
 from polysight.shared.raster import RasterPlan
+from tests.support.refusals import refused
 
 payloads = st.lists(st.binary(max_size=40), max_size=12)
 
@@ -118,7 +118,7 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
         return n
 
     monkeypatch.setattr(journal_module.os, "pwrite", full)
-    with pytest.raises(JournalFullError, match="No space left"):
+    with refused(ErrorCode.DISK_FULL, j.path, "No space left"):
         j.write([b"lost 1", b"lost 2"])
     assert (j.last_seq, j.read(1, 9)) == (1, [b"kept"])
     monkeypatch.undo()
@@ -131,19 +131,19 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
 def test_a_stranger_file_is_refused_and_kept(tmp_path):
     path = tmp_path / "a.journal"
     path.write_bytes(b"somebody's notes")
-    with pytest.raises(DataError):
+    with refused(ErrorCode.FILE_FOREIGN, path):
         JournalFile(path)
     assert path.read_bytes() == b"somebody's notes"
 
 
 def test_one_process_a_folder(tmp_path):
     folder = Journal(tmp_path / "j")
-    with pytest.raises(DeviceError, match="in use"):
+    with refused(ErrorCode.BUSY, tmp_path / "j"):
         Journal(tmp_path / "j")
     folder.close()
     Journal(tmp_path / "j").close()
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError):
+    with refused(ErrorCode.FILE_UNREADABLE, tmp_path / "file" / "j"):
         Journal(tmp_path / "file" / "j")
 
 
@@ -226,17 +226,11 @@ def test_no_scan_begins_without_room_for_its_journal(tmp_path, monkeypatch):
     free = SPARE_BYTES + 70_000 * CAPTURE_BYTES
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     folder.check_room("scan", 70_000)
-    with pytest.raises(JournalFullError, match=r"26\.6 MB free, 26\.6 MB needed for 70001 positions"):
+    with refused(ErrorCode.DISK_FULL, "26.6 MB free", "26.6 MB needed", 70_001):
         folder.check_room("scan", 70_001)
-    folder.close()
-
-
-def test_a_scan_that_goes_on_needs_room_for_the_rest_only(tmp_path, monkeypatch):
-    folder = Journal(tmp_path)
     folder.path_of("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
     free = SPARE_BYTES + 1_000 * CAPTURE_BYTES
-    monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
-    folder.check_room("there", 70_000)
-    with pytest.raises(JournalFullError):
+    folder.check_room("there", 70_000)  # only the rest needs space
+    with refused(ErrorCode.DISK_FULL):
         folder.check_room("another", 70_000)
     folder.close()

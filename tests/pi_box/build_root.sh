@@ -28,9 +28,9 @@ exec 9>"$cache/lock"
 flock 9 # two runs at once: the second finds the first one's
 if [ -e "$box/root.img" ]; then echo "$box"; exit 0; fi
 work=$cache/work
-rm -rf "$work"
+rm -rf --one-file-system "$work"
 mkdir -p "$work/box" "$work/wheels"
-trap 'rm -rf "$work"' EXIT
+trap 'rm -rf --one-file-system "$work"' EXIT  # /proc and /sys are mounted in it if mmdebstrap was killed
 
 libraries() { # $1: a release as install.sh would begin one, with its libraries: an emulated processor takes long over pip
   "${PYTHON:-python3}" -m pip download "${for_the_pi[@]}" --dest "$work/wheels" --requirement "$pins"

@@ -18,7 +18,7 @@ import zmq
 
 from polysight.shared import messages as m
 from polysight.shared.faults import PiFault
-from polysight.shared.sockets import Refusals, requester
+from polysight.shared.sockets import HandshakeMonitor, requester
 from tests.pi_box.installed import PROGRAM, READY_LIMIT_S, InstalledPi, tell
 from tests.support.pi.host_side import HostSide
 from tests.support.rigs import published_rig
@@ -114,8 +114,8 @@ def test_a_host_with_the_keys_is_answered_and_one_without_is_refused(pi: Install
     assert isinstance(refused, m.Refused)
     assert refused.number == PiFault.NOT_OWNER
     stranger = requester(context, pi.addresses()[0], tmp_path / "second")
-    refusals = Refusals(stranger)
-    pi.box.wait(refusals.seen, "a revoked key is refused at the door", 60)
+    refusals = HandshakeMonitor(stranger)
+    pi.box.wait(refusals.refused, "a revoked key is refused at the door", 60)
     refusals.close()
     context.destroy(linger=0)
 

@@ -1,4 +1,4 @@
-"""`polysight plan` as it is called."""
+"""`polysight plan`: exit status, text and JSON; noise and standstill from options and from a scan (`--like`)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ import pytest
 import tomli_w
 
 from polysight.host.cli.main import main
+from polysight.host.plan import Changes
+from polysight.host.store import manifest
+from polysight.host.store.events import EventWriter
+from polysight.host.store.scan_folder import EVENTS, MANIFEST
+from polysight.shared.messages import Capture
+from polysight.shared.raster import plan_raster
+from polysight.simulators.scene import decode_scene, simulate
 from tests.support.paths import RIG_FILE
 
 RIG = ["--config", str(RIG_FILE)]
 SMALL = ["--columns", "40", "--rows", "30"]
+PULSES, ROWS, COLUMNS, SNR_DB, GAP_S = 8, 2, 12, 12.0, 20.0
 
 
-def test_a_plan_in_words_and_as_numbers(capsys):
+def test_text_and_json_have_the_same_plan(capsys):
     assert main(["plan", *RIG, *SMALL]) == 0
     words = capsys.readouterr().out
     assert main(["plan", *RIG, *SMALL, "--json"]) == 0
@@ -26,25 +34,21 @@ def test_a_plan_in_words_and_as_numbers(capsys):
     assert "simulated" in numbers["noise_source"]
 
 
-def test_a_plan_that_would_be_refused_says_so_and_fails(capsys):
-    assert main(["plan", *RIG, *SMALL, "--speed-mm-s", "100", "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert told["possible"] is False
-    assert any(w["refused"] and "too fast for the burst" in w["text"] for w in told["warnings"])
-
-
-def test_what_breaks_the_rig_file_is_one_message(capsys):
-    assert main(["plan", *RIG, "--width-mm", "5000"]) == 2
-    assert "do not fit stage.travel_x_mm" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("options", "status"),
+    [([*SMALL, "--speed-mm-s", "100"], 1), (["--minutes", "0.5"], 1), (["--width-mm", "5000"], 2)],
+    ids=["refused plan", "no plan", "broken rule"],
+)
+def test_a_plan_that_is_impossible_fails(options, status):
+    assert main(["plan", *RIG, *options]) == status
 
 
 def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
-    """Put into the rig file as they are printed, they give the plan's own figures, and nothing is left to ask for."""
+    """Inserted into the rig file as printed, they give the plan's own figures without any option."""
     asked = [*SMALL, "--accel-mm-s2", "345", "--object-distance-mm", "480", "--width-mm", "120"]
     minutes = ["--minutes", "3", "--count", "1"]
     assert main(["plan", *RIG, *asked, *minutes]) == 0
-    lines = capsys.readouterr().out.rpartition("rig file, all that differ:\n\n")[2]
-    assert "Pi's rig file too" in lines
+    lines = capsys.readouterr().out.rpartition("all that differ:\n\n")[2]
     assert main(["plan", *RIG, *asked, *minutes, "--json"]) == 0
     proposed = json.loads(capsys.readouterr().out)["plans"][0]
     table = tomllib.loads(RIG_FILE.read_text())
@@ -60,13 +64,66 @@ def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
     assert json.loads(capsys.readouterr().out) == proposed
 
 
-def test_no_plan_within_the_time(capsys):
-    assert main(["plan", *RIG, "--minutes", "0.5"]) == 1
-    assert "no plan keeps 0.5 minutes" in capsys.readouterr().err
+# --- noise and standstill of an earlier scan ---
 
 
-def test_given_noise_and_standstill_are_used(capsys):
-    assert main(["plan", *RIG, *SMALL, "--json", "--snr-db", "10", "--row-overhead-s", "2"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["position_snr_db"] == pytest.approx(22.04, abs=0.01)
-    assert told["time_s"]["standstill"] == pytest.approx(60.0)
+@pytest.fixture(scope="module")
+def scan(rig, tmp_path_factory):
+    """A scan of known noise, made without a Pi."""
+    folder = tmp_path_factory.mktemp("like") / "scan"
+    scene = decode_scene({"name": "quiet", "disturbances": {"ideal": True, "direct_snr_db": SNR_DB}}, "test")
+    return simulate(Changes(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig), scene, folder)
+
+
+def taken_by_a_pi(scan, rig, gap_s: float) -> None:
+    """Give the scan events of a Pi with `gap_s` seconds from a row's last trigger to the next one's first."""
+    facts = manifest.read(scan / MANIFEST).facts
+    facts[0]["pi"] = {"release": "test"}
+    (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
+    (scan / EVENTS).unlink(missing_ok=True)
+    events, t, seq = EventWriter(scan / EVENTS), 0.0, 0
+    for row in plan_raster(Changes(columns=COLUMNS, rows=ROWS).apply(rig).grid):
+        for point in range(row.points):
+            seq, ns = seq + 1, round(t * 1e9)
+            events.append(
+                Capture(
+                    scan_id="quiet", seq=seq, t_mono_ns=ns, row_index=row.index, take=1, point=point,
+                    column=row.column(point), edge_ns=ns, first_pulse_ns=ns, last_pulse_ns=ns, pulses=PULSES,
+                    width_max_ns=1, jitter_ns=1,
+                )
+            )  # fmt: skip
+            t += gap_s if point == row.points - 1 else 0.1
+    events.sync()
+    events.close()
+
+
+@pytest.fixture
+def planned(capsys):
+    def plan(*more: object) -> dict:
+        arguments = ["plan", *RIG, "--rows", "30", "--pulses", "16", "--json", *more]
+        assert main(list(map(str, arguments))) == 0
+        return json.loads(capsys.readouterr().out)
+
+    return plan
+
+
+def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, planned):
+    without = planned()
+    alike = planned("--like", scan)
+    assert alike["position_snr_db"] == pytest.approx(SNR_DB + 12.04, abs=0.7)  # 16 chirps
+    assert "simulated scan quiet" in alike["noise_source"]
+    assert abs(without["position_snr_db"] - alike["position_snr_db"]) > 5
+    assert alike["time_s"]["standstill"] == without["time_s"]["standstill"]  # without a Pi there are no times
+    standstills = []
+    for more_s in (0.0, 1.5):
+        taken_by_a_pi(scan, rig, GAP_S + more_s)
+        standstills.append(planned("--like", scan)["time_s"]["standstill"])
+    assert standstills[1] - standstills[0] == pytest.approx(30 * 1.5)
+    assert 0 < standstills[0] < 30 * GAP_S
+
+
+def test_options_override_the_scan(scan, rig, planned):
+    taken_by_a_pi(scan, rig, GAP_S)
+    values = planned("--like", scan, "--snr-db", "3", "--row-overhead-s", "0.5")
+    assert values["position_snr_db"] == pytest.approx(3 + 12.04, abs=0.01)
+    assert values["time_s"]["standstill"] == pytest.approx(15.0)

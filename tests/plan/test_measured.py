@@ -1,4 +1,4 @@
-"""Noise and standstill from scans: of a simulated scan with known noise, and of the simulated rig's own clock."""
+"""Measured noise and standstill: of a simulated scan with known noise, and by the clock of the simulated rig."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import msgspec
 import pytest
 import tomli_w
 
-from polysight.host.plan import Changes, Noise
-from polysight.host.plan.text import noise_of, row_overhead_of
+from polysight.host.plan import Changes
+from polysight.host.plan.plan_command import measure_noise, measure_row_overhead
 from polysight.host.plan.timing import row_motion_s, scan_time, turn_s, whole_packets
 from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import EVENTS, ScanFolder
 from polysight.shared.config import load_instrument
-from polysight.shared.errors import DataError
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.messages import Capture
 from polysight.shared.tables import to_builtins
 from polysight.simulators.scene import decode_scene, simulate
+from tests.support.refusals import refused
 
 
 def small_scan(rig, folder, pulses, snr_db):
@@ -30,21 +31,17 @@ def small_scan(rig, folder, pulses, snr_db):
 
 @pytest.mark.parametrize("snr_db", [3.0, 12.0])
 def test_the_noise_of_a_simulated_scan_is_found(rig, tmp_path, snr_db):
-    found = noise_of(small_scan(rig, tmp_path / "scan", 8, snr_db))
+    found = measure_noise(small_scan(rig, tmp_path / "scan", 8, snr_db))
     assert found.direct_snr_db == pytest.approx(snr_db, abs=0.7)
     assert "simulated" in found.source
-    assert row_overhead_of(tmp_path / "scan") is None  # made without a Pi: its times mean nothing
+    assert measure_row_overhead(tmp_path / "scan") is None  # without a Pi there are no times
 
 
-def test_a_scan_without_rows_cannot_tell_its_noise(rig, tmp_path):
+def test_a_scan_without_rows_has_no_noise(rig, tmp_path):
     scan = small_scan(rig, tmp_path / "scan", 4, 3.0)
     empty = ScanFolder.create(tmp_path / "empty", scan.instrument, scan.plan, simulated=True)
-    with pytest.raises(DataError, match="cannot be told"):
-        noise_of(empty)
-
-
-def test_the_default_noise_is_called_simulated():
-    assert "simulated" in Noise().source
+    with refused(ErrorCode.NOT_ENOUGH_DATA):
+        measure_noise(empty)
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +65,7 @@ def scanned(rig, tmp_path_factory):
         try:
             ready = process.stdout.readline()
             assert ready.startswith("ready "), ready
-            scan = [
-                sys.executable,
-                "-m",
-                "polysight.host",
-                "scan",
-                "--config",
-                ready.removeprefix("ready ").strip(),
-            ]
+            scan = [sys.executable, "-m", "polysight.host", "scan", "--config", ready.removeprefix("ready ").strip()]
             subprocess.run([*scan, "--out", folder / "scan", "--no-process"], check=True, timeout=240)
         finally:
             process.terminate()
@@ -83,7 +73,7 @@ def scanned(rig, tmp_path_factory):
 
 
 def test_a_simulated_scan_s_own_clock_agrees(scanned):
-    """Rows take exactly what was estimated; between them pass the motion and the standstill that is told."""
+    """Rows take the estimated time; the gaps between them are motion plus the measured standstill."""
     folder, rig = scanned
     assert whole_packets(rig)
     estimate = scan_time(rig, 0.0)
@@ -95,5 +85,4 @@ def test_a_simulated_scan_s_own_clock_agrees(scanned):
     motion = row_motion_s(rig.grid, rig.stage) - estimate.measuring_s / 3 + turn_s(rig.grid, rig.stage)
     gaps = [later[0] - earlier[-1] for earlier, later in pairwise(rows)]
     assert min(gaps) > motion - 0.02
-    told = row_overhead_of(folder)
-    assert told == pytest.approx(sum(gaps) / 2 - motion, abs=1e-6)
+    assert measure_row_overhead(folder) == pytest.approx(sum(gaps) / 2 - motion, abs=1e-6)

@@ -1,4 +1,4 @@
-"""The time of a scan: equal to the simulated stage's own clock, and the law of adding up."""
+"""The estimated time of a scan equals the simulated stage's own clock, and adds up row by row."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from polysight.simulators.stage import TICK_HZ, PythonStage, Rig
 
 
 class Stage:
-    """The simulated stage, homed, set up as the Pi sets it up; it moves in virtual time."""
+    """The simulated stage in virtual time, homed and set up as by the Pi."""
 
     def __init__(self, rig: Instrument) -> None:
         s = rig.stage
@@ -44,7 +44,7 @@ class Stage:
         assert self.board.replies.startswith(b"ok"), self.board.replies
 
     def seconds(self, verb: str, *args: int) -> float:
-        """From a motion command to its end."""
+        """Duration of a motion command."""
         began = self.board.tick
         self.command(verb, *args)
         while b"done" not in self.board.replies:
@@ -54,7 +54,7 @@ class Stage:
 
 
 def scanned(rig: Instrument) -> tuple[float, list[int]]:
-    """Seconds of motion of a whole scan from the home corner, and the times of its triggers, ns."""
+    """Motion of a whole scan from the home corner, seconds, and the times of its triggers, ns."""
     stage = Stage(rig)
     total = sum(
         stage.seconds("ROW", *row_in_steps(row, rig.stage, rig.stage.speed_mm_s)) for row in plan_raster(rig.grid)
@@ -73,7 +73,7 @@ def scanned(rig: Instrument) -> tuple[float, list[int]]:
         (40.0, 2.0, 6.0, 200.0, 3.0),
     ],
 )
-def test_the_estimate_is_the_simulated_stage_own_time(rig, speed, step_x, step_y, accel, backlash):
+def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, step_y, accel, backlash):
     rig = Changes(speed_mm_s=speed, step_x_mm=step_x, step_y_mm=step_y, columns=30, rows=5, accel_mm_s2=accel).apply(
         rig
     )
@@ -88,10 +88,10 @@ def test_the_estimate_is_the_simulated_stage_own_time(rig, speed, step_x, step_y
     assert sum(measuring) == pytest.approx(estimate.measuring_s, rel=1e-5)
 
 
-def test_a_row_is_its_motion_and_its_turn(rig):
+def test_one_more_row_adds_its_motion_turn_overhead_and_tail(rig):
     ten, eleven = (scan_time(Changes(rows=n).apply(rig), 0.25) for n in (10, 11))
     more = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + 0.25 + tail_s(rig)
-    # One row more, and the first one half a step nearer to the corner.
+    # The first row is half a step nearer to the corner.
     assert eleven.total_s - ten.total_s == pytest.approx(more + eleven.approach_s - ten.approach_s)
 
 
@@ -104,7 +104,7 @@ def test_moves_take_no_less_than_at_full_speed_and_no_less_than_acceleration_all
     assert took <= distance / speed + 2 * (distance / accel) ** 0.5
 
 
-def test_a_row_of_whole_packets_is_not_waited_for(rig):
+def test_a_row_of_whole_packets_has_no_wait_for_the_last_packet(rig):
     # 350 columns x 13 frames x 4096 bytes = 12,800 packets of 1456 bytes.
     whole, short = Changes(pulses=13).apply(rig), Changes(pulses=16).apply(rig)
     assert whole_packets(whole)

@@ -18,6 +18,7 @@ from polysight.host.materials.sub_bands import bands_of_row
 from polysight.host.polarimetry import Leakage, PlaneReference
 from polysight.shared.config import Instrument
 from polysight.simulators.scene import decode_scene, simulate
+from tests.support.leakage import remaining
 
 BANDS = 3
 LEAKAGE = {"leakage_h": [0.08, 0.03], "leakage_v": [-0.02, 0.06]}
@@ -62,13 +63,13 @@ def scan(rig: Instrument, tmp_path_factory):
     return make
 
 
-def remaining(found: Leakage, truth: Leakage) -> tuple[float, float]:
+def remaining_at_same_plate(found: Leakage, truth: Leakage) -> tuple[float, float]:
     """Crosstalk and imbalance left, both rigs brought to the same plate."""
 
     def relative(x: Leakage) -> Leakage:
         return Leakage(x.h, x.v, (1 + x.v) / (1 + x.h), 0.0)
 
-    return relative(found).remaining(relative(truth))
+    return remaining(relative(found), relative(truth))
 
 
 def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan, capsys):
@@ -76,7 +77,7 @@ def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan
     assert main(["leakage", str(plate), "--strips", f"0={upright}", "--strips", f"90={lying}", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     found, truth = (Leakage(complex(*x["leakage_h"]), complex(*x["leakage_v"]), 1.0, 0.0) for x in (printed, LEAKAGE))
-    crosstalk, imbalance = remaining(found, truth)
+    crosstalk, imbalance = remaining_at_same_plate(found, truth)
     assert crosstalk < 0.01
     assert imbalance < 0.025
     assert printed["simulated"]

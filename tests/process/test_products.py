@@ -15,7 +15,7 @@ from polysight.host.pipeline import Pipeline
 from polysight.host.process import Options
 from polysight.host.products import read_products
 from polysight.host.products.files import FINISHED
-from polysight.host.store import MANIFEST, ScanFolder, manifest
+from polysight.host.store import ScanFolder
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from tests.support.commands import content, told_by
@@ -110,33 +110,17 @@ def rename_pet(scan: Path, name: str) -> None:
     (scan / "truth.json").write_text(json.dumps(truth))
 
 
-def add_retakes(scan: Path) -> None:
-    """Add two retakes to the manifest, and mark row 5 as kept though incomplete."""
-    facts = manifest.read(scan / MANIFEST).facts
-    rejected = [{"fact": "row_rejected", "row": row, "take": 1, "reasons": ["test"]} for row in (2, 5)]
-    (kept,) = (f for f in facts if f["fact"] == "row_committed" and f["row"] == 5)
-    kept["kept_incomplete"] = True
-    (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in [facts[0], *rejected, *facts[1:]]))
-
-
-def test_right_names_and_retakes_are_counted_and_the_mark_of_an_earlier_run_is_removed(
-    two_plates: Path, tmp_path: Path
-) -> None:
+def test_right_names_are_counted_and_the_mark_of_an_earlier_run_is_removed(two_plates: Path, tmp_path: Path) -> None:
     scan, out = shutil.copytree(two_plates, tmp_path / "scan"), tmp_path / "out"
     rename_pet(scan, "no such material")
     shown = told_by("process", scan, "--out", out, "--metal", METAL)
     segments = content(out / "materials.json")["segments"]
     for value in (f"{len(segments)} patches", "0 of 1 plates", out / "report.html", f"{out}/"):
         assert str(value) in shown
-    quality = content(out / "quality.json")
-    assert quality["verdict"]["level"] == "care"
-    assert (quality["rows_retaken"], quality["rows_incomplete"]) == (0, [])
+    assert content(out / "quality.json")["verdict"]["level"] == "care"
 
     (out / FINISHED).write_text("{}")
     (pet,) = (s for s in segments if s["truth"] and s["truth"]["name"] == "no such material")
     rename_pet(scan, pet["name"])
-    add_retakes(scan)
     assert "1 of 1 plates" in told_by("process", scan, "--out", out, "--metal", METAL)
     assert not (out / FINISHED).exists()
-    quality = content(out / "quality.json")
-    assert (quality["rows_retaken"], quality["rows_incomplete"]) == (2, [5])

@@ -1,4 +1,4 @@
-"""What the verdict `none` withholds, the signs of a permittivity's errors, and products of earlier releases."""
+"""The verdict `none` withholds results; signs of the errors of a permittivity; products of earlier releases."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ import xarray
 from polysight import open_scan
 from polysight.host.cli.main import main
 from polysight.host.products import permittivity_spread, read_image, read_products, withhold, write_image, write_json
-from polysight.shared.errors import DataError
+from polysight.shared.error_codes import ErrorCode
 from tests.support.products import NAMES, judged_products
+from tests.support.refusals import refused
 
 
 @pytest.mark.parametrize("level", ["good", "care", "none"])
@@ -41,7 +42,7 @@ def test_every_export_holds_the_verdict_and_p_sigma(tmp_path, level):
 
 
 def test_without_a_result_no_export_names_anything(tmp_path):
-    """Even where the files hold names, as a faulty or tampered writer would leave them."""
+    """Even if the files contain names, as written by a faulty program."""
     folder, out = judged_products(tmp_path / "one", "none", careless=True), tmp_path / "out"
     assert any(name in (folder / "materials.json").read_text(encoding="utf-8") for name in NAMES)
     assert main(["export", str(folder), "--hdf5", "--mat", "--csv", "--zarr", "--out", str(out)]) == 0
@@ -62,7 +63,7 @@ def test_without_a_result_no_export_names_anything(tmp_path):
     assert [name for name in NAMES if name in text] == []
 
 
-def test_withholding_keeps_places_and_changes_nothing_of_usable_results(tmp_path):
+def test_withholding_keeps_positions_and_does_not_change_usable_results(tmp_path):
     usable = json.loads((judged_products(tmp_path / "good", "good") / "materials.json").read_text(encoding="utf-8"))
     assert withhold(usable) is usable
     assert withhold({}) == {}
@@ -108,7 +109,7 @@ def test_products_of_earlier_releases_are_read_as_before(tmp_path):
 
 def test_p_sigma_has_the_shape_of_the_image(tmp_path):
     one, axis = np.ones((2, 2), np.complex64), np.array([0.0, 0.1])
-    with pytest.raises(DataError, match="p_sigma"):
+    with refused(ErrorCode.MISMATCH, "p_sigma"):
         write_image(tmp_path / "i.npz", one, one, one, axis, axis, np.ones((2, 2), bool), np.ones((3, 2)))
     write_json(tmp_path / "materials.json", {"segments": []})
     write_image(tmp_path / "i.npz", one, one, one, axis, axis, np.ones((2, 2), bool), np.full((2, 2), np.nan))

@@ -219,7 +219,7 @@ def test_a_replay_against_another_rig_names_the_line_where_they_differ(rig, rig_
     assert run(rig_file(), "check", "RH", "--trace", trace) == 0
     path = rig_file(msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, rx_gain_db=40)))
     assert run(path, "replay", trace) == 1
-    assert "of the trace: the host does" in capsys.readouterr().out
+    assert re.search(r"line \d+ of the trace", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ BAD_LINES += ["5", '{"t": 2, "out": ""}\n{"t": 1, "out": ""}', '{"t": true, "out
 def test_a_line_that_is_none_of_a_trace_s_is_named(rig_file, capsys, tmp_path, line):
     (tmp_path / "a").write_text(HEAD + line + "\n")
     assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
-    assert re.search(r"a: line [23] is", capsys.readouterr().err)
+    assert re.search(r"a: line [23]", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("kind", ["device", "pipe", "sparse", "folder"])
@@ -261,7 +261,7 @@ def test_what_is_no_file_of_a_sane_size_is_refused_unread(rig, rig_file, capsys,
     else:
         with path.open("wb") as file:
             file.truncate(3 * 2**30)
-    said = "bytes" if kind == "sparse" else "no regular file"
+    said = "bytes" if kind == "sparse" else "not a regular file"
     with_it = msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, firmware=str(path)))
     here = rig_file()
     for file, args in ((here, ("firmware", "RH", str(path))), (here, ("replay", str(path)))):

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.commands import Chirp, LdoBypass, LowPower
+from polysight.host.radar.commands import LOW_POWER_OFF, Chirp, LdoBypass
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import Link
 from polysight.shared.errors import DeviceError
@@ -57,7 +57,7 @@ def test_whatever_is_lost_every_command_is_obeyed_in_order_and_once(faults_of_ea
     link: Link = radar._link
     told = []
     for n, faults in enumerate(faults_of_each):
-        sent = (LowPower(), LdoBypass(), Chirp(0))[n % 3]
+        sent = (LOW_POWER_OFF, LdoBypass(), Chirp(0))[n % 3]
         board.inject(*faults)
         link.call(sent)
         unheard = (Fault.NACK, Fault.NO_ANSWER)

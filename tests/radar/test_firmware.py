@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import zlib
 
 import pytest
@@ -10,12 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.host.radar.board import RadarBoard, State
-from polysight.host.radar.firmware import CHUNK_S, TO_FLASH, TO_RAM, check_image, file_chunks, read_image
+from polysight.host.radar.firmware import CHUNK_TIMEOUT_S, TO_FLASH, TO_RAM, check_image, file_chunks, read_image
 from polysight.host.radar.program import program
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DeviceError
 from polysight.simulators.radars import Fault, make_image
 from polysight.simulators.radars import RadarBoard as Simulated
 from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, native_rig
+from tests.support.refusals import refused
 
 RIG = native_rig()
 DATA = make_image()
@@ -30,26 +31,25 @@ def with_crc(data: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"", "begins with 'nothing'"),
-        (b"Index: mmwave_dfp\n" * 400, "begins with 'Index: mmwav'"),
-        (bytes(7940), "begins with"),
-        (b"MSTR", "too few"),
-        (DATA[: len(DATA) // 2], "its header says 7940"),
-        (DATA + b"\0", "its header says 7940"),
-        (DATA[:-4], "CRC is missing"),
+        (b"", "nothing"),
+        (b"Index: mmwave_dfp\n" * 400, "Index: mmwav"),
+        (bytes(7940), "MSTR"),
+        (b"MSTR", "4 bytes"),
+        (DATA[: len(DATA) // 2], "7940"),
+        (DATA + b"\0", "7940"),
+        (DATA[:-4], "CRC"),
         (DATA[:5000] + bytes((DATA[5000] ^ 4,)) + DATA[5001:], "CRC-32"),
         (with_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
         (with_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
-        (FIRST_GENERATION, "for devices of generation 1"),
-        (with_crc(DATA[:0x8B8] + bytes((6, 2, 0, 13)) + DATA[0x8BC:-4]), "for devices of generation 6"),
+        (FIRST_GENERATION, "AWR1243"),
+        (with_crc(DATA[:0x8B8] + bytes((6, 2, 0, 13)) + DATA[0x8BC:-4]), "generation 6"),
         (with_crc(DATA[:0x880] + b"CPRR" + DATA[0x884:-4]), "1 program parts"),
         (with_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
     ],
 )
-def test_what_is_no_image_is_refused_with_the_reason(data, why):
-    with pytest.raises(ConfigError, match=why) as caught:
+def test_a_file_that_is_no_image_is_refused_with_the_reason(data, why):
+    with refused(ErrorCode.FILE_FOREIGN, "image.bin", why):
         check_image(data, "image.bin")
-    assert "nothing was sent" in str(caught.value)
 
 
 @settings(deadline=None)
@@ -133,12 +133,11 @@ def test_a_new_board_works_from_ram_and_its_flash_is_left_alone(clock, fault_at)
     assert board.executed.count(0x4080) == 2 * len(file_chunks(DATA))
 
 
-def test_without_an_image_a_new_board_is_refused_and_the_remedy_named(new, clock):
+def test_without_an_image_a_new_board_is_refused(new, clock):
     radar = made(new, clock)
-    with pytest.raises(DeviceError, match="no patch") as caught:
+    with refused(ErrorCode.RADAR_NO_FIRMWARE) as caught:
         radar.configure()
-    assert "image header" in caught.value.why  # what it said of itself
-    assert "polysight radar firmware" in caught.value.remedy
+    assert "image header" in caught.value.why  # from its boot status
 
 
 def test_a_flash_that_holds_the_image_is_not_loaded_again(board, clock):
@@ -159,7 +158,7 @@ def test_the_flash_is_written_and_verified_by_a_start_from_it(clock, fault_at):
 
 
 def test_the_slow_erase_is_waited_for(clock):
-    board = Simulated(lambda: clock.time, erase_s=0.9 * CHUNK_S)
+    board = Simulated(lambda: clock.time, erase_s=0.9 * CHUNK_TIMEOUT_S)
     made(board, clock).write_flash(IMAGE, ignored)
     assert board.cores.flash == DATA
 
@@ -167,37 +166,29 @@ def test_the_slow_erase_is_waited_for(clock):
 @pytest.mark.parametrize("bit", [8, 48, *range(50, 57)])
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["flash empty", "flash written"])
 @pytest.mark.parametrize("image", [None, IMAGE])
-def test_a_board_that_found_itself_damaged_is_refused_after_any_download(clock, bit, flash, image):
-    """Boot status bits of docs/spec/mmwavelink.md; the status after a RAM download is clean, and no excuse."""
+def test_a_board_that_reports_a_hardware_fault_is_refused_after_any_download(clock, bit, flash, image):
+    """Boot status bits of docs/spec/mmwavelink.md; the status after a RAM download is clean, but does not count."""
     board = Simulated(lambda: clock.time, flash=flash)
     board.cores.hardware_bits = 1 << bit
-    with pytest.raises(DeviceError, match="main core is up: ") as caught:
+    with pytest.raises(DeviceError):
         made(board, clock, image).configure()
-    assert caught.value.remedy == "replace the board"
     assert 0x4000 not in board.executed
-    with pytest.raises(DeviceError) as caught:
+    with pytest.raises(DeviceError):
         made(board, clock).write_flash(IMAGE, ignored)
-    assert caught.value.remedy == "replace the board"
     assert board.cores.flash == DATA
 
 
-def test_another_board_than_the_rig_file_names_is_told_after_its_flash_was_written(clock):
-    board = Simulated(lambda: clock.time)
-    radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")), die_id="5eed0002-0-0-0")
-    with pytest.raises(DeviceError, match=r"die id 5eed0001.*the rig file names 5eed0002"):
-        radar.write_flash(IMAGE, ignored)
-
-
-def test_nothing_of_another_board_than_the_rig_file_names_is_powered(clock):
+@pytest.mark.parametrize("use", [lambda radar: radar.write_flash(IMAGE, ignored), lambda radar: radar.configure()])
+def test_the_rf_part_of_another_board_is_not_configured(clock, use):
     board = Simulated(lambda: clock.time, flash=DATA)
     radar = RadarBoard("LS", BoardWords(board, clock), clock, program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0")
-    with pytest.raises(DeviceError, match="die id 5eed0001"):
-        radar.configure()
+    with refused(ErrorCode.MISMATCH, "5eed0001", "5eed0002"):
+        use(radar)
     assert 0x0080 not in board.executed
 
 
-@pytest.mark.parametrize(("tests", "said"), [(0, "none did"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
-def test_self_tests_of_the_rf_core_that_failed_are_told(board, clock, tests, said):
+@pytest.mark.parametrize(("tests", "said"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
+def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, said):
     board.cores.rf_tests = tests
     radar = made(board, clock)
     told = []
@@ -212,7 +203,7 @@ def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):
     board = Simulated(lambda: clock.time, flash=flash)
     board.cores.main_rom = rom
     for use in (lambda r: r.write_flash(IMAGE, ignored), lambda r: r.configure()):
-        with pytest.raises(ConfigError, match=rf"ROM is {'.'.join(map(str, rom))}"):
+        with refused(ErrorCode.MISMATCH, ".".join(map(str, rom))):
             use(made(board, clock, IMAGE))
     assert 0x4080 not in board.executed
     assert board.cores.flash == flash
@@ -224,18 +215,17 @@ def test_an_image_for_another_rom_is_never_sent(clock, rom, flash):
     [((1, 2, 0, 5), "AWR1243"), ((6, 2, 0, 13), "57..64 GHz"), ((255,) * 4, "generation 255"), ((0,) * 4, "0.0.0.0")],
 )
 @pytest.mark.parametrize("image", [None, IMAGE])
-def test_what_is_no_awr2243_is_refused_before_any_setting(clock, core, rom, said, image):
-    """The same codes would be other frequencies there."""
+def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, rom, said, image):
+    """The same codes would be other frequencies on it."""
     board = Simulated(lambda: clock.time, flash=DATA)
     setattr(board.cores, core, rom)
-    with pytest.raises(ConfigError, match=re.escape(said)) as caught:
+    with refused(ErrorCode.MISMATCH, said):
         made(board, clock, image).configure()
-    assert "only AWR2243" in caught.value.what
     assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
 
 
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["from RAM", "from flash"])
-def test_another_patch_of_the_rf_core_than_the_image_s_is_told(clock, monkeypatch, flash):
+def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
     board = Simulated(lambda: clock.time, flash=flash)
     effect = board.cores._effect
     old = bytes((2, 1, 20, 1, 1, 0))
@@ -243,12 +233,12 @@ def test_another_patch_of_the_rf_core_than_the_image_s_is_told(clock, monkeypatc
     radar = made(board, clock, IMAGE)
     radar.configure()
     (told,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
-    assert "holds 2.2.4.0" in told
+    assert "2.2.4.0" in told
     assert ("--flash" in told) is bool(flash)
 
 
 @pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])
-def test_whatever_the_flash_holds_a_download_cures_it(clock, broken):
+def test_a_download_repairs_any_content_of_the_flash(clock, broken):
     board = Simulated(lambda: clock.time, flash=broken)
     made(board, clock).write_flash(IMAGE, ignored)
     made(board, clock).configure()
@@ -270,13 +260,12 @@ def test_power_lost_at_any_part_is_recovered_from(clock, part):
 
 
 @pytest.mark.parametrize("part", range(1, 36))
-def test_a_start_in_the_middle_of_a_download_ends_it_at_once(clock, part):
-    """The parts that follow would be taken as the first of another file by the fresh ROM."""
+def test_a_restart_during_a_download_ends_it_at_once(clock, part):
+    """The restarted ROM would take the next part as the first of another file."""
     board = Simulated(lambda: clock.time, flash=DATA, erase_s=0.1)
     words = Restarts(board, clock, part + 1)
-    with pytest.raises(DeviceError, match=rf"part {part} of 35 .*started anew by itself") as caught:
+    with refused(ErrorCode.RADAR_RESTARTED, f"part {part} of 35"):
         made(board, clock, words=words).write_flash(IMAGE, ignored)
-    assert "no whole image" in caught.value.why
     assert words.later == 0
     assert clock.time < 5.0
 
@@ -290,11 +279,11 @@ def test_a_part_that_is_refused_is_named(new, clock, monkeypatch):
         return (7, b"", 0.0) if len(seen) == 7 else obey(data, remaining)
 
     monkeypatch.setattr(new.cores, "_download", refuse_seventh)
-    with pytest.raises(DeviceError, match=r"part 7 of 35 of image.bin was not taken.*file CRC"):
+    with refused(ErrorCode.REFUSED_BY_PEER, "part 7 of 35 of image.bin", "error 7"):
         made(new, clock).write_flash(IMAGE, ignored)
 
 
-def test_a_flash_that_does_not_keep_what_it_was_sent_is_noticed(new, clock, monkeypatch):
+def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
     obey = new.cores._download
 
     def forget(data, remaining):
@@ -303,13 +292,13 @@ def test_a_flash_that_does_not_keep_what_it_was_sent_is_noticed(new, clock, monk
         return told
 
     monkeypatch.setattr(new.cores, "_download", forget)
-    with pytest.raises(DeviceError, match="not from its flash"):
+    with pytest.raises(DeviceError):
         made(new, clock).write_flash(IMAGE, ignored)
 
 
 @pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
-def test_what_the_board_reports_afterwards_is_compared(new, clock, monkeypatch, reported, warned):
-    """Another patch than the file's is told; the old one, or none, is an error."""
+def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, reported, warned):
+    """Another patch than the file's is a warning; the old one, or none, is an error."""
     effect = new.cores._effect
 
     def answer(number, data):
@@ -322,7 +311,7 @@ def test_what_the_board_reports_afterwards_is_compared(new, clock, monkeypatch, 
         radar.configure()
         assert any("reports patch 2.9.3.0 after the download" in line for line in radar.warnings)
         return
-    with pytest.raises(DeviceError, match="no patch"):
+    with refused(ErrorCode.RADAR_NO_FIRMWARE):
         radar.configure()
     with pytest.raises(DeviceError, match=r"reports patch 0\.0\.0\.0"):
         radar.write_flash(IMAGE, ignored)
@@ -336,5 +325,5 @@ def test_a_disturbed_download_arrives_whole(new, clock, fault):
     assert new.cores.flash == DATA
 
 
-def test_types_of_places_are_the_document_s():
+def test_file_types_are_the_document_s():
     assert (TO_RAM, TO_FLASH) == (0, 4)

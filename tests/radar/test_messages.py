@@ -113,10 +113,14 @@ def test_error_of_a_response():
     assert command((SubBlock(0x0102),)).error is None
 
 
-def test_what_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="at most 256"):
-        encode(command((SubBlock(0x4080, bytes(240)),)))
-    with pytest.raises(ValueError, match="one message id"):
-        command((SubBlock(0x0100), SubBlock(0x4040)))
-    with pytest.raises(ValueError, match="sequence 16"):
-        encode(command((SubBlock(0x0100),), sequence=16))
+@pytest.mark.parametrize(
+    ("blocks", "sequence", "value"),
+    [
+        ((SubBlock(0x4080, bytes(240)),), 0, "256"),
+        ((SubBlock(0x0100), SubBlock(0x4040)), 0, "message id"),
+        ((SubBlock(0x0100),), 16, "sequence 16"),
+    ],
+)
+def test_a_message_that_exceeds_its_limits_is_refused(blocks, sequence, value):
+    with pytest.raises(ValueError, match=value):
+        encode(command(blocks, sequence=sequence))

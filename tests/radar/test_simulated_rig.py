@@ -17,11 +17,12 @@ from polysight.host.radar.constraints import constraints
 from polysight.host.radar.native import open_board
 from polysight.host.radar.program import program
 from polysight.host.radar.spi import SystemClock
-from polysight.shared.errors import DeviceError
+from polysight.shared.error_codes import ErrorCode
 from polysight.simulators.radars import RadarBoard as Simulated
 from polysight.simulators.radars import RadarSocket, make_image
 from polysight.simulators.rig import derive
 from polysight.simulators.scene import SimulatedRig, decode_scene, without_offset
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 EMPTY = decode_scene({"name": "the direct path alone"}, "test")
@@ -99,9 +100,9 @@ def test_a_board_unplugged_behind_its_socket_is_a_fault_that_says_where(rig, ser
 def test_nobody_at_the_address_is_named():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-    with pytest.raises(DeviceError, match=f"tcp://127.0.0.1:{port}: cannot be reached"):
+    with refused(ErrorCode.NO_ANSWER, f"tcp://127.0.0.1:{port}"):
         open_board(f"tcp://127.0.0.1:{port}")
-    with pytest.raises(DeviceError, match="cannot be reached"):
+    with refused(ErrorCode.NO_ANSWER, "tcp://nonsense"):
         open_board("tcp://nonsense")
 
 

@@ -12,9 +12,11 @@ from pyftdi.usbtools import UsbTools
 from polysight.host.radar.interface import RadarState
 from polysight.host.radar.native import NativeRadars
 from polysight.host.radar.usb import open_usb
-from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import DeviceError
 from polysight.simulators.radars import RadarBoard, UsbChip, make_image
 from tests.support.radar import usb_bus
+from tests.support.refusals import refused
 
 FRAMES = 4
 
@@ -85,14 +87,14 @@ def test_a_path_on_the_bus_finds_the_board_whatever_its_serial_number(bus, plugg
     open_usb("usb:1-4.2").write([0x1234])
     assert plugged.chip.words_written == [0x1234]
     assert all(o.chip.words_written == [] and o.modes == {} for o in others)
-    with pytest.raises(DeviceError, match=r"usb:1-7.*there are 1-4\.1, 1-4\.2"):
+    with pytest.raises(DeviceError, match=r"usb:1-7.*1-4\.1, 1-4\.2"):
         open_usb("usb:1-7")
 
 
 def test_a_serial_number_that_two_chips_have_opens_neither_and_lists_their_paths(bus, plugged):
     other = chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
     bus.plug(other)
-    with pytest.raises(DeviceError, match=r"2 chips have this serial number, at 1-4\.2, 1-4\.3") as caught:
+    with pytest.raises(DeviceError, match=r"1-4\.2, 1-4\.3") as caught:
         open_usb("FT1234")
     assert "usb_path" in caught.value.remedy
     assert plugged.modes == other.modes == {}
@@ -110,7 +112,7 @@ def test_what_keeps_a_chip_from_being_claimed_is_named(bus, number, cause):
 
 @pytest.mark.usefixtures("plugged")
 def test_a_chip_that_is_not_there_is_named():
-    with pytest.raises(DeviceError, match="FT9: cannot be opened"):
+    with pytest.raises(DeviceError, match="FT9"):
         open_usb("FT9")
 
 
@@ -183,6 +185,6 @@ def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
 def test_without_pyftdi_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyftdi", None)
     monkeypatch.setitem(sys.modules, "pyftdi.ftdi", None)
-    with pytest.raises(ConfigError, match="pyftdi") as caught:
+    with refused(ErrorCode.PACKAGE_MISSING, "pyftdi") as caught:
         open_usb("FT1")
     assert "polysight[radar]" in str(caught.value)

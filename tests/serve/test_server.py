@@ -11,7 +11,7 @@ import socket
 import msgspec
 import pytest
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest, Wish
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, ScanCommand, StopRequest
 from polysight.host.cli.main import build_parser
 from polysight.host.serve.app import STATIC
 from polysight.host.serve.control import FORMATS, ExportRequest
@@ -62,7 +62,7 @@ def desk(growing):
     """A running scan of which nothing has come yet: its folder and what hears of wishes."""
     growing.grow_to("scan_started")
     stop = StopRequest()
-    with ControlDesk(growing.path, stop) as made:
+    with ControlFolder(growing.path, stop) as made:
         made.open()
         wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
         yield growing.path, stop
@@ -72,7 +72,7 @@ def desk(growing):
 def test_without_the_token_nothing_is_asked(desk, watching, given):
     folder, stop = desk
     with served(watching(folder, control=True), TOKEN) as view:
-        for wish in Wish:
+        for wish in ScanCommand:
             status, body, _ = ask(view, f"/api/control/{wish}?token={TOKEN}", "POST", **given)
             assert status == 403
             assert "token" in json.loads(body)["what"]
@@ -83,7 +83,7 @@ def test_without_the_token_nothing_is_asked(desk, watching, given):
 def test_with_the_token_the_scan_hears(desk, watching):
     folder, stop = desk
     with served(watching(folder, control=True), TOKEN) as view:
-        for wish, holds in ((Wish.PAUSE, True), (Wish.CONTINUE, False)):
+        for wish, holds in ((ScanCommand.PAUSE, True), (ScanCommand.CONTINUE, False)):
             assert ask(view, f"/api/control/{wish}", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
             assert stop.paused is holds
         assert ask(view, "/api/control/abort", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
@@ -208,7 +208,7 @@ def test_pictures_are_served_as_they_are_shown(finished, watching):
 
 def test_the_how_to_names_every_wish():
     page = (REPO / "docs/how-to/live-view.md").read_text(encoding="utf-8")
-    assert all(f"control/{wish}" in page for wish in Wish)
+    assert all(f"control/{wish}" in page for wish in ScanCommand)
 
 
 def test_all_formats_may_be_asked_for_at_once():

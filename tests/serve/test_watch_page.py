@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from polysight.host.acquisition.control import ALIVE, CONTROL, ControlDesk, StopRequest
+from polysight.host.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
 from polysight.simulators.loopback import on_free_subnet
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.page.live_view import GrowingScan, served
@@ -71,7 +71,7 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
 def test_buttons_reach_the_scan(browser, growing, watching):
     growing.grow_to("row_committed")
     stop = StopRequest()
-    with ControlDesk(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
+    with ControlFolder(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
         desk.open()
         wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
         opened(browser, view, token=TOKEN)
@@ -97,7 +97,7 @@ def test_buttons_reach_the_scan(browser, growing, watching):
 def test_a_wrong_token_is_said(browser, growing, watching):
     growing.grow_to("row_committed")
     stop = StopRequest()
-    with ControlDesk(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
+    with ControlFolder(growing.path, stop) as desk, served(watching(growing.path, control=True), TOKEN) as view:
         desk.open()
         wait_for((growing.path / CONTROL / ALIVE).exists, "the first sign of life")
         opened(browser, view, token="guessed")

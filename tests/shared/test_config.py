@@ -1,4 +1,4 @@
-"""The rig file: complete, checked, and every refusal names file, key, value and rule."""
+"""The rig file: complete and checked; an error names file, key, value and rule."""
 
 import math
 from pathlib import Path
@@ -7,12 +7,12 @@ import pytest
 import tomli_w
 
 from polysight.shared.config import Instrument, load_instrument
-from polysight.shared.errors import ConfigError
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import no_such
 from polysight.shared.geometry import direct_path_m, incidence_deg, rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.tables import decode, read_toml, to_builtins
-from tests.support.rigs import rig_with
-
-RIG = Path(__file__).resolve().parents[2] / "instrument.toml"
+from tests.support.paths import RIG_FILE
+from tests.support.refusals import refused
 
 
 def test_the_published_rig_survives_toml(rig: Instrument, tmp_path: Path):
@@ -44,66 +44,79 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
 
 
 @pytest.mark.parametrize(
-    ("table", "key", "value", "words"),
+    ("table", "key", "value", "code", "named"),
     [
-        ("chirp", "start_hertz", 1.0, "start_hertz"),
-        ("chirp", "start_hz", "fast", "chirp.start_hz = 'fast'"),
-        ("chirp", "samples", 400, "must end inside the ramp"),
-        ("chirp", "hpf1_khz", 180.0, "hpf1_khz must be one of"),
-        ("burst", "period_us", 200.0, "at least 300 us"),
-        ("burst", "width_us", 5.0, r"0\.025\.\.4 us"),
-        ("pi", "trigger_in", 10, "trigger_in must not be one of sync_out"),
-        ("pi", "sync_out", [22, 23], "drives exactly one line"),
-        ("pi", "trigger_bias", "up", "pi.trigger_bias = 'up'"),
-        ("pi", "trigger_debounce_us", 10, "swallows every trigger"),
-        ("grid", "columns", 4000, "do not fit stage.travel_x_mm"),
-        ("grid", "rows", 0, "grid.rows = 0"),
-        ("stage", "accel_mm_s2", -1.0, "accel_mm_s2 = -1.0"),
+        ("chirp", "start_hertz", 1.0, ErrorCode.KEY_UNKNOWN, ["start_hertz"]),
+        ("chirp", "start_hz", "fast", ErrorCode.TYPE_WRONG, ["chirp.start_hz", "'fast'"]),
+        ("chirp", "samples", 400, ErrorCode.VALUE_INVALID, ["adc_start_us", "sample_rate_hz", "ramp_end_us"]),
+        ("chirp", "ramp_end_us", 10.0, ErrorCode.VALUE_INVALID, ["adc_start_us", "sample_rate_hz", "ramp_end_us"]),
+        ("chirp", "slope_hz_per_s", 1e14, ErrorCode.VALUE_INVALID, ["start_hz", "slope_hz_per_s"]),
+        ("chirp", "linear_samples", [0, 5], ErrorCode.VALUE_INVALID, ["linear_samples", "samples"]),
+        ("chirp", "hpf1_khz", 180.0, ErrorCode.VALUE_INVALID, ["hpf1_khz", 175.0]),
+        ("burst", "period_us", 200.0, ErrorCode.VALUE_INVALID, ["period_us", 300]),
+        ("burst", "width_us", 5.0, ErrorCode.VALUE_INVALID, ["width_us", 0.025, 4]),
+        ("pi", "trigger_in", 10, ErrorCode.VALUE_INVALID, ["trigger_in", "sync_out"]),
+        ("pi", "sync_out", [22, 23], ErrorCode.VALUE_INVALID, ["sync_out", "wiring"]),
+        ("pi", "trigger_bias", "up", ErrorCode.VALUE_INVALID, ["pi.trigger_bias", "'up'"]),
+        ("pi", "trigger_debounce_us", 10, ErrorCode.VALUE_INVALID, ["trigger_debounce_us", "trigger_width_us"]),
+        ("grid", "columns", 4000, ErrorCode.VALUE_INVALID, ["grid.columns", "grid.step_x_mm", "stage.travel_x_mm"]),
+        ("grid", "columns", 9000, ErrorCode.VALUE_INVALID, ["stage.centre_x_mm"]),
+        ("grid", "rows", 0, ErrorCode.VALUE_INVALID, ["grid.rows"]),
+        ("stage", "accel_mm_s2", -1.0, ErrorCode.VALUE_INVALID, ["accel_mm_s2", -1.0]),
+        ("stage", "speed_mm_s", 900.0, ErrorCode.VALUE_INVALID, ["grid.columns", "stage.speed_mm_s"]),
     ],
 )
-def test_every_refusal_names_file_key_and_rule(table: str, key: str, value: object, words: str):
-    raw = read_toml(RIG)
+def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value: object, code: ErrorCode, named: list):
+    raw = read_toml(RIG_FILE)
     raw[table][key] = value
-    with pytest.raises(ConfigError, match=words) as caught:
+    with refused(code, "my.toml", *named):
         decode(raw, Instrument, "my.toml")
-    assert "my.toml" in str(caught.value)
 
 
 def test_a_missing_table_and_a_second_transmitter_are_refused():
-    raw = read_toml(RIG)
+    raw = read_toml(RIG_FILE)
     raw["boards"][1]["role"] = "transmit"
-    with pytest.raises(ConfigError, match="exactly one with role"):
+    with refused(ErrorCode.VALUE_INVALID, "transmit"):
         decode(raw, Instrument, "my.toml")
-    raw = read_toml(RIG)
     del raw["chirp"]
-    with pytest.raises(ConfigError, match="chirp"):
+    with refused(ErrorCode.KEY_MISSING, "chirp"):
         decode(raw, Instrument, "my.toml")
-
-
-def test_missing_file_bad_toml_and_binary_are_refused(tmp_path: Path):
-    with pytest.raises(ConfigError, match="no such file"):
-        load_instrument(tmp_path / "none.toml")
-    bad = tmp_path / "bad.toml"
-    bad.write_text("a = = 1")
-    with pytest.raises(ConfigError, match="not valid TOML"):
-        load_instrument(bad)
-    bad.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_instrument(bad)
 
 
 @pytest.mark.parametrize(
-    ("table", "key", "value", "named"),
+    ("content", "code"),
     [
-        ("chirp", "ramp_end_us", 10.0, ["adc_start_us", "sample_rate_hz", "ramp_end_us"]),
-        ("chirp", "slope_hz_per_s", 1e14, ["start_hz", "slope_hz_per_s"]),
-        ("chirp", "linear_samples", [0, 5], ["linear_samples", "samples"]),
-        ("grid", "columns", 9000, ["grid.columns", "grid.step_x_mm", "stage.travel_x_mm", "stage.centre_x_mm"]),
-        ("stage", "speed_mm_s", 900.0, ["grid.columns", "stage.speed_mm_s", "stage.accel_mm_s2"]),
+        (None, ErrorCode.FILE_MISSING),
+        (b"a = = 1", ErrorCode.FILE_DAMAGED),
+        (b"\xff\xfe\x00", ErrorCode.FILE_UNREADABLE),
     ],
 )
-def test_a_rule_between_keys_names_all_of_them(table, key, value, named):
-    with pytest.raises(ConfigError) as e:
-        rig_with(**{table: {key: value}})
-    assert all(name in e.value.what for name in named)
-    assert "top level" not in str(e.value)
+def test_a_missing_file_bad_toml_and_binary_data_are_refused(tmp_path: Path, content: bytes | None, code: ErrorCode):
+    path = tmp_path / "rig.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with refused(code, path):
+        load_instrument(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong", "suggestion"),
+    [
+        ("step_x_mm = 2.0", "stepx_mm = 2.0", "'step_x_mm'"),
+        ("step_x_mm = 2.0", "samples = 2", "[chirp]"),
+        ("step_x_mm = 2.0", "qqqq = 2", "'qqqq'"),
+        ("[stage]", "[stagge]", "'stage'"),
+    ],
+)
+def test_an_unknown_key_is_refused_with_a_suggestion(line, wrong, suggestion, tmp_path):
+    text = RIG_FILE.read_text()
+    assert text.count(f"\n{line}") == 1
+    (tmp_path / "rig.toml").write_text(text.replace(f"\n{line}", f"\n{wrong}"))
+    with refused(ErrorCode.KEY_UNKNOWN, suggestion):
+        load_instrument(tmp_path / "rig.toml")
+
+
+def test_a_missing_path_is_refused_with_a_similar_one(tmp_path):
+    (tmp_path / "scan-7").mkdir()
+    assert "'scan-7'" in str(no_such(tmp_path / "scan-77"))
+    assert str(tmp_path / "away") in no_such(tmp_path / "away" / "scan-7").remedy

@@ -1,4 +1,4 @@
-"""The one fault table reaches the firmware; simulated wires keep edges and their times."""
+"""The fault table is complete and is that of the firmware; simulated wires keep edges and their times."""
 
 import socket
 import threading
@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError, ProtocolError
 from polysight.shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
 from polysight.shared.wires import WireClient, WireEdge, WireMotion, encode, parse
+from tests.support.refusals import refused
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -19,7 +21,7 @@ def test_every_number_is_explained_and_unique():
     numbers = [*map(int, StageError), *map(int, PiFault)]
     assert sorted(numbers) == sorted(EXPLANATIONS)
     assert all(all(explain(k)) for k in numbers)
-    assert "unknown fault 250" in explain(250).what
+    assert "250" in explain(250).what
 
 
 def test_the_firmware_header_is_the_table():
@@ -41,7 +43,7 @@ def test_other_lines_are_refused(line: str):
         parse(line)
 
 
-def test_client_receives_what_was_sent_in_order_and_tells_when_the_hub_ends(tmp_path: Path):
+def test_a_client_receives_all_edges_in_order_and_detects_the_end_of_the_hub(tmp_path: Path):
     path = tmp_path / "hub"
     hub = socket.socket(socket.AF_UNIX)
     hub.bind(str(path))
@@ -58,13 +60,13 @@ def test_client_receives_what_was_sent_in_order_and_tells_when_the_hub_ends(tmp_
     thread.start()
     client = WireClient(path, listen=(26,))
     assert [client.receive(5.0) for _ in sent] == sent
-    with pytest.raises(DeviceError, match="were closed"):
+    with pytest.raises(DeviceError):
         client.receive(5.0)
     client.close()
     thread.join()
     hub.close()
 
 
-def test_nobody_listening_is_a_clear_error(tmp_path: Path):
-    with pytest.raises(DeviceError, match="nobody listens"):
+def test_a_missing_hub_is_an_error(tmp_path: Path):
+    with refused(ErrorCode.NO_ANSWER, tmp_path):
         WireClient(tmp_path / "none", timeout_s=0.05)

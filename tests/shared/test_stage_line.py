@@ -1,4 +1,4 @@
-"""Laws of the stage line: round trip, and no single flipped bit is ever taken for a line."""
+"""The stage line: lines survive a round trip, and a line with a flipped bit is refused."""
 
 import pytest
 from hypothesis import given

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -68,29 +67,6 @@ def test_payloads_joined_are_the_stream_and_the_counters_count_it(
         assert got_sequence == (sequence + i) % 2**32
         assert got_count == (byte_count + before) % 2**48
         before += len(part)
-
-
-@given(st.lists(chunks, min_size=1, max_size=4))
-def test_records_follow_each_other_without_resetting_the_counters(records: list[list[int]]) -> None:
-    card, now, seen = ready_card(), 0.0, []
-    for number, sizes in enumerate(records):
-        data = stream(sum(sizes), number)
-        outputs = card.command(START, now)
-        at = 0
-        for size in sizes:
-            outputs += card.lvds(data[at : at + size], now)
-            at, now = at + size, now + 0.1
-        now += TAIL_S
-        outputs += card.tick(now)
-        record = packets(outputs)
-        assert b"".join(parse(p)[2] for p in record) == data.tobytes()
-        assert [len(p) for p in record[:-1]] == [1466] * (len(record) - 1)
-        assert messages(outputs)[-1] == COMPLETED
-        seen += record
-    counters = [parse(p) for p in seen]
-    assert [c[0] for c in counters] == list(range(1, len(seen) + 1))
-    assert all(b[1] - a[1] == len(a[2]) for a, b in pairwise(counters))
-    assert not counters or counters[0][1] == 0
 
 
 def test_the_tail_comes_two_seconds_after_the_last_data_and_the_status_right_behind_it() -> None:

@@ -12,7 +12,7 @@ import tomli_w
 from polysight.host.acquisition.scan import resume_scan
 from polysight.host.cli.main import main
 from polysight.host.page.story import Story
-from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, reconnected
+from polysight.host.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, connection_of, with_connection
 from polysight.shared.config import Instrument
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, to_builtins
@@ -64,11 +64,11 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
         assert given != begun
         if may_change(path):
             check_same_scan(begun, given, "mine.toml")
-            assert reconnected(begun, connection_of(given)) == given
+            assert with_connection(begun, connection_of(given)) == given
             taken += 1
         elif does_not_matter(path):
             check_same_scan(begun, given, "mine.toml")
-            assert reconnected(begun, connection_of(given)) == begun
+            assert with_connection(begun, connection_of(given)) == begun
         else:
             name = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
             with pytest.raises(ConfigError) as e:

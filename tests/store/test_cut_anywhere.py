@@ -15,8 +15,9 @@ from polysight.host.store.events import read_events
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
 from polysight.pi_controller.journal import records
-from polysight.shared.errors import DataError
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.messages import RowStarted
+from tests.support.refusals import refused
 from tests.support.store.small_scan import SmallScan
 
 pytestmark = pytest.mark.timeout(3600)  # with --long
@@ -195,7 +196,7 @@ def test_committed_row_cut_short(undisturbed, tmp_path, sample, suffix):
         (scan.path / name).write_bytes(raw[:cut])
         assert [name in f for f in faults(scan)] == [True]
         if suffix == ".bin":
-            with pytest.raises(DataError, match="not the bytes that were committed"):
+            with refused(ErrorCode.FILE_DAMAGED):
                 ScanFolder.load(scan.path).read_row("RV", 1)
         assert resumed(scan, undisturbed, image=not cut) == {1}  # row 1 is taken last now
         withdrawn = ScanFolder.load(scan.path).facts("row_withdrawn")

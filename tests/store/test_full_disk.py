@@ -9,7 +9,9 @@ import pytest
 
 from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import PolysightError
+from tests.support.refusals import refused
 from tests.support.store.faulty_disk import GROWS, FaultyDisk
 from tests.support.store.small_scan import Samples, SmallScan
 
@@ -69,7 +71,7 @@ def test_disk_that_has_space_again_while_the_program_still_runs(samples, tmp_pat
     raw = (scan.path / "manifest.jsonl").read_bytes()
     with disk(), folder.writer() as writer:
         disk.at = len(disk.done) + 1
-        with pytest.raises(PolysightError, match="No space left"):
+        with refused(ErrorCode.DISK_FULL):
             writer.append({"fact": "row_committed", "row": 0})
         assert (scan.path / "manifest.jsonl").read_bytes() == raw
         disk.free_space()

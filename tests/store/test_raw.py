@@ -17,10 +17,13 @@ from polysight.host.process.request import ProcessRequest
 from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validation import damaged_rows, validate
-from polysight.shared.errors import ConfigError, DataError, DeviceError, ScanError
+from polysight.host.store.validation import damaged_rows
+from polysight.shared.error_codes import ErrorCode
+from polysight.shared.errors import ConfigError, DataError, ScanError
 from tests.support.paths import POLYSIGHT, RIG_FILE
+from tests.support.refusals import refused
 from tests.support.scenes import small_scene
+from tests.support.store.plain_scan import errors
 
 ROWS, BOARDS = 4, 2
 SCENE = small_scene(8, ROWS, metal=False)
@@ -53,10 +56,6 @@ def payloads(scan: Path) -> set[Path]:
     return set(scan.glob("raw/*/*.bin"))
 
 
-def errors(scan: Path) -> list[str]:
-    return [str(f) for f in validate(scan) if f.severity == "error"]
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
 
@@ -83,7 +82,7 @@ def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
     assert f"the raw data of {ROWS} rows was dropped after processing into products" in done.stdout
     done = polysight("process", scan, "--out", scan / "products")
     assert (done.returncode, "it was dropped on" in done.stderr) == (3, True), done
-    with pytest.raises(DataError, match=f"raw data of {ROWS} rows"):
+    with refused(ErrorCode.NO_DATA, ROWS):
         resume(ProcessRequest(data=str(scan), out=str(scan / "products")), keep_incomplete=False, process=True)
     assert contents(scan / "products") == products
     assert drop_raw(scan, None, yes=True) == 0
@@ -96,7 +95,7 @@ def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, 
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
         with pytest.raises(ConfigError, match="nothing dropped"):
             drop_raw(scan, None, yes=False)
-    with pytest.raises(DataError, match=r"does not exist"):
+    with refused(ErrorCode.FILE_MISSING):
         drop_raw(scan, tmp_path / "none", yes=True)
     quality = scan / "products" / "quality.json"
     said = json.loads(quality.read_text())
@@ -106,7 +105,7 @@ def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, 
     capsys.readouterr()
     with pytest.raises(DataError, match="nothing can be dropped"):
         drop_raw(scan, None, yes=True)
-    assert capsys.readouterr().out.count("not the bytes the products were made from") == ROWS * BOARDS
+    assert capsys.readouterr().out.count("differs from the data of the products") == ROWS * BOARDS
     quality.write_text("{}")
     with pytest.raises(DataError, match="does not say what it was made from"):
         drop_raw(scan, None, yes=True)
@@ -133,15 +132,14 @@ def test_an_unfinished_scan_keeps_its_rows(scan):
     path = scan / MANIFEST
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(line for line in lines if b'"row":3' not in line))
-    with pytest.raises(ScanError, match="1 of 4 rows are not committed") as e:
+    with refused(ErrorCode.NOT_ENOUGH_DATA, "1 of 4", "polysight resume"):
         droppable(ScanFolder.load(scan), processed_digests(scan / "products"))
-    assert "polysight resume" in e.value.remedy
     with pytest.raises(ScanError):
         drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
 
 
 def test_a_scan_in_use_keeps_its_rows(scan):
-    with ScanFolder.load(scan).writer(), pytest.raises(DeviceError, match="another program"):
+    with ScanFolder.load(scan).writer(), refused(ErrorCode.BUSY):
         drop(ScanFolder.load(scan), processed_digests(scan / "products"), scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
 
@@ -207,5 +205,5 @@ def test_a_row_taken_again_is_there_again(scan):
     folder.reload()
     assert {Path(file).name for file in dropped_files(folder)} == {"0000.bin", "0002.bin", "0003.bin"}
     assert sum("0001.bin" in e for e in errors(scan)) == BOARDS
-    with pytest.raises(DataError, match="3 rows"):
+    with refused(ErrorCode.NO_DATA, "3 rows"):
         require_raw(folder)

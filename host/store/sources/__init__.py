@@ -1,1 +1,1 @@
-"""Where recorded rows come from: `open` recognises a folder, `published*` read the published data set as a `Source`."""
+"""Layouts of recorded rows: `open` recognises a folder, `published*` read the published data set as a `Source`."""

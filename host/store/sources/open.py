@@ -1,4 +1,4 @@
-"""Open recorded data of any layout, recognised by what the folder holds."""
+"""Open recorded data of any layout, recognised by the folder's files."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from polysight.host.store.source import Source
 from polysight.host.store.sources.published import SYNCED, PublishedCubes, PublishedScan
 from polysight.host.store.sources.published_settings import COLLECTION
 from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError, no_such
 
 
 def is_source(path: Path) -> bool:
-    """Whether a folder is a scan folder, or `unsynced/<scan>` or `raw/<scan>` of the published data."""
+    """True if the folder is a scan folder, or `unsynced/<scan>` or `raw/<scan>` of the published data."""
     known = (MANIFEST, COLLECTION)
     return path.is_dir() and (any((path / name).exists() for name in known) or any(path.glob("*" + SYNCED)))
 
@@ -27,17 +28,16 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
     path
         A scan folder, or the authors' `unsynced/<scan>` or `raw/<scan>`.
     base
-        Rig whose geometry, stage and limits an authors' scan takes over, since their files do not tell them; a rig
-        file is read only where it is needed.
+        Rig, or rig file, with the geometry, stage and limits of an authors' scan, which their files lack.
     dropped
-        Also a scan whose raw rows were dropped, for what is made from its kept samples.
+        Accept a scan whose raw data was dropped.
 
     Raises
     ------
     DataError
-        when it is none of them, when its raw rows were dropped, or when an authors' scan is opened without `base`.
+        if it is none of them, its raw rows were dropped, or an authors' scan is opened without `base`.
     ConfigError
-        when the rig file is wrong.
+        if the rig file is wrong.
     """
     if (path / MANIFEST).exists():
         scan = ScanFolder.load(path)
@@ -48,15 +48,17 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
         raise no_such(path)
     if not is_source(path):
         raise DataError(
-            f"{path}: not a scan: neither {MANIFEST} nor {COLLECTION} nor *{SYNCED} is in it",
+            f"{path}: not a scan: contains no {MANIFEST}, {COLLECTION} or *{SYNCED}",
             "the path is wrong, or the download is not complete",
             "give a scan folder, or a folder unsynced/<scan> or raw/<scan> of the published data",
+            code=ErrorCode.FILE_FOREIGN,
         )
     if base is None:
         raise DataError(
-            f"{path}: the published data does not tell the rig's geometry",
+            f"{path}: the published data does not contain the rig's geometry",
             "no rig file was given",
             "give the instrument.toml of the published rig",
+            code=ErrorCode.KEY_MISSING,
         )
     rig = load_instrument(base) if isinstance(base, Path) else base
     return PublishedCubes(path, rig) if any(path.glob("*" + SYNCED)) else PublishedScan(path, rig)

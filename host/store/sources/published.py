@@ -1,8 +1,8 @@
-"""The published data set read as scans: `unsynced/<scan>` (raw rows) and `raw/<scan>` (synchronised cubes).
+"""Read the published data set as scans: `unsynced/<scan>` (raw rows) and `raw/<scan>` (synchronised cubes).
 
-Rows are files named by the grid index where they start, `<x>_<y>.bin`, with a log of their packets beside them. Lost
-packets are zeros in the file or absent from it (`packet_zero_filling`); positions at which a radar did not start are
-absent. A scan taken column by column is the row scan of the rig mirrored in x = y (`mirrored`), and is read as one.
+Rows are files named by the grid index of their start, `<x>_<y>.bin`, each with a log of its packets. Lost packets are
+zeros in the file or missing from it (`packet_zero_filling`); positions at which a radar did not start are missing.
+A scan recorded column by column is read as a row scan of the rig mirrored in x = y (`mirrored`).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from polysight.host.store.sources.published_packets import (
 )
 from polysight.host.store.sources.published_settings import mirrored, read_settings, rig_of
 from polysight.shared.config import Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.raster import RasterPlan, plan_raster
 
@@ -40,28 +41,16 @@ SYNCED = "_synced.npy"
 
 @dataclass(frozen=True)
 class RowLosses:
-    """What one board's recording of one row lacks.
+    """Losses of one board's recording of one row."""
 
-    Attributes
-    ----------
-    packets_lost
-        Packets that the card sent and nobody received.
-    positions_missing
-        Positions at which the radar did not start.
-    positions_short
-        Positions with fewer frames than pulses; which pulse was missed cannot be told, so they are masked.
-    rows_not_placed
-        1 where positions are missing and nothing tells which: the whole row is masked.
-    """
-
-    packets_lost: int = 0
-    positions_missing: int = 0
-    positions_short: int = 0
-    rows_not_placed: int = 0
+    packets_lost: int = 0  # sent by the card and not received
+    positions_missing: int = 0  # at which the radar did not start
+    positions_short: int = 0  # with fewer frames than pulses; masked, because the missed pulse is unknown
+    rows_not_placed: int = 0  # 1 if unknown positions are missing: the whole row is masked
 
 
 class _Published:
-    """What both of the authors' folders tell."""
+    """Common properties of both kinds of the authors' folders."""
 
     synchronised = False
     manifest_faults: tuple[ManifestFault, ...] = ()
@@ -81,12 +70,12 @@ class _Published:
 
     @property
     def plan(self) -> RasterPlan:
-        """Where every position is; the rows of a scan by columns are its columns."""
+        """The plan of positions; the rows of a scan by columns are its columns."""
         return self._plan
 
     @property
     def simulated(self) -> bool:
-        """Whether the description says so."""
+        """True if the description contains "simulated"."""
         return "simulated" in self._settings.description.lower()
 
     @property
@@ -96,13 +85,7 @@ class _Published:
 
 
 class PublishedScan(_Published):
-    """An `unsynced/<scan>` folder as a source.
-
-    Raises
-    ------
-    DataError
-        when the files are not of that form.
-    """
+    """An `unsynced/<scan>` folder as a source. Raises DataError if the files are not of that form."""
 
     def __init__(self, path: Path, base: Instrument) -> None:
         super().__init__(path, base)
@@ -128,28 +111,30 @@ class PublishedScan(_Published):
         if start != expected:
             row_name, column_name = ("column", "row") if self.mirrored else ("row", "column")
             raise DataError(
-                f"{file}: {row_name} {row} starts at {column_name} {start}, a serpentine from {column_name} 0 has it"
-                f" start at {expected}",
+                f"{file}: {row_name} {row} starts at {column_name} {start}; in a serpentine from {column_name} 0 it"
+                f" starts at {expected}",
                 "another order than the published scans'",
                 "this scan cannot be processed",
+                code=ErrorCode.FILE_FOREIGN,
             )
 
     def rows(self) -> Iterator[int]:
-        """Rows that both receiving boards hold, ascending."""
+        """Rows of which both receiving boards have data, ascending."""
         h, v = (set(self._files[b.name]) for b in self._instrument.receivers)
         yield from sorted(h & v)
 
     def read_row(self, board_name: str, row: int) -> RowData:
-        """One board's recording of one row, with what is missing placed by the packet logs.
+        """Read one board's recording of one row, with its gaps located by the packet logs.
 
         Raises
         ------
         DataError
-            when the row is absent, or file and log contradict each other.
+            if the row is missing, or file and log contradict each other.
         """
         stream = self._stream(board_name, row)
         if stream is None:
-            raise DataError(f"{self.path}: no row {row} of board {board_name}", "the download is not complete")
+            what = f"{self.path}: no row {row} of board {board_name}"
+            raise DataError(what, "the download is not complete", code=ErrorCode.NO_DATA)
         shape, frames = self._shape, self._shape.positions * self._shape.pulses
         lost = stream.packets_lost
         if stream.data.size >= shape.bytes:  # nothing slipped
@@ -179,13 +164,13 @@ class PublishedScan(_Published):
         return read_stream(file, log, self._shape, self._settings.packet_zero_filling)
 
     def _others(self, board_name: str, row: int) -> list[Bursts]:
-        """Bursts of the same row as the other boards received them."""
+        """Return the bursts of the same row from the other boards."""
         streams = [self._stream(name, row) for name in self._files if name != board_name]
         return [b for s in streams if s is not None and (b := find_bursts(s, self._shape)) is not None]
 
     @cached_property
     def _period_s(self) -> float | None:
-        """Time from one position to the next, from the first row that is whole; None where there is none."""
+        """Time from one position to the next in the first complete row; None if there is none."""
         for board in self._instrument.receivers:
             for row in sorted(self._files[board.name]):
                 stream = self._stream(board.name, row)
@@ -198,7 +183,7 @@ class PublishedScan(_Published):
         self._losses.setdefault(board_name, {})[row] = losses
 
     def recording_facts(self) -> dict[str, Any]:
-        """What the rows read so far lacked, by board, and the rows that are absent."""
+        """Return the losses of the rows read so far and the number of missing rows, by board."""
         boards = {}
         for board in self._instrument.receivers:
             rows = [asdict(r) for r in self._losses[board.name].values()]
@@ -211,7 +196,7 @@ class PublishedScan(_Published):
 def _place(
     stream: Stream, bursts: Bursts, positions: NDArray[np.int64], shape: RowShape
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], int]:
-    """Payload of the row, which bytes of it are there, and the number of positions with too few or too many frames."""
+    """Return the row's payload, a mask of bytes that arrived, and the number of positions with a wrong frame count."""
     size, burst, short = stream.data.size, shape.burst_bytes, 0
     payload, there = np.zeros(shape.bytes, np.uint8), np.zeros(shape.bytes, bool)
     arrived = np.ones(size, bool)
@@ -229,7 +214,7 @@ def _place(
 
 
 class PublishedCubes(_Published):
-    """A `raw/<scan>` folder: cubes that the authors synchronised themselves."""
+    """A `raw/<scan>` folder with cubes that the authors have synchronised."""
 
     synchronised = True
 
@@ -238,25 +223,21 @@ class PublishedCubes(_Published):
         yield from range(self._plan.rows)
 
     def read_row(self, board_name: str, row: int) -> CubeRow:
-        """One board's row, referenced as they left it.
-
-        Raises
-        ------
-        DataError
-            when the cube is absent or has another shape than the scan's settings.
-        """
+        """Read one board's row with the authors' reference. Raises DataError if it is missing or of a wrong shape."""
         file = self.path / f"{board_name}{SYNCED}"
         try:
             cube = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as e:
-            raise DataError(f"{file}: not a cube: {e}", "the download is not complete") from None
+            what = f"{file}: not a cube: {e}"
+            raise DataError(what, "the download is not complete", code=ErrorCode.FILE_DAMAGED) from None
         rig, s = self._instrument, self._settings
         shape = (len(rig.antennas.rx_mm), s.total_y, s.total_x, rig.chirp.samples)
         if cube.shape != shape:
-            raise DataError(f"{file}: shape {cube.shape}, its settings say {shape}", "not the settings of this scan")
+            what = f"{file}: shape {cube.shape}, {shape} in its settings"
+            raise DataError(what, "not the settings of this scan", code=ErrorCode.MISMATCH)
         ascending = cube[:, :, row] if self.mirrored else cube[:, row]  # from the smallest x (y) on
         return CubeRow(np.array(ascending[:, :: self._plan.row(row).direction], np.complex64))
 
     def recording_facts(self) -> dict[str, Any]:
-        """In which direction, and what to know."""
+        """Return the direction and the notices."""
         return {"recording": {"direction": self._settings.moving_direction, "notices": list(self.notices)}}

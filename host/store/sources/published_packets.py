@@ -1,10 +1,10 @@
-"""One board's row of the published data: its packets, which of them arrived, and where its bursts belong.
+"""Read one board's row of the published data: lost packets, and the position of each burst.
 
-The card counts its packets, so a lost one is known by its number. A position at which the radar did not start leaves
-nothing but a longer pause: bursts of positions are about 90 ms apart and arrive within some milliseconds. A burst ends
-with a frame, and the pause falls within a packet of its end, so the frames of every burst can be counted.
+The card numbers its packets, so lost ones are known. A position at which the radar did not start is only visible as a
+longer pause: bursts are about 90 ms apart and arrive within some milliseconds. A burst ends with a frame, and the pause
+falls within a packet of its end, so the frames of every burst can be counted.
 
-What cannot be placed is masked and counted, never put where it might belong.
+Data of uncertain position is masked and counted, never guessed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Gaps = list[tuple[int, int]]
-PACKET_BYTES = 1456  # payload of a full packet, where no log tells
-_UNEVEN = 0.25  # of the period between positions: a pause this far from a whole number of periods places nothing
+PACKET_BYTES = 1456  # payload of a full packet, if there is no log
+_UNEVEN = 0.25  # of the period between positions: largest deviation of a pause from a whole number of periods
 
 
 class PacketLog(NamedTuple):
@@ -33,7 +34,7 @@ class PacketLog(NamedTuple):
 
 @dataclass(frozen=True)
 class RowShape:
-    """What a whole row of one board is: positions, pulses of a burst, bytes of a frame."""
+    """Size of a complete row of one board: positions, pulses of a burst, bytes of a frame."""
 
     positions: int
     pulses: int
@@ -52,28 +53,14 @@ class RowShape:
 
 @dataclass(frozen=True)
 class Stream:
-    """What the card sent in one row, as far as it is known.
+    """Data that the card sent in one row."""
 
-    Attributes
-    ----------
-    data
-        uint8 [n], zero where lost.
-    lost
-        Byte ranges that never arrived.
-    packets_lost
-        How many packets they are.
-    start, at_s
-        Offset of each packet that arrived, and when it did; empty where no log tells.
-    packet_bytes
-        Payload of a full packet.
-    """
-
-    data: NDArray[np.uint8]
-    lost: Gaps
+    data: NDArray[np.uint8]  # [n], zero where lost
+    lost: Gaps  # byte ranges that never arrived
     packets_lost: int
-    start: NDArray[np.int64]
-    at_s: NDArray[np.float64]
-    packet_bytes: int
+    start: NDArray[np.int64]  # offset of each packet that arrived; empty without a log
+    at_s: NDArray[np.float64]  # its arrival time
+    packet_bytes: int  # payload of a full packet
 
 
 class Bursts(NamedTuple):
@@ -84,15 +71,15 @@ class Bursts(NamedTuple):
 
 
 def read_log(path: Path) -> PacketLog | None:
-    """A row's packet log; None when there is none. A header line is skipped.
+    """Read a row's packet log; None if there is none. A header line is skipped.
 
-    The last packet, when it is not full, counts as come with the one before it: the card holds it back for 2 s, and it
-    would look like one more position.
+    A last packet that is not full gets the arrival time of the one before it: the card delays it by 2 s, and it would
+    look like another position.
 
     Raises
     ------
     DataError
-        naming the line that is not a packet.
+        with the first line that is not a packet.
     """
     if not path.exists():
         return None
@@ -121,7 +108,7 @@ def _numbers(lines: list[str]) -> NDArray[np.float64]:
 
 
 def _numbers_by_line(path: Path, lines: list[str]) -> NDArray[np.float64]:
-    """The slow way: more columns than three are put up with, and a damaged line is named."""
+    """Parse line by line, slowly: accepts more than three columns and names a damaged line."""
     rows = []
     for number, line in enumerate(lines):
         words = line.split(",")
@@ -129,7 +116,8 @@ def _numbers_by_line(path: Path, lines: list[str]) -> NDArray[np.float64]:
             rows.append((float(int(words[0])), float(int(words[1])), float(words[2])))
         except (ValueError, IndexError):
             if number and line.strip():
-                raise DataError(f"{path}: line {number + 1} is not a packet: {line!r}", "a damaged file") from None
+                what = f"{path}: line {number + 1} is not a packet: {line!r}"
+                raise DataError(what, "a damaged file", code=ErrorCode.FILE_DAMAGED) from None
     return np.array(rows, np.float64).reshape(-1, 3)
 
 
@@ -137,14 +125,14 @@ _MOST = 16  # rows' worth that a stream may span: what is not there is filled wi
 
 
 def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled: bool) -> Stream:
-    """A row's stream from its file and its log.
+    """Read a row's stream from its file and its log.
 
-    In a zero-filled file a packet of zeros is a lost one, whatever the log says: no receiver is that quiet.
+    In a zero-filled file every packet of zeros is a lost one, regardless of the log: real samples have noise.
 
     Raises
     ------
     DataError
-        when file and log are not of one recording.
+        if file and log are not of one recording.
     """
     raw = np.fromfile(file, np.uint8)
     none = np.zeros(0, np.int64)
@@ -160,12 +148,14 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
             f"{file}: its packet log spans {end} bytes, a row has {shape.bytes}",
             "the numbers of its packets jump: a damaged log, or one of several rows",
             "fetch both again",
+            code=ErrorCode.FILE_DAMAGED,
         )
     if not zero_filled and raw.size != log.size.sum():
         raise DataError(
             f"{file}: {raw.size} bytes, its packet log says {log.size.sum()}",
             "file and log are not of one recording, or one of them was cut",
             "fetch both again",
+            code=ErrorCode.MISMATCH,
         )
     if zero_filled:
         end = max(end, raw.size)
@@ -184,7 +174,7 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
 
 
 def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64], end: int) -> NDArray[np.uint8]:
-    """The packets of a file without the lost ones, each at its own place."""
+    """Move the packets of a file without the lost ones to their offsets."""
     data = np.zeros(end, np.uint8)
     source = np.concatenate([[0], np.cumsum(size)])
     breaks = np.flatnonzero(start[1:] != start[:-1] + size[:-1]) + 1  # runs of packets without a loss
@@ -203,12 +193,11 @@ def _silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
 
 
 def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
-    """Sequence number of the row's first packet, which may itself be lost.
+    """Return the sequence number of the row's first packet, which may be lost.
 
-    Where lost packets are in the file, as many before the first that arrived as the file begins with packets of zeros;
-    where they are not, counted back from a short last packet if no position is missing; else the first that arrived.
-    But 1 where that is neither 1 nor 0, and the numbers fit a record that starts there: the card's counters do, a log
-    may count from 0.
+    With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
+    counted back from a short last packet if no position is missing, otherwise the first packet that arrived. If the
+    result is neither 0 nor 1 but the numbers fit a record from 1, return 1: cards count from 1, a log may from 0.
     """
     expected, first, last = -(-shape.bytes // full), int(log.sequence[0]), int(log.sequence[-1])
     begin = first
@@ -220,10 +209,10 @@ def _first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDA
 
 
 def _pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Indices of the packets that come after a pause between bursts, where there should be `count` pauses.
+    """Return the indices of the packets behind a pause between bursts, of which about `count` are expected.
 
-    The `count` longest pauses are those between bursts, most of them between neighbours: half of a short one of them
-    parts the kinds.
+    Most of the `count` longest pauses are those between neighbouring positions; the threshold is half of their first
+    quartile.
     """
     steps = np.diff(at_s)
     if count < 1 or steps.size < count:
@@ -233,7 +222,7 @@ def _pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
 
 
 def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
-    """The bursts of a stream; None where no log tells when its packets came."""
+    """Find the bursts of a stream; None without a log."""
     if not stream.at_s.size:
         return None
     frame, end = shape.frame_bytes, stream.data.size
@@ -250,16 +239,15 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
 
 
 def period_s(bursts: Bursts) -> float | None:
-    """Time from one position to the next, if most positions follow one another; None for fewer than two bursts."""
+    """Return the time between positions (most must follow one another); None for fewer than two bursts."""
     return float(np.quantile(np.diff(bursts.at_s), 0.25)) if bursts.at_s.size > 1 else None
 
 
 def positions_of(own: Bursts, others: list[Bursts], positions: int, period: float | None) -> NDArray[np.int64] | None:
-    """Position of each burst; None where it cannot be told.
+    """Return the position of each burst; None if undetermined.
 
-    Positions follow each other evenly, so a step of two periods is a position at which no radar started. The boards
-    are triggered together and their packets timed by one clock: only if all boards together span the row is it known
-    which position is the first.
+    Positions are evenly spaced in time, so a step of two periods is a position at which no radar started. The boards
+    share triggers and clock: the first position is known only if all boards together span the row.
     """
     times = np.sort(np.concatenate([b.at_s for b in (own, *others)]))
     if period is None or period <= 0 or positions < 2:

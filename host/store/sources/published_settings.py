@@ -1,4 +1,4 @@
-"""The published data set's JSON settings, made into a rig: grid, burst, chirp, distances and mount angles."""
+"""Convert the published data set's JSON settings to a rig: grid, burst, chirp, distances and mount angles."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import msgspec
 
 from polysight.shared import files
 from polysight.shared.config import Board, Instrument, MountStep
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.tables import decode
 
@@ -27,7 +28,7 @@ class ChirpConfig(msgspec.Struct, frozen=True):
 
 
 class Collection(msgspec.Struct, frozen=True):
-    """The JSON files as far as they are needed. Lengths in mm, times in ms, angles in degrees, `board_dist` in m."""
+    """The keys of the JSON files that are used. Lengths in mm, times in ms, angles in degrees, `board_dist` in m."""
 
     dx: float
     dy: float
@@ -51,32 +52,33 @@ class Collection(msgspec.Struct, frozen=True):
 
     @property
     def by_columns(self) -> bool:
-        """Whether the stage ran along y, column after column."""
+        """True if the stage ran along y, column after column."""
         return self.moving_direction == "col"
 
 
 class Rig(NamedTuple):
-    """The rig of a scan, x from TX to RX, and what the user should know of how it was read."""
+    """The rig of a scan, x from TX to RX, and notices on how the settings were read."""
 
     instrument: Instrument
     notices: tuple[str, ...]
 
 
 def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
-    """A JSON object from a file; empty when it is absent and may be. Raises DataError."""
+    """Read a JSON object from a file; with `missing_ok`, {} for a missing file. Raises DataError."""
     if missing_ok and not path.exists():
         return {}
+    why, remedy = "the download is not complete", "fetch the file again"
     try:
         content = files.read_json(path)
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: not JSON: {e}", "the download is not complete", "fetch the file again") from None
+        raise DataError(f"{path}: not JSON: {e}", why, remedy, code=ErrorCode.FILE_DAMAGED) from None
     if not isinstance(content, dict):
-        raise DataError(f"{path}: not a JSON object", "the download is not complete", "fetch the file again")
+        raise DataError(f"{path}: not a JSON object", why, remedy, code=ErrorCode.FILE_FOREIGN)
     return content
 
 
 def read_settings(path: Path) -> Collection:
-    """Settings of an `unsynced/<scan>` or `raw/<scan>` folder. Raises DataError or ConfigError."""
+    """Read the settings of an `unsynced/<scan>` or `raw/<scan>` folder. Raises DataError or ConfigError."""
     content = {**read_json(path / DEVICES, missing_ok=True), **read_json(path / COLLECTION)}
     s = decode(content, Collection, str(path / COLLECTION))
     if s.moving_direction not in ("row", "col") or not s.chirp_configs or s.num_chirp != 1:
@@ -85,15 +87,16 @@ def read_settings(path: Path) -> Collection:
             f" {s.num_chirp} chirps a frame",
             "only scans by row or by column with one chirp a frame are read",
             "this scan cannot be processed",
+            code=ErrorCode.VALUE_INVALID,
         )
     return s
 
 
 def rig_of(s: Collection, base: Instrument, path: Path) -> Rig:
-    """The base rig with a scan's own settings; what the JSON does not tell stays the base's. Raises ConfigError."""
+    """Return the base rig with the scan's settings; values missing in the JSON stay the base's. Raises ConfigError."""
     c = s.chirp_configs[0]
     grid = {"columns": s.total_x, "rows": s.total_y, "step_x_mm": s.dx, "step_y_mm": s.dy}
-    travel = (  # their stage had the room
+    travel = (  # the grid was within their stage's travel
         max(base.stage.travel_x_mm, s.total_x * s.dx + 2 * base.stage.run_up_mm(s.dx)),
         max(base.stage.travel_y_mm, s.total_y * s.dy + 2 * base.stage.run_up_mm(s.dy)),
     )
@@ -119,11 +122,11 @@ def rig_of(s: Collection, base: Instrument, path: Path) -> Rig:
 
 
 def _mount(board: Board, s: Collection, notices: list[str]) -> tuple[MountStep, ...]:
-    """A board's mount with the scan's angles and offsets in the places where the base rig has its own.
+    """Replace the angles and offsets of the base rig's mount by the scan's.
 
-    The last turn about y makes the board look at the object, the last about z tilts the receivers, and the shift
-    between those two is the tilt's offset; the V board has a turn about y of its own before. The last shift is half
-    the distance between the board origins.
+    The last turn about y points the board at the object, the last about z tilts the receivers, and the shift between
+    them is the tilt's offset; the V board has another turn about y before. The last shift is half the distance between
+    the board origins.
     """
     steps = list(board.mount)
     tx = board.role == "transmit"
@@ -162,10 +165,10 @@ def _shifts(steps: list[MountStep]) -> list[int]:
 
 
 def mirrored(rig: Instrument) -> Instrument:
-    """The rig as seen in a mirror that swaps x and y; twice is the rig itself.
+    """Mirror the rig in x = y; mirroring twice gives the rig itself.
 
-    Paths know no mirror: what this rig records row by row is what the other records column by column. A turn about an
-    axis becomes the opposite turn about the swapped axis.
+    The mirrored rig records row by row the same path lengths as the rig column by column. A turn about an axis becomes
+    the opposite turn about the swapped axis.
     """
     stage, grid, image = rig.stage, rig.grid, rig.image
     replace = msgspec.structs.replace

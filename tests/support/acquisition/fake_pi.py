@@ -19,7 +19,7 @@ class FakePi:
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
         self.rig, self.cards = rig, cards
         self.journal: dict[str, list[m.AnyEvent]] = {}
-        self.stage = rig.stage.placing  # what Hello tells; {}: nothing, as older releases
+        self.stage = rig.stage.placement_settings  # what Hello tells; {}: nothing, as older releases
         self.homed = False
         self.run: m.BeginRun | None = None
         self.state: m.State = "idle"

@@ -31,9 +31,9 @@ class FakeLines:
             self.t = t_ns + self.late(self.sleeps)
             self.sleeps += 1
 
-    def wait_edge(self, limit_s: float) -> Edge | None:
+    def wait_edge(self, timeout_s: float) -> Edge | None:
         try:
-            edge = self.edges.get(timeout=min(limit_s, 0.01))
+            edge = self.edges.get(timeout=min(timeout_s, 0.01))
         except queue.Empty:
             return None
         if isinstance(edge, Exception):

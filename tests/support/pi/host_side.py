@@ -1,4 +1,4 @@
-"""The host's end of the Pi's sockets, as small as can be."""
+"""A minimal host: its end of the Pi's sockets."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LIMIT_S = 60.0
 
 
 class HostSide:
-    """Commands, and every event seen."""
+    """Sends commands, and keeps every event in `events`."""
 
     def __init__(
         self,
@@ -37,7 +37,8 @@ class HostSide:
         self.wait(m.Heartbeat)  # the subscription has arrived
 
     def ask(self, command: Any) -> Any:
-        self.commands.send(m.pack(command))
+        """The reply to a command, or to bytes."""
+        self.commands.send(command if isinstance(command, bytes) else m.pack(command))
         assert self.commands.poll(int(self.limit_s * 1e3)), f"no reply to {command}"
         return m.unpack_reply(self.commands.recv())
 
@@ -45,6 +46,14 @@ class HostSide:
         reply = self.ask(command)
         assert isinstance(reply, m.Accepted), reply
         return reply
+
+    def refused(self, command: Any) -> int:
+        """Fault number of the refusal."""
+        reply = self.ask(command)
+        assert isinstance(reply, m.Refused), reply
+        assert reply.what
+        assert reply.remedy
+        return reply.number
 
     def begin(self, scan_id: str = "scan", **changes: Any) -> m.BeginRun:
         i = self.instrument
@@ -72,7 +81,7 @@ class HostSide:
         raise AssertionError(f"never in {states}: {self.ask(m.Status())}")
 
     def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None) -> Any:
-        """The next event of a kind; everything on the way is kept in `events`."""
+        """The next event of a kind."""
         limit_s = self.limit_s if limit_s is None else limit_s
         deadline = time.monotonic() + limit_s
         while (left := deadline - time.monotonic()) > 0:
@@ -83,13 +92,20 @@ class HostSide:
                     return event
         raise AssertionError(f"no {kind.__name__} within {limit_s} s; seen {self.events[-5:]}")
 
-    def row(self, row_index: int, take: int = 1, scan_id: str = "scan") -> m.RowFinished:
-        self.accepted(m.RunRow(scan_id=scan_id, row_index=row_index, take=take))
+    def start_row(self, row_index: int = 0, take: int = 1, owner: str = "") -> m.Accepted:
+        return self.accepted(m.RunRow(scan_id="scan", row_index=row_index, take=take, owner=owner))
+
+    def row(self, row_index: int, take: int = 1) -> m.RowFinished:
+        self.start_row(row_index, take)
         return self.wait(m.RowFinished, lambda e: (e.row_index, e.take) == (row_index, take))
+
+    def of(self, *kinds: type) -> list[Any]:
+        """Events of these kinds so far."""
+        return [e for e in self.events if isinstance(e, kinds)]
 
     @property
     def journalled(self) -> list[Any]:
-        return [e for e in self.events if isinstance(e, m.JOURNALLED)]
+        return self.of(*m.JOURNALLED)
 
     def replay(self, scan_id: str = "scan", from_seq: int = 1, limit: int = 10000) -> list[Any]:
         return self.ask(m.Replay(scan_id=scan_id, from_seq=from_seq, limit=limit)).events

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from tests.support.paths import REPO
@@ -14,9 +15,11 @@ PROGRAM = (sys.executable, "-m", "polysight.pi_controller")
 
 
 class Process:
-    """`polysight-pi run`, once it is ready. Its environment can be added to."""
+    """`polysight-pi run`, once it is ready; with further arguments and environment variables."""
 
-    def __init__(self, config: Path, *args: object, **environment: str) -> None:
+    def __init__(
+        self, config: Path, *args: object, preexec_fn: Callable[[], None] | None = None, **environment: str
+    ) -> None:
         self.popen = subprocess.Popen(
             [*PROGRAM, "run", "--config", str(config), *map(str, args)],
             stdout=subprocess.PIPE,
@@ -24,6 +27,7 @@ class Process:
             text=True,
             cwd=REPO,
             env={**os.environ, **environment},
+            preexec_fn=preexec_fn,
         )
         assert self.popen.stdout is not None
         self.ready = self.popen.stdout.readline().split()

@@ -137,10 +137,10 @@ def draw(rng: random.Random) -> tuple[Case, int]:
         "flood": lambda: _flood(rng),
         "unplug": lambda: Case("unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False)),
         "power": lambda: Case("power lost", SILENT, lambda w: w.board.power(False)),
-        "brown-out": lambda: Case("brown-out", "started anew", lambda w: (w.board.power(False), w.board.power(True))),
+        "brown-out": lambda: Case("brown-out", "restarted", lambda w: (w.board.power(False), w.board.power(True))),
         "ram brown-out": lambda: Case(
             "new board, brown-out",
-            "started anew",
+            "restarted",
             lambda w: (w.board.power(False), w.board.power(True)),
             b"",
             IMAGE,

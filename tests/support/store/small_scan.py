@@ -177,7 +177,7 @@ class SmallRig:
     def reports(self) -> dict[str, Any]:
         return {}
 
-    def row_runs(self, not_before_ns: int) -> None:
+    def discard_before(self, not_before_ns: int) -> None:
         """Nothing is left over here."""
 
     def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:

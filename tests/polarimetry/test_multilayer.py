@@ -1,4 +1,4 @@
-"""Reflection of layered media against `tmm` (S. J. Byrnes), an independent implementation by transfer matrices.
+"""Reflection of layered media, compared with `tmm` (S. J. Byrnes), an independent transfer-matrix implementation.
 
 `tmm` works in exp(-i omega t): its index is the conjugate of ours, and so are its coefficients. Its r_p has the
 opposite sign (a perfect conductor has r_p = +1 there, -1 in Eq. 2 of the paper).
@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from polysight.host.polarimetry import fresnel, multilayer
+from polysight.shared.errors import PolysightError
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from polysight.simulators.scene import Layer, layered
 
 media = st.tuples(st.floats(1.0, 12.0), st.floats(0.0, 20.0)).map(lambda e: complex(e[0], -e[1]))
 lossless = st.floats(1.0, 12.0).map(complex)
@@ -51,7 +53,7 @@ def test_energy_is_conserved_by_lossless_layers(layers, f, theta):
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(media, thickness), min_size=1, max_size=3), media, frequency, angle)
-def test_a_passive_stack_gives_back_no_more_than_it_gets(layers, last, f, theta):
+def test_a_passive_stack_reflects_at_most_all_power(layers, last, f, theta):
     r = multilayer([e for e, _ in layers] + [last], [d for _, d in layers], f, theta)
     assert np.all(np.abs(r) <= 1 + 1e-9)
 
@@ -59,14 +61,38 @@ def test_a_passive_stack_gives_back_no_more_than_it_gets(layers, last, f, theta)
 @settings(max_examples=40)
 @given(media, media, frequency, angle)
 def test_an_infinite_or_invisible_second_medium_is_fresnel(eps, second, f, theta):
-    np.testing.assert_allclose(multilayer(eps, np.inf, f, theta), fresnel(eps, theta), rtol=1e-12)
+    for half_space in (multilayer(eps, np.inf, f, theta), multilayer([eps], [], f, theta)):
+        np.testing.assert_allclose(half_space, fresnel(eps, theta), rtol=1e-12)
     np.testing.assert_allclose(multilayer([eps, eps], [1e-3], f, theta), fresnel(eps, theta), rtol=1e-9, atol=1e-12)
-    # A lossy layer thick enough hides what is behind it.
+    # A thick lossy layer hides the media behind it.
     dark = complex(eps.real, min(eps.imag, -1.0))
     np.testing.assert_allclose(multilayer([dark, second], [1.0], f, theta), fresnel(dark, theta), rtol=1e-9)
 
 
-def test_a_known_number():
+def test_water_behind_glass():
     """Water at 75 GHz behind 3 mm of glass, 55 degrees, 78.6 GHz."""
     expected, _ = by_tmm([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0))
     assert multilayer([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0)) == pytest.approx(expected)
+
+
+def test_a_stack_agrees_with_the_simulator():
+    """The simulator calculates transmission lines in series, the host sums of echoes."""
+    theta = np.radians(np.linspace(0, 75, 16))
+    stack = [Layer((5.5, 0.05), 3.0), Layer((2.2, 0.3), 0.4), Layer((9.37, 18.0))]
+    simulated = layered(stack, 78.5e9, theta)
+    np.testing.assert_allclose(
+        simulated, multilayer([x.epsilon for x in stack], [3e-3, 0.4e-3], 78.5e9, theta), rtol=1e-9
+    )
+
+
+def test_shapes_broadcast():
+    r_s, _ = multilayer([2.5, 4.0], [1e-3, 2e-3], np.linspace(76e9, 81e9, 5)[:, None], np.radians([50.0, 60.0]))
+    assert r_s.shape == (5, 2)
+
+
+@pytest.mark.parametrize(
+    ("eps", "thickness_m"), [([2.0, 3.0], []), ([2.0], [1e-3, 1e-3]), ([2.0, 3.0], [np.inf]), ([2.0], [-1e-3])]
+)
+def test_invalid_stacks_are_refused(eps, thickness_m):
+    with pytest.raises(PolysightError):
+        multilayer(eps, thickness_m, 78e9, 1.0)

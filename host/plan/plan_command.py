@@ -1,6 +1,6 @@
-"""`polysight plan`: a forecast in words and as plain numbers, with what an earlier scan tells of noise and overhead.
+"""`polysight plan`: print a forecast, or the best plans within a time, as text or JSON.
 
-`plan` prints the forecast or the proposals. `noise_of` and `row_overhead_of` measure what a recorded scan had.
+`measure_noise` and `measure_row_overhead` take noise and standstill from a recorded scan (`--like`).
 """
 
 from __future__ import annotations
@@ -22,25 +22,24 @@ from polysight.host.plan.search import Changes, propose, rig_lines
 from polysight.host.plan.timing import ROW_OVERHEAD_S, row_motion_s, tail_s, turn_s
 from polysight.host.store import EVENTS, RawSource, ScanFolder, read_events
 from polysight.host.sync import BoardSetup, synchronise_row
-from polysight.shared.config import Instrument, load_instrument
+from polysight.shared.config import load_instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.messages import Capture
 
 _WIDTH = 118
-_ROWS = 5  # that the noise is taken from
-_SIMULATED = "the simulated rig's (no hardware has been measured; --like SCAN or --snr-db give another)"
+_NOISE_ROWS = 5  # rows from which the noise is measured
+_SIMULATED = "the simulated rig's (not measured on hardware; set it with --like SCAN or --snr-db)"
 
 
-def duration(seconds: float) -> str:
-    """Hours and minutes, or minutes, or seconds, as a person says it."""
+def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = seconds / 60
     return f"{minutes:.1f} min" if minutes < 100 else f"{minutes / 60:.2f} h"
 
 
-def size(count: float) -> str:
-    """Bytes in decimal units."""
+def _size(count: float) -> str:
     return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
@@ -49,63 +48,65 @@ def _pair(values: tuple[float, float], digits: int = 1) -> str:
 
 
 def describe(f: Forecast) -> str:
-    """One plan in full."""
+    """Return the text of one forecast."""
     g, b, s, t, r = f.rig.grid, f.rig.burst, f.rig.stage, f.time, f.response
     w, h = (g.columns - 1) * g.step_x_mm, (g.rows - 1) * g.step_y_mm
     lines = [
         ("scan", f"{g.columns} x {g.rows} positions, steps {g.step_x_mm:g} x {g.step_y_mm:g} mm, {w:g} x {h:g} mm"),
         ("", f"{s.speed_mm_s:g} mm/s, {b.chirps_a_position} chirps a position, {b.chirp_us or b.period_us:g} us apart"),
-        ("time", f"{duration(t.total_s)}, without homing and rows taken again: {duration(t.measuring_s)} measuring,"),
+        ("time", f"{_duration(t.total_s)}, without homing and retakes: {_duration(t.measuring_s)} measuring,"),
         (
             "",
-            f"{duration(t.ramps_s)} ramps, {duration(t.turns_s)} turns, {duration(t.tail_s)} waiting for last packets,"
-            f" {duration(t.overhead_s)} between rows, {duration(t.approach_s)} approach",
+            f"{_duration(t.ramps_s)} ramps, {_duration(t.turns_s)} turns, {_duration(t.tail_s)} waiting for last"
+            f" packets, {_duration(t.overhead_s)} between rows, {_duration(t.approach_s)} approach",
         ),
-        ("raw data", f"{size(f.raw_bytes)} of {len(f.rig.recorded)} boards"),
+        ("raw data", f"{_size(f.raw_bytes)} of {len(f.rig.recorded)} boards"),
         (
             "resolution",
-            f"{_pair(r.width_mm)} mm at half power (x by y), window and taper as in the rig file;"
-            f" the geometry's limit {_pair(r.limit_mm)} mm",
+            f"{_pair(r.width_mm)} mm at half power (x by y), with the rig file's window and taper;"
+            f" limit of the geometry {_pair(r.limit_mm)} mm",
         ),
-        ("", f"the paper's r lambda / L: {_pair(r.paper_mm)} mm (docs/decisions/0002-imaging.md says why it differs)"),
-        ("field", f"free of aliases over {_pair(f.field.alias_free_mm, 0)} mm"),
-        ("", f"flat plates want {_pair(f.field.mirror_zone_mm, 0)} mm of aperture beyond them on every side"),
+        (
+            "",
+            f"the paper's r lambda / L: {_pair(r.paper_mm)} mm (docs/decisions/0002-imaging.md explains the"
+            " difference)",
+        ),
+        ("field", f"without aliases over {_pair(f.field.alias_free_mm, 0)} mm"),
+        ("", f"flat plates need {_pair(f.field.mirror_zone_mm, 0)} mm of aperture beyond them on every side"),
         (
             "motion",
-            f"{f.burst.travel_mm:.2f} mm within a burst, {f.burst.travel_wavelengths:.2f} wavelengths;"
+            f"{f.burst.travel_mm:.2f} mm during a burst, {f.burst.travel_wavelengths:.2f} wavelengths;"
             f" a burst fills {f.burst.duty:.0%} of the time to the next position",
         ),
         (
             "noise",
-            f"direct path {f.noise.position_db:.1f} dB over it in a position's average (a channel, a sample), its phase"
-            f" known to {f.noise.direct_phase_rad:.4f} rad",
+            f"direct path {f.noise.position_db:.1f} dB above the noise in a position's average (one channel, one"
+            f" sample), standard deviation of its phase {f.noise.direct_phase_rad:.4f} rad",
         ),
-        ("", f"a point as strong as the direct path stands {f.noise.image_db:.1f} dB over it in the image"),
-        ("", f"from: {f.noise_source}"),
+        ("", f"a point as strong as the direct path is {f.noise.image_db:.1f} dB above the noise in the image"),
+        ("", f"source: {f.noise_source}"),
     ]
     out = [f"{name:11s}{text}" for name, text in lines]
-    for caution in f.warnings:
-        kind = "REFUSED" if caution.refused else "note"
-        out += textwrap.wrap(f"{kind}, {caution.topic}: {caution.text}", _WIDTH, subsequent_indent="  ")
+    for warning in f.warnings:
+        kind = "REFUSED" if warning.refused else "note"
+        out += textwrap.wrap(f"{kind}, {warning.topic}: {warning.text}", _WIDTH, subsequent_indent="  ")
     return "\n".join(out) + "\n"
 
 
-def table(plans: list[Forecast]) -> str:
-    """Several plans, a line each."""
-    head = "    time      mm/s  chirps  period us  steps mm     grid       image dB  motion  alias-free mm   raw"
-    lines = [head]
+def _table(plans: list[Forecast]) -> str:
+    lines = ["    time      mm/s  chirps  period us  steps mm     grid       image dB  motion  alias-free mm   raw"]
     for i, f in enumerate(plans, 1):
         g, b = f.rig.grid, f.rig.burst
         lines.append(
-            f"{i:2d}  {duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {b.pulses:6d}  {b.period_us:9g}"
+            f"{i:2d}  {_duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {b.pulses:6d}  {b.period_us:9g}"
             f"  {f'{g.step_x_mm:g} x {g.step_y_mm:g}':11s}  {f'{g.columns} x {g.rows}':9s}  {f.noise.image_db:8.1f}"
-            f"  {f.burst.travel_wavelengths:4.2f} w  {_pair(f.field.alias_free_mm, 0):13s}  {size(f.raw_bytes)}"
+            f"  {f.burst.travel_wavelengths:4.2f} w  {_pair(f.field.alias_free_mm, 0):13s}  {_size(f.raw_bytes)}"
         )
     return "\n".join(lines) + "\n"
 
 
-def numbers(f: Forecast) -> dict[str, Any]:
-    """One plan as plain numbers, for JSON; what is infinite is None."""
+def forecast_values(f: Forecast) -> dict[str, Any]:
+    """Return a forecast as plain values for JSON; infinite ones as None."""
     g, b, s, t, r = f.rig.grid, f.rig.burst, f.rig.stage, f.time, f.response
 
     def finite(values: tuple[float, float]) -> list[float | None]:
@@ -150,19 +151,19 @@ def numbers(f: Forecast) -> dict[str, Any]:
     }
 
 
-def noise_of(source: RawSource) -> Noise:
-    """Direct path over noise of a scan's weaker receiver, from a few of its rows.
+def measure_noise(source: RawSource) -> Noise:
+    """Measure the direct path over noise of a scan's weaker receiver in a few of its rows.
 
     Raises
     ------
     DataError
-        when no row tells: bursts of one chirp, or nothing recorded.
+        if the scan has no rows, or bursts of a single chirp.
     """
-    from polysight.host.report import SyncReport  # here: matplotlib loads for a second
+    from polysight.host.report import SyncReport  # here: importing matplotlib takes a second
 
     rig = source.instrument
     rows = list(source.rows())
-    chosen = [rows[i] for i in sorted({*np.linspace(0, len(rows) - 1, _ROWS).astype(int)})] if rows else []
+    chosen = [rows[i] for i in sorted({*np.linspace(0, len(rows) - 1, _NOISE_ROWS).astype(int)})] if rows else []
     found = []
     for board in rig.receivers:
         setup = BoardSetup.of(rig, board)
@@ -174,19 +175,20 @@ def noise_of(source: RawSource) -> Noise:
         found.append(report.snr)
     if not np.isfinite(found).all():
         raise DataError(
-            f"scan {source.scan_id}: its noise cannot be told",
+            f"scan {source.scan_id}: its noise cannot be measured",
             "it has no rows, or bursts of a single chirp",
-            "give another scan to --like, or the ratio itself to --snr-db",
+            "give another scan with --like, or the ratio with --snr-db",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     kind = "simulated scan" if source.simulated else "scan"
     return Noise(float(10 * np.log10(min(found))), f"measured on {kind} {source.scan_id}")
 
 
-def row_overhead_of(folder: Path) -> float | None:
-    """Standstill between rows, seconds: median time from a row's last trigger to the next one's first, less motion.
+def measure_row_overhead(folder: Path) -> float | None:
+    """Measure the standstill between a scan's rows, seconds, on the clock of the triggers.
 
-    On the clock of the triggers. None where the Pi's events do not tell: fewer than two rows in a sequence, or data
-    that was made without a Pi.
+    It is the median time from a row's last trigger to the next row's first, minus the motion. None if the Pi's events
+    have no two consecutive rows, or the data was simulated without a Pi.
     """
     scan = ScanFolder.load(folder)
     if not scan.facts("scan_started")[0].get("pi"):
@@ -207,8 +209,8 @@ def row_overhead_of(folder: Path) -> float | None:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What the user wants to know besides the plan's own numbers."""
+class PlanOptions:
+    """Options of the command besides `Changes`: time and number of proposals, assumptions, output."""
 
     minutes: float | None = None
     count: int = 5
@@ -219,53 +221,49 @@ class Wanted:
     as_json: bool = False
 
 
-def plan(config: Path, changes: Changes, wanted: Wanted) -> int:
-    """Print the forecast, or the proposals; the exit status is 1 when the plan would be refused, or none fits.
+def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
+    """Print the forecast, or proposals if `minutes` is given; return 1 if the plan would be refused or none fits.
 
     Raises
     ------
     PolysightError
-        when the rig file, a number or the scan named by --like is wrong.
+        if the rig file, a value or the scan of --like is invalid.
     """
-    begun_with = load_instrument(config)
-    rig = changes.apply(begun_with)
-    noise, overhead = _assumed(wanted)
-    if wanted.minutes is not None:
-        plans = propose(rig, wanted.minutes, wanted.count, noise, overhead, wanted.scene_mm)
-        if wanted.as_json:
-            content = {"minutes": wanted.minutes, "plans": [numbers(p) for p in plans]}
-            sys.stdout.write(json.dumps(content, indent=1) + "\n")
-        elif plans:
-            sys.stdout.write(
-                f"Best plans within {wanted.minutes:g} minutes for this aperture, least noise in the image first"
-                f" (dB: point over noise; motion: wavelengths within a burst)\n\n{table(plans)}\n"
-                f"The first one in full:\n\n{describe(plans[0])}\n"
-                f"{_lines(plans[0].rig, begun_with)}"
-            )
-        else:
-            sys.stderr.write(
-                f"polysight plan: no plan keeps {wanted.minutes:g} minutes with this aperture, stage and scene without"
-                " aliases: give more time, a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
-                " --accel-mm-s2\n"
-            )
-        return 0 if plans else 1
-    told = forecast(rig, noise, overhead, wanted.scene_mm)
-    sys.stdout.write(json.dumps(numbers(told), indent=1) + "\n" if wanted.as_json else describe(told))
-    return 0 if told.possible else 1
+    original = load_instrument(config)
+    rig = changes.apply(original)
+    noise, overhead = _assumptions(options)
+    if options.minutes is None:
+        f = forecast(rig, noise, overhead, options.scene_mm)
+        sys.stdout.write(json.dumps(forecast_values(f), indent=1) + "\n" if options.as_json else describe(f))
+        return 0 if f.possible else 1
+    plans = propose(rig, options.minutes, options.count, noise, overhead, options.scene_mm)
+    if options.as_json:
+        content = {"minutes": options.minutes, "plans": [forecast_values(p) for p in plans]}
+        sys.stdout.write(json.dumps(content, indent=1) + "\n")
+    elif plans:
+        lines = rig_lines(plans[0].rig, original)
+        sys.stdout.write(
+            f"Best plans within {options.minutes:g} minutes for this aperture, least noise in the image first"
+            f" (dB: point over noise; motion: wavelengths during a burst)\n\n{_table(plans)}\n"
+            f"The first plan in full:\n\n{describe(plans[0])}\n"
+            + (f"Its lines in the rig file, all that differ:\n\n{lines}" if lines else "It is the rig file's plan.\n")
+        )
+    else:
+        sys.stderr.write(
+            f"polysight plan: no plan within {options.minutes:g} minutes without aliases for this aperture, stage and"
+            " scene: give more time, a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
+            " --accel-mm-s2\n"
+        )
+    return 0 if plans else 1
 
 
-def _lines(plan: Instrument, begun_with: Instrument) -> str:
-    lines = rig_lines(plan, begun_with)
-    return f"Its lines in the rig file, all that differ:\n\n{lines}" if lines else "The rig file says so already.\n"
-
-
-def _assumed(wanted: Wanted) -> tuple[Noise, float]:
-    """Noise and standstill: given, else of the scan named by --like, else the simulated rig's."""
+def _assumptions(options: PlanOptions) -> tuple[Noise, float]:
+    """Noise and standstill: as given, else of the scan of --like, else the simulated rig's."""
     noise, overhead = Noise(source=_SIMULATED), None
-    if wanted.like is not None:
-        noise, overhead = noise_of(ScanFolder.load(wanted.like)), row_overhead_of(wanted.like)
-    if wanted.snr_db is not None:
-        noise = Noise(wanted.snr_db, "given")
-    if wanted.row_overhead_s is not None:
-        overhead = wanted.row_overhead_s
+    if options.like is not None:
+        noise, overhead = measure_noise(ScanFolder.load(options.like)), measure_row_overhead(options.like)
+    if options.snr_db is not None:
+        noise = Noise(options.snr_db, "given")
+    if options.row_overhead_s is not None:
+        overhead = options.row_overhead_s
     return noise, ROW_OVERHEAD_S if overhead is None else overhead

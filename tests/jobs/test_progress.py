@@ -1,0 +1,44 @@
+"""Progress is shown before a step begins, also without a terminal."""
+
+from __future__ import annotations
+
+import pytest
+
+from polysight.host.cli.main import main
+from polysight.host.jobs import progress
+from polysight.host.jobs.progress import counted, steps
+
+
+def test_every_step_is_named_before_it_begins(capsys):
+    told = [(thing, capsys.readouterr().err) for thing in steps(["a", "b"], ["first", "second"])]
+    assert [thing for thing, _ in told] == ["a", "b"]
+    assert told[0][1] == "[1/2] first ..."
+    assert "[2/2] second ..." in told[1][1]
+    assert capsys.readouterr().err.endswith("s\n")
+
+
+def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):
+    now = iter(range(0, 1000, 2))
+    monkeypatch.setattr(progress, "monotonic", lambda: next(now))
+    rows = counted(range(40), 40, "rows")
+    assert next(rows) == 0
+    assert capsys.readouterr().err == "40 rows ...\n"  # before the first is done
+    assert list(rows) == list(range(1, 40))
+    lines = capsys.readouterr().err.splitlines()
+    assert 3 <= len(lines) <= 10
+    assert all(line.endswith("of 40 rows ...") for line in lines)
+
+
+def test_a_closed_stderr_stops_nothing(monkeypatch):
+    def closed(text: str) -> None:
+        raise BrokenPipeError(text)
+
+    monkeypatch.setattr(progress.sys.stderr, "write", closed)
+    progress.say("images")
+
+
+@pytest.mark.parametrize("words", [["reproduce", "--out", "out", "fig99"]])
+def test_a_line_comes_before_slow_libraries_are_loaded(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(words) != 0
+    assert capsys.readouterr().err.startswith(f"polysight {words[0]}: starting\n")

@@ -206,18 +206,17 @@ def segment(
     level = np.maximum(level_db(h, v, usable, cfg.smooth_px), cfg.floor_db)
     masks, threshold = _regions(_without_speckle(level, usable, cfg, pixel_mm), usable, cfg, pixel_mm)
     labels = np.zeros(h.shape, np.int32)
-    y = axis_mm(y_m)
-    row_pitch = max(2 * cfg.smallest_mm, 1.0)
-
-    def reading_order(mask: Mask) -> tuple[float, float]:
-        rows, cols = np.nonzero(mask)
-        return -round(float(y[rows].mean()) / row_pitch), float(cols.mean())
-
     patches = []
-    for mask in sorted(masks, key=reading_order):
+    for mask in sorted(masks, key=lambda mask: _reading_order(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patches.append(make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable))
     return Segmentation(labels, tuple(patches), threshold)
+
+
+def _reading_order(mask: Mask, y_mm: npt.NDArray[np.float64], row_pitch_mm: float) -> tuple[float, float]:
+    """Sort key of a patch: top row first, then from left to right."""
+    rows, cols = np.nonzero(mask)
+    return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())
 
 
 def insides(images: ChannelImages) -> list[Mask]:

@@ -58,7 +58,7 @@ def pi_fault(rig) -> None:
     ],
     ids=lambda x: x.__name__ if callable(x) else "",
 )
-def test_a_take_that_is_rejected_says_its_kind_and_board(rig, tmp_path, spoil, said):
+def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoil, said):
     spoil(rig)
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
@@ -101,7 +101,7 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
     assert (fact["reasons"], fact["faults"]) == ([str(ON_REQUEST)], [{"kind": "on_request"}])
 
 
-def test_a_row_that_is_kept_says_the_same(rig, tmp_path):
+def test_a_row_kept_incomplete_has_the_kind_and_board_of_its_fault(rig, tmp_path):
     for take in (1, 2, 3):
         rig.cards["RV"].drop[1, take] = {3}
     result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)

@@ -213,9 +213,7 @@ def test_rows_of_a_scan_folder_are_those_committed_last(tmp_path: Path) -> None:
         (["{file}", "--card-address", "203.0.113.9"], "cannot take", 5),
     ],
 )
-def test_wrong_arguments_are_told_in_one_message(
-    recording: Path, arguments: list[str], words: str, status: int
-) -> None:
+def test_wrong_arguments_are_one_message(recording: Path, arguments: list[str], words: str, status: int) -> None:
     filled = [a.format(folder=recording.parent, file=recording) for a in arguments]
     command = [sys.executable, "-m", "polysight.simulators.replay", *filled]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)

@@ -87,7 +87,7 @@ def moved(rig: Instrument) -> Instrument:
     return decode(table, Instrument, "moved")
 
 
-def test_what_was_taken_up_holds_from_then_on(undisturbed, tmp_path):
+def test_new_connection_settings_hold_from_then_on(undisturbed, tmp_path):
     """For every reader, and for a later resume that says nothing; what the scan was begun with is still there."""
     small = undisturbed.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)

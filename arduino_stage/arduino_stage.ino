@@ -12,7 +12,7 @@ void setup() {
 
 void loop() {
   uno_alive();
-  // At most one line a turn, and none while its answer has no room: whatever comes, the stage is looked after.
+  // At most one line per turn, and none without space for its answer, so that input never delays poll().
   uint8_t byte;
   bool line = false;
   while (!line && Protocol::ready() && uno_read(byte)) line = protocol.receive(byte);

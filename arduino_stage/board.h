@@ -33,16 +33,16 @@ constexpr uint32_t MIN_ACCEL = 100, MAX_ACCEL = 1000000UL;  // steps/s^2
 constexpr int32_t MAX_BACKLASH = 20000;  // steps
 constexpr uint16_t MAX_POINTS = 9999;
 
-// An input counts when it has read the same in so many looks, one at each step, at rest one each millisecond: a glitch of
-// 100 us is seen at most four times at MAX_RATE, and a real switch closes for milliseconds.
+// Debouncing: an input changes after this many equal readings, one per step, at rest one per millisecond. A glitch of
+// 100 us is read at most four times at MAX_RATE; a real switch closes for milliseconds.
 constexpr uint8_t LOOKS = 5;
-// A byte that follows another one within this time is no sign of life: chatter is none, whatever it consists of.
+// An immediate byte counts as a heartbeat only after this much silence, so that continuous chatter never does.
 constexpr uint8_t QUIET_MS = 4;
 
-// Homing: towards the switch, back until it opens, then clear of it; there is the zero.
+// Homing: towards the switch, back until it opens, then PULL_OFF steps further, which is the zero.
 constexpr uint16_t HOME_RATE = 4000;   // steps/s
 constexpr uint16_t CREEP_RATE = 400;   // steps/s
-constexpr uint32_t HOME_ACCEL = 40000UL;  // steps/s^2, whatever SET ACCEL says: it overruns the switch by 1 mm
+constexpr uint32_t HOME_ACCEL = 40000UL;  // steps/s^2, independent of SET ACCEL: overruns the switch by 1 mm
 constexpr uint16_t PULL_OFF = 400;     // steps from the switch's opening to the zero
 constexpr int32_t MAX_RELEASE = 4000;  // steps within which a pressed switch must open
 

@@ -1,4 +1,4 @@
-// What motion and protocol ask of the machine they run on: hal_uno.cpp on the board, pc/machine.cpp on a PC.
+// Hardware interface of motion and protocol: hal_uno.cpp on the board, pc/machine.cpp on a PC.
 #pragma once
 #include <stdint.h>
 
@@ -9,20 +9,20 @@ constexpr uint8_t SWITCHES = SWITCH_X | SWITCH_Y;
 // State of the switches: bits of Input, set = pressed.
 uint8_t hal_inputs();
 
-// Call Motion::step() after so many ticks, and then after each Motion::interval() until that is 0.
+// Call Motion::step() after this many ticks, then again after each Motion::interval() until that is 0.
 void hal_start_steps(uint16_t ticks);
 
-// Set the direction pins; they hold still until the next call.
+// Set the direction pins.
 void hal_directions(bool x_positive, bool y_positive);
 
 void hal_enable(bool on);
 void hal_trigger_width(uint16_t us);
-// Room for so many bytes more; hal_write() of no more than that returns at once.
+// Free bytes of the send buffer; a hal_write() that fits returns at once.
 uint8_t hal_room();
 void hal_write(const char* text, uint8_t length);
 uint16_t hal_steps_per_mm();
 
-// Keeps the step and receive interrupts out while it lives.
+// Disables the step and receive interrupts during its lifetime.
 class InterruptLock {
  public:
   InterruptLock();

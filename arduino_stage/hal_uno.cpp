@@ -7,9 +7,9 @@
 
 #include "motion_step.h"
 
-// Serial of the Arduino core is not used: its receive interrupt knows no immediate bytes, and drops bytes silently.
+// The Arduino core's Serial is not used: its receive interrupt has no immediate bytes, and drops bytes silently.
 
-Motion motion;  // its address is known where the interrupt is compiled
+Motion motion;  // here, so that the interrupt is compiled with its address
 Stage stage(motion);
 
 namespace {
@@ -18,7 +18,7 @@ uint16_t trigger_ticks;
 uint16_t due;  // of the next step, in ticks of timer 1
 constexpr uint16_t PULSE_TICKS = board::TICK_HZ / 1000000 * board::STEP_PULSE_US;
 
-// Bytes between an interrupt and the main program; one side puts, the other takes.
+// Byte queue between an interrupt and the main program: one side puts, the other takes.
 class Ring {
  public:
   uint8_t room() const { return (uint8_t)(tail_ - head_ - 1) & (SIZE - 1); }
@@ -129,7 +129,7 @@ ISR(USART_UDRE_vect) {
 }
 
 // Measured worst case: 755 cycles from entry to reti (a ramp step of both axes; avr-gcc 5.4, emulated UNO), of the 800
-// between two steps at MAX_RATE. Where other interrupts come in between, later steps catch up.
+// between two steps at MAX_RATE. Steps that other interrupts delay are caught up.
 ISR(TIMER1_COMPA_vect) {
   const uint8_t out = motion.step(pressed());
   if (out & STEP_X) write<board::PIN_X_PUL>(true);
@@ -147,7 +147,7 @@ ISR(TIMER1_COMPA_vect) {
   const uint16_t risen = TCNT1;
   const uint16_t ticks = motion.interval();
   if (ticks) {
-    // From the step's own due time: lateness does not add up. A step that is already due comes at once.
+    // Relative to the step's due time, so that delays do not add up. A step that is overdue comes at once.
     const uint16_t since = TCNT1 - due;
     due += ticks;
     OCR1A = since < ticks - 3 ? due : TCNT1 + 3;
@@ -185,7 +185,7 @@ void hal_enable(bool on) { write<board::PIN_ENABLE>(!on); }
 
 void hal_trigger_width(uint16_t us) {
   InterruptLock lock;
-  trigger_ticks = us < 4 ? 8 : us * 2;  // a compare value nearer than this might pass before its flag is cleared
+  trigger_ticks = us < 4 ? 8 : us * 2;  // a shorter time might pass before the flag is cleared
 }
 
 uint8_t hal_room() { return to_send.room(); }

@@ -11,11 +11,11 @@ extern Stage stage;
 // Set up pins, timer 1 and the serial line.
 void uno_begin();
 
-// The main program lives: without this for 250 ms the watchdog resets the board, which stops the motors.
+// Feed the watchdog: without this call for 250 ms it resets the board, which stops the motors.
 void uno_alive();
 
-// The next received byte that is not an immediate one; false when there is none.
+// Take the next received byte that is not an immediate one; false if there is none.
 bool uno_read(uint8_t& byte);
 
-// True once after received bytes found no room.
+// True once after received bytes were lost because the buffer was full.
 bool uno_lost();

@@ -91,7 +91,7 @@ void Motion::resume() {
   if (!stepping_ && left_ != 0) resume_leg();
 }
 
-// From rest: the first interval is that of the slowest speed, or the exact one when no ramp is needed.
+// Start from rest: the first interval is that of the slowest speed, or the exact one if there is no ramp.
 void Motion::resume_leg() {
   InterruptLock lock;
   if (hold_) return;

@@ -1,9 +1,9 @@
 // The step engine: one straight leg at a time, trapezoidal speed, triggers at exact step counts. All integers.
 //
-// A leg of N steps (of the axis with more steps) is counted down step by step. `ramp_` counts the steps it would take
-// to stop from the present speed: speeding up adds one, slowing down takes one away, and slowing down begins when as
-// many steps are left. Speed in the ramp follows dv = a dt; at constant speed the interval between steps is exact:
-// the remainder of TICK_HZ / rate is carried on, so that step k comes floor(k TICK_HZ / rate) ticks after the ramp.
+// A leg of N steps (of the axis with more steps) is counted down. `ramp_` is the number of steps needed to stop from
+// the current speed: accelerating adds one, decelerating removes one, and decelerating begins when as many are left.
+// In the ramp dv = a dt; at constant speed the interval is exact: the remainder of TICK_HZ / rate is carried over, so
+// that step k comes floor(k TICK_HZ / rate) ticks after the ramp.
 #pragma once
 #include <stdint.h>
 
@@ -35,13 +35,13 @@ class Motion {
   // Plan a leg and start the step timer.
   void start(const Leg& leg);
 
-  // Look at the switches: what differs from before counts after board::LOOKS looks. step() does it by itself; the main
-  // program does it each millisecond while the stage rests.
+  // Read and debounce the switches (board::LOOKS). step() does this too; the main program does it each millisecond
+  // while the stage is at rest.
   void look_at_switches();
-  // The switches that count as pressed.
+  // The debounced switches: bits of Input.
   uint8_t inputs() const { return seen(stable_); }
 
-  // In the step interrupt: make the step that is due. Returns bits of Output: what to pulse now.
+  // In the step interrupt: make the step that is due. Returns the pins to pulse: bits of Output.
   uint8_t step(uint8_t inputs);
 
   // In the step interrupt, after step(): ticks until the next step; 0 = the stage is at rest.
@@ -50,7 +50,7 @@ class Motion {
   // Slow down to a stop within the leg and wait for resume(). Safe in an interrupt.
   void hold() { hold_ = true; }
   void resume();
-  // Give up the rest of the leg. Only at rest, or when position no longer matters.
+  // Drop the rest of the leg. Only at rest, or if the position no longer matters.
   void abandon();
 
   bool stepping() const { return seen(stepping_); }  // steps are due
@@ -74,14 +74,13 @@ class Motion {
   void resume_leg();
   void look(uint8_t inputs);
 
-  // The main program's look at what the step interrupt writes: read anew each time. More than a byte: under a lock.
+  // Read a variable that the step interrupt writes, from memory. More than a byte needs a lock.
   template <class T>
   static T seen(const T& value) {
     return *static_cast<const volatile T*>(&value);
   }
 
-  // The step interrupt's own while stepping_, the main program's otherwise. The first ones are the nearest to the
-  // object's address, which the AVR reaches fastest.
+  // Used by the step interrupt while stepping_, else by the main program. The AVR accesses the first ones fastest.
   uint8_t stable_, looks_;
   uint32_t left_;  // steps
   uint32_t ramp_;  // steps to a stop from the present speed

@@ -1,4 +1,4 @@
-// The part of Motion that runs in the step interrupt, inlined there: its time counts.
+// The part of Motion that runs in the step interrupt, inlined there for speed.
 #pragma once
 #include "motion.h"
 
@@ -9,7 +9,7 @@
 #define IN_INTERRUPT inline
 #endif
 
-// TICK_HZ / v in 16 turns instead of the 32 of the compiler's division, which takes longer than a step may.
+// TICK_HZ / v in 16 turns; the compiler's division needs 32, which takes longer than a step.
 // Exact for MIN_RATE <= v < 32768: the quotient has 16 bits, and the doubled remainder too.
 IN_INTERRUPT uint16_t ticks_of(uint16_t v) {
   static_assert(board::TICK_HZ >> 16 < board::MIN_RATE && board::MAX_RATE < 32768, "the quotient must fit 16 bits");

@@ -11,7 +11,7 @@ constexpr uint8_t MAX_LINE_BYTES = 96;  // with checksum and line end
 // CRC-16/XMODEM, one byte: polynomial 0x1021, start 0.
 uint16_t crc16_update(uint16_t crc, uint8_t byte);
 
-// A reply in the making.
+// Builder of a reply.
 class Line {
  public:
   Line() : length_(0) {}
@@ -34,11 +34,11 @@ class Protocol {
   void reset();
   void banner();
 
-  // One received byte that is not an immediate one. True when it ended a line.
+  // Process a received byte that is not an immediate one. True if it ended a line.
   bool receive(uint8_t byte);
-  // Whether the answer to a line would find room: only then is one taken, so that no reply keeps the program waiting.
+  // True if the send buffer has space for an answer. Lines are processed only then, so that no reply blocks.
   static bool ready() { return hal_room() >= MAX_LINE_BYTES; }
-  // Received bytes were lost before they came here: whatever they were, the host hears of it.
+  // Report received bytes that were lost.
   void lost() { send_error(ERROR_LINE_TOO_LONG); }
   void poll(uint32_t now_ms);
 
@@ -69,13 +69,13 @@ class Protocol {
   uint8_t length_;
   bool overlong_;
 
-  // The last answered line, so that its repetition gets the same answer and is not carried out again.
-  bool greeted_, fresh_;  // fresh_: nothing since HELLO, any number may follow
+  // The last answered line: its repetition gets the same answer and is not executed again.
+  bool greeted_, fresh_;  // fresh_: only HELLO so far, any number may follow
   uint16_t last_sequence_, last_crc_;
   StageError last_error_;
   uint16_t motion_sequence_;  // of the last motion command
   bool last_is_motion_;
   Outcome outcome_;
-  bool end_due_, alarm_due_;  // what has not found room yet: how the last motion ended, an alarm
+  bool end_due_, alarm_due_;  // waiting for space: the end of the last motion, an alarm
   StageError outcome_alarm_;
 };

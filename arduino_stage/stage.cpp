@@ -134,11 +134,11 @@ StageError Stage::row(int32_t x0, int32_t pitch, int32_t points, int32_t y, int3
   if ((uint32_t)trigger_us_ * (uint32_t)rate >= (spacing < 4000 ? spacing : 4000) * 1000000UL) {
     return ERROR_OUT_OF_RANGE;
   }
-  // One pitch at constant speed before the first and after the last point: there the ramp's shaking has died
-  // down, and the burst of the last point, which is sent in motion, sees the same speed as all others.
+  // One pitch at constant speed before the first and after the last point: the vibration of the ramp has decayed, and
+  // the burst of the last point is sent at the same speed as all others.
   const uint32_t ramp = motion_.ramp_steps((uint16_t)rate);
   if (ramp > (uint32_t)board::MAX_TRAVEL) return ERROR_NO_RUN_UP;
-  // The run-up also takes up the backlash of x; that of y is taken up by coming from below.
+  // The run-up also takes up the backlash of x; that of y is taken up by approaching from below.
   const uint32_t lead = ramp + (spacing > (uint32_t)backlash_ ? spacing : (uint32_t)backlash_);
   const int32_t run_up = pitch < 0 ? -(int32_t)lead : (int32_t)lead;
   if (!within(x0 - run_up, y) || !within(last + run_up, y) || y < backlash_) return ERROR_NO_RUN_UP;
@@ -231,7 +231,7 @@ Event Stage::raise(StageError alarm, bool position_lost) {
 Event Stage::service(uint32_t now_ms) {
   listen(now_ms);
   look_at_switches(now_ms);
-  // The step interrupt tells a fault before it stops: look in the opposite order, or a fault passes for a normal end.
+  // The step interrupt sets the fault before it stops: read in the opposite order, or a fault looks like a normal end.
   const bool stepping = motion_.stepping(), finished = motion_.finished();
   const StageError fault = motion_.fault();
   if (fault != ERROR_NONE) return raise(fault, true);
@@ -243,7 +243,7 @@ Event Stage::service(uint32_t now_ms) {
       stop_requested_ = false;
     }
     resume_requested_ = false;
-    motion_.abandon();  // a hold at rest holds nothing
+    motion_.abandon();  // a hold at rest has no effect
     return EVENT_NONE;
   }
 
@@ -257,7 +257,7 @@ Event Stage::service(uint32_t now_ms) {
   }
   if (motion_.holding() && activity_ == ROW) held_ = true;
   if (resume_requested_) {
-    InterruptLock lock;  // a HOLD byte comes before or after, not in between
+    InterruptLock lock;  // against a HOLD byte in between
     resume_requested_ = false;
     motion_.resume();
   }
@@ -283,7 +283,7 @@ Event Stage::next_leg() {
   }
 }
 
-// Per axis: seek the switch, creep back until it opens, pull off; the zero is there.
+// Per axis: seek the switch, creep back until it opens, pull off to the zero.
 Event Stage::next_homing_leg() {
   if (board::HAS_SWITCHES) {
     const uint8_t step = phase_ % 3;

@@ -1,4 +1,4 @@
-// What the stage does: homing, moves and rows as sequences of legs; hold, stop, heartbeat, alarms, soft limits.
+// The commands of the stage: homing, moves and rows as sequences of legs; hold, stop, heartbeat, alarms, soft limits.
 #pragma once
 #include <stdint.h>
 
@@ -31,7 +31,7 @@ class Stage {
   explicit Stage(Motion& motion) : motion_(motion) { reset(); }
   void reset();
 
-  // Commands. A motion command returns at once; service() tells when it has ended.
+  // Commands. A motion command returns at once; service() reports its end.
   StageError set(int32_t parameter, int32_t value);
   StageError enable(int32_t on);
   StageError home();
@@ -39,12 +39,12 @@ class Stage {
   StageError row(int32_t x0, int32_t pitch, int32_t points, int32_t y, int32_t rate);
   StageError clear();
 
-  // Every received byte. True when it was one of Immediate. Safe in the receive interrupt.
+  // Process any received byte; true if it was one of Immediate. Safe in the receive interrupt.
   bool immediate(uint8_t byte);
   bool take_status_request();
   void heard() { heard_ = true; }  // the host is alive
 
-  // Goes on to the next leg, watches heartbeat and switches. Call often.
+  // Start the next leg, check heartbeat and switches. Call often.
   Event service(uint32_t now_ms);
 
   const char* state() const;
@@ -54,7 +54,7 @@ class Stage {
   bool in_row() const { return row_command_; }  // the last motion command was a row
   StageError alarm() const { return alarm_; }
   bool homing() const { return homing_command_; }  // the last motion command was a homing
-  int32_t lost_x() const { return lost_x_; }  // steps lost since the homing before, found by this one
+  int32_t lost_x() const { return lost_x_; }  // steps lost since the previous homing
   int32_t lost_y() const { return lost_y_; }
   const Motion& motion() const { return motion_; }
 

@@ -42,11 +42,10 @@ OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)  # commands that only th
 
 
 class Request(NamedTuple):
-    """A command, the callback for its reply, and the semaphore that limits how many wait."""
+    """A command and the callback for its reply."""
 
     command: m.AnyCommand
     answer: Callable[[m.AnyReply], None]
-    room: threading.Semaphore | None = None
 
 
 def refused(number: int, what: str, why: str = "", remedy: str = "") -> m.Refused:
@@ -84,7 +83,7 @@ class Executor:
 
     # --- for other threads ------------------------------------------------------------------------------------------
 
-    def post(self, item: Request | StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
+    def post(self, item: StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
         """Append an item to the queue; return at once. Replies of the stage are dropped if too many wait."""
         if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
             return  # the end of a row or of homing is requested again
@@ -95,7 +94,12 @@ class Executor:
         room = self._replay_room if isinstance(command, m.Replay) else self._room
         if not room.acquire(blocking=False):
             return False
-        self._inbox.put(Request(command, answer, room))
+
+        def execute() -> None:
+            room.release()
+            self._execute(Request(command, answer))
+
+        self._inbox.put(execute)
         return True
 
     @property
@@ -171,10 +175,6 @@ class Executor:
         elif isinstance(item, LoopFault):
             machine.on_loop_fault(item)
             self._answer_pulses(refused(item.number, item.detail))
-        elif isinstance(item, Request):
-            if item.room is not None:
-                item.room.release()
-            self._execute(item._replace(room=None))
         elif isinstance(item, Reply):
             machine.on_stage(item)
         elif isinstance(item, StageLost):
@@ -330,7 +330,7 @@ class Executor:
         self._last_row = row
         begins, self._after_row = self._after_row, None
         if begins is not None:
-            self._handle(begins)
+            self._execute(begins)
         self._ended = self._ending
 
     def _end(self) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError
 from polysight.shared.tables import decode, read_toml
 
@@ -119,7 +120,12 @@ def read_faults(
     if path is not None:
         raw = read_toml(path)
         if set(raw) != {"faults"} or not isinstance(raw["faults"], dict):
-            raise ConfigError(f"{path}: has the keys {sorted(raw)}", "not a fault file", "write one table, [faults]")
+            raise ConfigError(
+                f"{path}: contains {sorted(raw)}",
+                "not a fault file",
+                "write one table, [faults]",
+                code=ErrorCode.FILE_FOREIGN,
+            )
         _merge(table, raw["faults"])
     for setting in settings:
         try:
@@ -140,6 +146,7 @@ def read_faults(
                     f"faults {idle} of {name}: the rig has radar.control = {control!r}",
                     f"they need {needed!r}",
                     "leave them out, or change radar.control (--native makes it native)",
+                    code=ErrorCode.VALUES_CONFLICT,
                 )
     return faults
 

@@ -1,4 +1,4 @@
-// The machine under the command of its standard input: time goes on only when told. For tests.
+// The machine in lockstep with its standard input, for tests: time advances only by command.
 #pragma once
 #include "machine.h"
 

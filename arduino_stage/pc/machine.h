@@ -1,4 +1,4 @@
-// The board, the motors and the switches on a PC: the sketch's own code, stepped in virtual time.
+// The board, the motors and the switches on a PC: the sketch's own code in virtual time.
 //
 // Time is counted in ticks of the step timer (500 ns), as on the board; wire time is its nanoseconds. Steps and edges
 // get their exact times however late this process is.

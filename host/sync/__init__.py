@@ -1,7 +1,10 @@
-"""Synchronisation of one row of one board: filter compensation, burst alignment, direct-path reference.
+"""Synchronisation of the rows of a board: from raw chirps to samples referenced to the direct path.
 
-`synchronise_row` does it for raw chirps with a board's `BoardSetup`; `RowSynchroniser` for every row of a source,
-published cubes included.
+`synchronise_row` processes a row of raw chirps with a board's `BoardSetup`: compensate the high-pass filter, align the
+chirps of each burst and average them (`align_row`), find the direct path and remove its frequency and phase
+(`reference`). The result is a `SyncedRow`, with the residual errors after each stage. `RowSynchroniser` does this for
+every row of a source, and converts cubes that another program has synchronised. The loops run compiled (C) if possible,
+otherwise in NumPy with equal results. `estimate_backlash` measures the backlash of the stage from the echoes.
 """
 
 from polysight.host.sync.align import AlignedRow, align_row, whole_blocks

@@ -1,13 +1,13 @@
-"""Burst alignment: the chirps of a position differ by a frequency and a phase each; find them, undo them, average.
+"""Burst alignment: estimate and remove the frequency and phase offset of each chirp in a burst, then average.
 
 A board samples SYNC_IN with its own clock, so each chirp is the same signal times `exp(j(2 pi df t + dphi))` (paper,
-eq. 4). Its conjugate product with a reference chirp, summed over the RX, is a pure tone under a positive envelope
-`|s(t)|^2`: its strongest frequency is the maximum-likelihood offset, whatever paths make up `s`. The paper divides by
-the reference chirp instead, which blows up wherever direct path and object cancel each other.
+eq. 4). The conjugate product with a reference chirp, summed over the RX, is a tone with the positive envelope
+`|s(t)|^2`; the maximum of its spectrum is the maximum-likelihood offset for any signal `s`. The paper divides by the
+reference chirp instead, which amplifies noise where direct path and object cancel.
 
-Once every chirp is mixed to zero by what the products say, its signal fills a few range bins, and four samples in a row
-are worth their mean: filter compensation and the second estimate, each chirp against the sum of all others, see a
-quarter of the samples. Only the average is taken at the full rate.
+After mixing each chirp to zero frequency, its signal fills only a few range bins, so four consecutive samples can be
+averaged. Filter compensation and a second estimate (each chirp against the sum of all others) use these averages. Only
+the final average of the chirps is computed at the full sample rate.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from polysight.host.sync import numpy_passes as passes
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.tone import Real, Tone, cis
 
-_REFERENCES = 4  # reference chirps to try before a position is given up
+_REFERENCES = 4  # reference chirps tried per position
 _GOOD = 0.5  # a good chirp has at least this part of the coherence of the position's median chirp
 
 
@@ -35,22 +35,22 @@ class AlignedRow(NamedTuple):
     mean
         complex64 [position, rx, sample], in the frame of each position's reference chirp.
     halves
-        complex64 [position, 2, rx, block]: what every other good chirp adds to `mean`, averaged over blocks of `FOLD`
-        linear samples.
+        complex64 [position, 2, rx, block]: contributions of alternate good chirps to `mean`, averaged over blocks of
+        `FOLD` linear samples.
     centre
-        float64 [position]: middle of the signal's band in the reference chirp, cycles a sample.
+        float64 [position]: middle of the signal's band in the reference chirp, cycles per sample.
     good
         bool [position, chirp]: chirps in the average.
     frequency, phase
-        float64 [position, chirp]: offset of each chirp from the average, cycles a sample, and radians at the centre
-        of the linear samples.
+        float64 [position, chirp]: offset of each chirp from the average, cycles per sample, and radians at the
+        centre of the linear samples.
     amplitude
-        float64 [position, chirp]: amplitude beside the average's, after compensation.
+        float64 [position, chirp]: amplitude relative to the average, after compensation.
     gain
-        float64 [position, chirp]: what compensation multiplied the chirp by, at its centre.
+        float64 [position, chirp]: gain of the filter compensation at the chirp's centre.
     error
-        float64 [2, position, chirp]: frequency (cycles a sample) and phase (rad) error of a chirp after alignment,
-        measured as half the disagreement between two halves of the RX; zero where not good.
+        float64 [2, position, chirp]: frequency (cycles per sample) and phase (rad) error of a chirp after alignment:
+        half the difference between two halves of the RX; zero where not good.
     coherence
         float64 [position, chirp]: normalised correlation with the average, 0..1.
     peak
@@ -77,20 +77,20 @@ def align_row(
     equaliser: hpf.Equaliser | None = None,
     full_scale: int = 32767,
 ) -> AlignedRow:
-    """Align and average the burst of every position: compiled (`burst.c`) where that is possible, else in NumPy.
+    """Align and average the burst of every position: compiled (`burst.c`) if possible, otherwise in NumPy.
 
     Parameters
     ----------
     words
         int16 [position, chirp, sample, 2, rx]: raw frames, I before Q.
     valid
-        bool [position, chirp]: chirps that were received whole.
+        bool [position, chirp]: chirps received whole.
     linear
-        Samples `[a, b)` in which the chirp is linear; only these are used to estimate, all are averaged.
+        Samples `[a, b)` in which the chirp is linear; estimates use only these, the average all samples.
     equaliser
-        Compensates the receiver's filter; None leaves it in.
+        Compensates the receiver's high-pass filter; None: no compensation.
     full_scale
-        A chirp with a sample at it was clipped, and is left out: its IF holds tones that are not there.
+        Value of a clipped sample; clipped chirps are left out, for clipping creates false tones.
     """
     loops = compiled.library() if words.shape[-1] == compiled.RX else None
     if loops is None:
@@ -105,7 +105,7 @@ def align_in_numpy(
     equaliser: hpf.Equaliser | None = None,
     full_scale: int = 32767,
 ) -> AlignedRow:
-    """The same in NumPy, for any number of RX: the readable form of `burst.c`, with equal results."""
+    """Align and average in NumPy, for any number of RX: the readable form of `burst.c`, with equal results."""
     words = np.ascontiguousarray(words)
     pieces = [
         _align(words[i : i + passes.CHUNK], valid[i : i + passes.CHUNK], linear, equaliser, full_scale)
@@ -124,7 +124,7 @@ def _align(
     equaliser: hpf.Equaliser | None,
     full_scale: int,
 ) -> AlignedRow:
-    """The same for a few positions."""
+    """Align and average a few positions."""
     linear = whole_blocks(linear)
     first, centre, coherence, usable, peak = _against_one(words, valid, linear, full_scale)
     good = _coherent(coherence, usable)
@@ -138,15 +138,15 @@ def _align(
     n = good.sum(axis=1)
     level = np.maximum(level / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     others = n[:, None] - good
-    # A chirp that has no other is the mean itself.
+    # A single chirp is the mean itself.
     amplitude = np.where(others > 0, np.abs(product) / np.maximum(others, 1) / level, 1.0)
-    # What a chirp differs by from the mean of the others, it differs by less from the mean of all.
+    # The difference from the mean of all chirps is smaller than that from the mean of the others.
     part = others / np.maximum(n, 1)[:, None]
     correction, shift = part * off, part * np.angle(product)
     coherence = amplitude * np.sqrt(level / np.maximum(own, 1e-30))
     good = _coherent(coherence, usable)
 
-    # What is filtered and then turned by the correction is what is turned and then filtered by turned taps.
+    # Filtering and then turning by the correction equals turning and then filtering with turned taps.
     lag = np.arange(taps.shape[-1]) - taps.shape[-1] // 2
     turned *= cis(2 * np.pi * FOLD * lag * correction[..., None] - shift[..., None])
     weights = turned * (good / np.maximum(good.sum(axis=1), 1)[:, None])[..., None]
@@ -168,7 +168,7 @@ def _align(
 
 
 def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
-    """The linear samples that fill blocks of `FOLD`; estimates count time from their middle."""
+    """Return the linear samples that fill whole blocks of `FOLD`; estimates count time from their middle."""
     a, b = linear
     return a, b - (b - a) % FOLD
 
@@ -176,13 +176,13 @@ def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
 def _against_one(
     words: NDArray[np.int16], valid: NDArray[np.bool_], linear: tuple[int, int], full_scale: int
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]:
-    """Offsets from one chirp of each position; another one is taken where the first matches few of the others.
+    """Estimate offsets relative to one chirp per position; try another one if it matches few of the others.
 
-    Returns them, the middle of the signal's band [position], and [position, chirp]: coherence with the chirp they are
-    from, usable chirps (received whole, not clipped, not silent), and the largest count.
+    Returns the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
+    chirp, usable chirps (received whole, not clipped, not silent), and the largest count.
     """
     positions, chirps = valid.shape
-    # Coherence of two records of noise: four times the rms of a sum of random phases.
+    # Threshold for two records of noise: four times the RMS of a sum of random phases.
     noise = 4.0 / np.sqrt(words.shape[-1] * (linear[1] - linear[0]))
     order = np.argsort(~valid, axis=1, kind="stable")  # the valid ones, first to last
     reference, todo = order[:, 0], np.arange(positions)
@@ -211,12 +211,12 @@ def _against_one(
 
 
 def _taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Filter taps of every chirp, [position, chirp, tap]; without an equaliser a single one."""
+    """Return the filter taps of every chirp, [position, chirp, tap]; one tap without an equaliser."""
     return np.ones((*frequency.shape, 1), complex) if equaliser is None else equaliser.taps(frequency)
 
 
 def _coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Chirps that match as well as the median one of their position does."""
+    """Return the usable chirps with at least `_GOOD` of the median coherence of their position."""
     rising = np.sort(np.where(usable, coherence, np.inf), axis=1)
     middle = np.maximum(usable.sum(axis=1) - 1, 0) // 2
     median = np.take_along_axis(rising, middle[:, None], axis=1)
@@ -228,6 +228,6 @@ def _c64(x: NDArray[np.complex128]) -> NDArray[np.complex64]:
 
 
 def _centred(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Values [..., position, chirp] less the mean over the good chirps of their position; zero where not good."""
+    """Subtract the mean over a position's good chirps from values [..., position, chirp]; zero where not good."""
     mean = (values * good).sum(axis=-1) / np.maximum(good.sum(axis=-1), 1)
     return (values - mean[..., None]) * good

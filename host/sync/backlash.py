@@ -1,8 +1,8 @@
-"""Stage backlash, from the data: how far odd rows lie from where the plan puts them beside the even ones.
+"""Estimate the backlash of the stage from the data: the shift of odd rows along x relative to even rows.
 
-A row's echo is that of its neighbours on either side, but for the row spacing. Rows that run the other way and lie `d`
-further along +x differ from them by `d` times the slope of the echo along x: least squares gives `d`, and leaving out
-groups of rows tells how well.
+Neighbouring rows have nearly the same echo. If odd rows, which run in the opposite direction, are shifted by `d` along
++x, they differ from their neighbours by `d` times the slope of the echo along x. Least squares gives `d`, the jackknife
+over groups of rows its standard deviation.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_po
 from polysight.shared.raster import mean_burst_travel_mm, plan_raster
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_GROUPS = 10  # of rows, for the standard deviation
+_GROUPS = 10  # groups of rows for the jackknife
 _STEPS = 3  # Gauss-Newton
-_ALIASED = 0.02  # part of the echo's power in the upper fifth of the spectrum that says it goes on beyond
+_ALIASED = 0.02  # largest share of power in the upper fifth of the spectrum; more means aliasing
 
 
 def object_filter(rig: Instrument, board: Board) -> NDArray[np.complex64]:
-    """Weights [sample] that pick the mirror point's range cell out of referenced samples, and leave the direct path."""
+    """Return weights [sample] that select the mirror point's range cell and suppress the direct path."""
     a, b = rig.chirp.linear_samples
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
     excess = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).mean()
@@ -37,33 +37,33 @@ def object_filter(rig: Instrument, board: Board) -> NDArray[np.complex64]:
 
 
 def echo_of_row(row: SyncedRow, weights: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """The echo of a row through :func:`object_filter`, complex64 [rx, position], positions as they were met."""
+    """Return the echo of a row through :func:`object_filter`, complex64 [rx, position], in order of recording."""
     return (row.samples @ weights) * row.valid
 
 
 @dataclass(frozen=True)
 class Backlash:
-    """Odd rows lie `shift_mm` further along +x than planned, beside the even ones; `std_mm` is its uncertainty."""
+    """Shift of odd rows along +x relative to even ones, and its standard deviation."""
 
     shift_mm: float
     std_mm: float
 
 
 def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -> Backlash | None:
-    """Backlash of a scan.
+    """Estimate the backlash of a scan.
 
     Parameters
     ----------
     rows
-        Echoes by row index, as :func:`echo_of_row` gives them. Rows without both neighbours are left out.
+        Echoes by row index, from :func:`echo_of_row`. Rows without both neighbours are left out.
     rig
-        The scan's rig file.
+        Rig of the scan.
 
     Returns
     -------
     Backlash | None
-        None when the rows do not tell: too few, steps too coarse for the echo's changes along x, or a standard
-        deviation above a quarter of the step.
+        None if undetermined: too few rows, steps too coarse for the echo along x, or a standard deviation above a
+        quarter of the step.
     """
     plan = plan_raster(rig.grid)
     inner = [r for r in sorted(rows) if r - 1 in rows and r + 1 in rows]
@@ -78,7 +78,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
         return _spectrum(rows[r][:, ::direction], k, direction * travel + (shift_mm if r % 2 else 0.0))
 
     def sums(shift_mm: float) -> NDArray[np.float64]:
-        """Slope times difference, slope squared, and power at all and at the highest k, of groups of rows."""
+        """Return sums over groups of rows: slope times difference, slope squared, power, power at the highest k."""
         out = np.zeros((_GROUPS, 4))
         recent = {r: spectrum(r, shift_mm) for r in (inner[0] - 1, inner[0])}
         for i, r in enumerate(inner):
@@ -97,7 +97,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     shift, without = 0.0, np.zeros(_GROUPS)
     for _ in range(_STEPS):
         s = sums(shift)
-        left = s.sum(axis=0) - s  # without one group: jackknife, Efron 1982
+        left = s.sum(axis=0) - s  # sums without one group: jackknife, Efron 1982
         if s[:, 1].sum() == 0 or left[:, 1].min() <= 0 or s[:, 3].sum() > _ALIASED * s[:, 2].sum():
             return None
         without = shift + left[:, 0] / left[:, 1]
@@ -107,8 +107,8 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
 
 
 def _spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], off_mm: float) -> NDArray[np.complex128]:
-    """A row along x from the smallest, [rx, 2 position], brought back by `off_mm` to the plan's positions.
+    """Return the spectrum of a row along x, [rx, 2 position], shifted back by `off_mm` to the planned positions.
 
-    It goes there and back, so that no jump between its ends rings through it. `k` is in radians a millimetre.
+    The row is continued by its mirror image to avoid a jump at its ends. `k` is in radians per millimetre.
     """
     return np.fft.fft(np.concatenate([row, row[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * off_mm)

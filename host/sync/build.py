@@ -1,7 +1,7 @@
 """Compile the loops of `burst.c` and `direct_path.c` into `kernels.so`: `python -m polysight.host.sync.build`.
 
-`setup.py` does it when the package is installed. It takes the system's C compiler, else the one of the package
-`ziglang`. Only the standard library is used here, since at installation there is nothing else.
+`setup.py` does this when the package is installed, with the system's C compiler or that of the package `ziglang`. This
+module uses only the standard library, for nothing else is available during installation.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 LIBRARY = "kernels.so"
 SOURCES = ("burst.c", "direct_path.c")
-"""Compiled once for each vector width."""
+"""Compiled once per vector width."""
 
 _FLAGS = "-std=c99 -O3 -fPIC -fopenmp-simd -ffp-contract=fast -fno-math-errno -fno-trapping-math -fno-signed-zeros"
-_FLAGS += " -fassociative-math"  # not -ffast-math, which would change how other libraries round
+_FLAGS += " -fassociative-math"  # not -ffast-math, which changes rounding in other libraries
 _WIDTHS = {
     128: "",
     256: "-mavx2 -mfma",
@@ -34,15 +34,15 @@ TARGETS = {
     "manylinux_2_17_x86_64": "x86_64-linux-gnu.2.17",
     "manylinux_2_17_aarch64": "aarch64-linux-gnu.2.17",
 }
-"""Platforms of wheels for other machines, and what `zig cc` calls them."""
+"""Platforms of wheels for other machines, with their names for `zig cc`."""
 
 
 class BuildError(Exception):
-    """There is no compiler, or it failed."""
+    """No compiler was found, or it failed."""
 
 
 def source_digest() -> str:
-    """Digest of what the library is made of, which it carries: tells a library of other sources."""
+    """Return the digest of the C sources; the library contains it, to detect a library of other sources."""
     digest = hashlib.sha256()
     for path in sorted([*HERE.glob("*.c"), *HERE.glob("*.h")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -50,7 +50,7 @@ def source_digest() -> str:
 
 
 def find_compiler(environment: Mapping[str, str] = os.environ) -> list[str] | None:
-    """The command of a C compiler: $CC, the system's, else ziglang's; None without any."""
+    """Return the command of a C compiler: $CC, the system's or ziglang's; None without any."""
     if environment.get("CC"):
         return shlex.split(environment["CC"])
     for name in ("cc", "gcc", "clang"):
@@ -61,16 +61,16 @@ def find_compiler(environment: Mapping[str, str] = os.environ) -> list[str] | No
 
 
 def build(folder: Path = HERE, target: str = "") -> Path:
-    """Compile into a folder; returns the library.
+    """Compile the library into a folder and return its path.
 
-    `target` is a key of `TARGETS`, for another machine; "": for this one.
+    `target` is a key of `TARGETS` for another machine; "": this machine.
 
     Raises
     ------
     BuildError
-        without a compiler, or when it fails.
+        if there is no compiler, or it fails.
     """
-    from concurrent.futures import ThreadPoolExecutor  # here: `compiled.py` needs this file, and no threads
+    from concurrent.futures import ThreadPoolExecutor  # `compiled.py` needs this module, but no threads
 
     compiler = _zig() if target else find_compiler()
     if compiler is None:
@@ -90,22 +90,11 @@ def build(folder: Path = HERE, target: str = "") -> Path:
             commands = [[*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{made}/{name}"] for words, name in jobs]
             list(workers.map(_run, commands))
         library = f"{made}/{LIBRARY}"
-        _run(
-            [
-                *compiler,
-                "-O3",
-                "-fno-sanitize=undefined",
-                "-s",
-                "-shared",
-                "-o",
-                library,
-                *(f"{made}/{name}" for _, name in jobs),
-                "-lm",
-            ]
-        )
+        objects = [f"{made}/{name}" for _, name in jobs]
+        _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
         shutil.copyfile(library, new)
-        new.replace(folder / LIBRARY)  # at once: a program that uses the old one keeps it
+        new.replace(folder / LIBRARY)  # atomic: programs that use the old library keep it
     return folder / LIBRARY
 
 
@@ -124,7 +113,7 @@ def _run(command: Sequence[str]) -> None:
 
 
 def main() -> int:
-    """Compile for this machine, beside this file."""
+    """Compile for this machine; the library lies beside this file."""
     try:
         sys.stdout.write(f"{build()}\n")
     except (BuildError, OSError) as e:

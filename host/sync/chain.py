@@ -1,4 +1,4 @@
-"""One board's row from raw chirps to samples referenced to the direct path."""
+"""Synchronise a row of a board: from raw chirps to samples referenced to the direct path."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from polysight.host.sync import high_pass_filter as hpf
 from polysight.host.sync.align import align_row
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.shared.config import Board, Chirp, Instrument
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
-_FULL_SCALE = 32767  # largest int16: a sample at it was clipped
+_FULL_SCALE = 32767  # largest int16: a sample with this value was clipped
 
 
 @dataclass(frozen=True)
 class BoardSetup:
-    """What synchronisation needs to know of a board. Build with :meth:`of`; one serves for a whole scan.
+    """Parameters of synchronisation for a board and a whole scan. Create with :meth:`of`.
 
-    `examined` positions of a row at most tell the residuals (`residuals.errors`).
+    `examined` is the largest number of positions per row used for residuals (`residuals.errors`).
     """
 
     chirp: Chirp
@@ -36,10 +37,10 @@ class BoardSetup:
     def of(
         cls, rig: Instrument, board: Board, compensate_filter: bool = True, model: hpf.HighPass | None = None
     ) -> BoardSetup:
-        """The setup of a board of a rig.
+        """Return the setup of a board of a rig.
 
-        `model` is the receiver's filter as `high_pass.fit_high_pass` found it; None takes the corners that the chirp
-        profile programs. `compensate_filter=False` leaves the filter in.
+        `model` is the measured high-pass filter (`fit_high_pass`); None: the corners in the chirp profile.
+        `compensate_filter=False` does not compensate the filter.
         """
         model = (model or hpf.high_pass(rig.chirp)) if compensate_filter else hpf.HighPass()
         equaliser = hpf.Equaliser.of(model, rig.chirp, FOLD) if model.corners_hz else None
@@ -48,7 +49,7 @@ class BoardSetup:
 
 @dataclass(frozen=True)
 class SyncedRow:
-    """A row of one board, every position referenced to its direct path.
+    """A row of a board with every position referenced to its direct path.
 
     Attributes
     ----------
@@ -61,14 +62,13 @@ class SyncedRow:
     direct_hz, direct_amplitude
         float64 [position]: IF and amplitude (ADC counts) of the direct path.
     freq_residual_hz, phase_residual_rad
-        float64 [position]: std of one chirp's error after alignment within its burst.
+        float64 [position]: standard deviation of one chirp's error after alignment within its burst.
     noise
-        float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), nan
-        where fewer than two were good; None: not known.
+        float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), NaN with fewer
+        than two good chirps; None: unknown.
     turn
-        float64 [position]: radians by which direct path and echoes together, weighed by power, turn from one position
-        to the next; burst alignment undoes it within a burst
-        (`imaging.reduce.undo_burst_motion`). None: nothing was aligned.
+        float64 [position]: phase change, radians, of the whole signal (direct path and echoes) from one position to
+        the next. Burst alignment removes it within a burst, see `imaging.reduce.undo_burst_motion`. None: not aligned.
     errors
         Error samples of the row after each stage (`residuals.errors`), {stage: float64 [3, n]}.
     """
@@ -86,27 +86,27 @@ class SyncedRow:
 
     @property
     def stages(self) -> dict[str, tuple[float, float, float]]:
-        """Frequency (Hz), phase (rad) and relative amplitude std after each stage."""
+        """Standard deviations of frequency (Hz), phase (rad) and relative amplitude after each stage."""
         return {name: residuals.spread(values) for name, values in self.errors.items() if values.size}
 
 
 def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
-    """Compensate, align, average and reference one row of one board (paper, section 5.2).
+    """Compensate, align, average and reference a row of a board (paper, section 5.2).
 
     Parameters
     ----------
     frames
-        int16 [frame, sample, 2, rx] as `decode.row_words` gives them (fastest), or complex64 [rx, frame, sample] in ADC
-        counts; positions in the order they were met, `setup.pulses` frames each.
+        int16 [frame, sample, 2, rx] from `row_words` (fastest), or complex64 [rx, frame, sample] in ADC counts;
+        positions in order of recording, `setup.pulses` frames each.
     valid
-        bool [frame]: frames that were received whole.
+        bool [frame]: frames received whole.
     setup
-        The board's.
+        Setup of the board.
 
     Raises
     ------
     DataError
-        when the frames are not whole bursts of the configured chirp.
+        if the frames are not whole bursts of the configured chirp.
     """
     words = raw_words(frames) if np.iscomplexobj(frames) else frames
     count, samples, _, rx = words.shape
@@ -115,8 +115,9 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
         raise DataError(
             f"{count} frames of {rx} RX x {samples} samples are not bursts of {setup.pulses} frames"
             f" of {expected[0]} RX x {expected[1]} samples",
-            "the data and the rig file do not belong together",
+            "the data were recorded with another rig file",
             "use the rig file of this scan",
+            code=ErrorCode.MISMATCH,
         )
     shape = (count // setup.pulses, setup.pulses)
     aligned = align_row(
@@ -144,7 +145,7 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
 
 
 def turn_along(done: direct_path.Referenced) -> NDArray[np.float64]:
-    """See `SyncedRow.turn`: by the two neighbours of each position, or the one that is valid; else 0."""
+    """Return `SyncedRow.turn`, from the valid neighbours of each position; 0 without any."""
     signal = done.halves.sum(axis=1) * done.found[:, None, None]
     flat = signal.reshape(len(signal), -1)
     step = np.einsum("pi,pi->p", flat[:-1].conj(), flat[1:])  # from each to the next

@@ -1,7 +1,6 @@
-"""The loops of `burst.c` and `direct_path.c`, called through ctypes: fast, and other threads run meanwhile.
+"""Call the compiled loops of `burst.c` and `direct_path.c` through ctypes, which releases the interpreter.
 
-:func:`library` gives them, or None where they were not compiled; then the NumPy form of the same runs, more slowly, and
-a warning says so once.
+:func:`library` returns them, or None and one warning if they were not compiled; then the slower NumPy form is used.
 """
 
 from __future__ import annotations
@@ -15,19 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.host.sync import build
 from polysight.host.sync.high_pass_filter import Equaliser
 from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.tone import search_size
 
 RX = 4
-"""Receiving antennas of a board that the loops are made for."""
+"""Number of RX that the loops support."""
 
 _log = logging.getLogger(__name__)
 
 
 class LoadError(Exception):
-    """The library is not there, or it is not of these sources."""
+    """The library is missing, or was compiled from other sources."""
 
 
 class Library:
@@ -36,17 +34,20 @@ class Library:
     Parameters
     ----------
     path
-        The library.
+        File of the library; None: beside the sources.
     bits
-        Width of vectors, 128, 256 or 512; None: the widest that the processor has.
+        Width of vectors, 128, 256 or 512; None: the widest of the processor.
 
     Raises
     ------
     LoadError
-        when it cannot be loaded, or was made of other sources.
+        if it cannot be loaded, or was compiled from other sources.
     """
 
-    def __init__(self, path: Path = build.HERE / build.LIBRARY, bits: int | None = None) -> None:
+    def __init__(self, path: Path | None = None, bits: int | None = None) -> None:
+        from polysight.host.sync import build  # not at import, so that `python -m polysight.host.sync.build` is clean
+
+        path = path or build.HERE / build.LIBRARY
         try:
             loaded = ctypes.CDLL(str(path))
         except OSError as e:
@@ -65,7 +66,7 @@ class Library:
         equaliser: Equaliser | None,
         full_scale: int,
     ) -> tuple[Any, ...]:
-        """The fields of `align.AlignedRow`; parameters as of `align.align_row`, `linear` in whole blocks."""
+        """Return the fields of `align.AlignedRow`; parameters as in `align.align_row`, `linear` in whole blocks."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
         filters = [0.0, 0.0, 0.0]
@@ -136,7 +137,7 @@ class Library:
         return out, halves_out
 
     def _call(self, name: str, *arguments: NDArray[Any] | float) -> None:
-        """Arrays are handed over as pointers, and int as int. Raises MemoryError."""
+        """Call a loop with arrays as pointers and numbers as int. Raises MemoryError."""
         arrays = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) else x for x in arguments]
         given = [ctypes.c_void_p(x.ctypes.data) if isinstance(x, np.ndarray) else ctypes.c_int(int(x)) for x in arrays]
         if getattr(self._loaded, f"{name}_{self.bits}")(*given):
@@ -145,7 +146,7 @@ class Library:
 
 @lru_cache(maxsize=1)
 def library() -> Library | None:
-    """The compiled loops; None, and a warning, where they cannot be used."""
+    """Return the compiled loops; None, and a warning, if they cannot be used."""
     try:
         return Library()
     except LoadError as e:

@@ -1,23 +1,22 @@
-"""The direct path from TX to RX: found in every position's average, and made its zero of frequency and phase.
+"""Direct path from TX to RX: find it in the average of every position and remove its frequency and phase.
 
-The object's echo has the same strength and lies only 3.5 IF bins above the direct path, so whatever measures the
-direct path must not hear it. Both are known from the geometry: the direct path comes from the TX along the RX array
-with delays that never change, and the object can only be where the object plane is. With the object as coloured noise
-of covariance R, the best linear unbiased estimate of a direct path `A exp(j w t)` near `w = 0`, of model `x = A g + A
-w (jt g)`, is
+The object's echo is as strong as the direct path and lies only 3.5 IF bins above it, so the estimate of the direct path
+must suppress the object. Both are known from the geometry: the direct path has fixed delays along the RX array, and the
+object lies on the object plane. With the object as coloured noise of covariance R, the best linear unbiased estimate of
+a direct path `A exp(j w t)` near `w = 0`, with the model `x = A g + A w (jt g)`, is
 
     [A, A w] = (G^H R^-1 G)^-1 G^H R^-1 x,   G = [g, j t g]
 
-(generalised least squares; Kay 1993, section 6.4), a fixed 2 x (4 RX x samples) matrix: a beamformer in space and
-frequency at once, with its nulls where the object is. Gauss-Newton steps `w += Re(A w / A)` converge. The estimate
-sees the average as burst alignment left it: mixed to zero, every four samples averaged.
+(generalised least squares; Kay 1993, section 6.4). This is a fixed 2 x (4 RX x samples) matrix: a beamformer in space
+and frequency with nulls at the object. Gauss-Newton steps `w += Re(A w / A)` converge. Its input is the average after
+burst alignment: mixed to zero frequency, with four consecutive samples averaged.
 
-The boards' crystals differ by parts per million, so their slopes do too, and all IF drift by some kilohertz within a
-chirp, equally for every path and position. With a third column `jt^2/2 g` the same estimate gives that drift; its
-median over the row is taken out first.
+The crystals of the boards differ by some ppm, and with them the chirp slopes, so the IF drifts by some kilohertz within
+a chirp, equally for all paths and positions. A third column `jt^2/2 g` estimates this drift; its median over the row is
+removed first.
 
-A scan's direct path never changes, so neither does its amplitude. Where a position's is out of line with its row's,
-the other of the two strongest peaks is tried; nothing is smoothed.
+The amplitude of the direct path is constant during a scan. If a position's amplitude is an outlier in its row, the
+second of the two strongest peaks is tried. Nothing is smoothed.
 """
 
 from __future__ import annotations
@@ -36,30 +35,30 @@ from polysight.shared.config import Board, Chirp, Instrument
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_FFT = 256  # of averaged samples
-_SPREAD_M = 0.1  # where echoes come from, relative to the mirror point: std of a normal distribution in x and y
-_GAIN_SPREAD = 0.3  # relative gain and phase differences of the RX that the nulls must bear with
-_NOISE = 1e-2  # noise power of one sample beside an echo as strong as the direct path
+_FFT = 256  # size of the search FFT, over averaged samples
+_SPREAD_M = 0.1  # standard deviation in x and y of the echoes' origin, around the mirror point
+_GAIN_SPREAD = 0.3  # relative gain and phase differences of the RX that the nulls tolerate
+_NOISE = 1e-2  # noise power of a sample relative to an echo as strong as the direct path
 _COMPARABLE = 0.35  # a second peak this strong, one object distance below the first, is the direct path
-_LOST = 0.3  # a direct path under this part of the row's median is not the direct path
-_OUTLIER = 5.0  # standard deviations at which an amplitude is out of line with its row's
+_LOST = 0.3  # smallest amplitude of a direct path, relative to the row's median
+_OUTLIER = 5.0  # standard deviations from the row's amplitude
 _C64, _F64 = NDArray[np.complex64], NDArray[np.float64]
-_PRESENT = 30.0  # nor is one under this power beside its estimate's noise: the best of 100,000 noises has 12
+_PRESENT = 30.0  # smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions
 
 
 class Loops(Protocol):
-    """What `numpy_direct_path` and `compiled.Library` both have; documented in the first."""
+    """Interface of `numpy_direct_path` and `compiled.Library`; documented in the former."""
 
     def search(
         self, halves: _C64, weights: _C64, size: int, object_bins: tuple[int, int], comparable: float
     ) -> tuple[NDArray[np.int32], _F64]:
-        """Bins of the direct path and of the other that it might be."""
+        """Find the bins of the direct path and of the second candidate."""
         ...
 
     def refine(
         self, halves: _C64, steering: _C64, estimator: _C64, frequency: _F64
     ) -> tuple[_F64, NDArray[np.complex128], _F64]:
-        """Frequency, estimate, and last step."""
+        """Refine frequencies; return frequency, estimate and last step."""
         ...
 
     def turn(
@@ -73,27 +72,27 @@ class Loops(Protocol):
         phase: _F64,
         found: NDArray[np.bool_],
     ) -> tuple[_C64, _C64]:
-        """Samples and halves with the direct path as zero."""
+        """Remove the direct path's frequency and phase from samples and halves."""
         ...
 
 
 class DirectPath(NamedTuple):
-    """What is known of a board's direct path before any data is seen: fixed for a scan, so that the phase zero is.
+    """Steering and estimators for a board's direct path, from geometry alone; fixed for a scan.
 
     Attributes
     ----------
     steering
         complex64 [rx, sample]: `exp(-j 2 pi f(t) (tau_r - tau_0))`, after which all RX share the direct path's tone.
     folded_steering
-        complex64 [rx, block]: the same at the middle of each block of `FOLD` linear samples.
+        complex64 [rx, block]: steering at the middle of each block of `FOLD` linear samples.
     estimator
-        complex128 [2, rx * block]: rows give A and A w (w in radians a sample) of the steered, demodulated samples.
+        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered, demodulated samples.
     drift_estimator
-        complex128 [3, rx * block]: A, A w and A q, q the drift in radians a sample squared.
+        complex128 [3, rx * block]: A, A w and A q, q the drift in radians per sample squared.
     half_estimators
         complex128 [2, 2, rx / 2 * block]: A and A w from every other RX alone.
     beam
-        complex64 [rx]: weights of the steered RX for the search, sum 1, weak where the object is.
+        complex64 [rx]: weights of the steered RX for the search, sum 1, with low gain towards the object.
     object_bins
         IF distance of the nearest and farthest echo from the direct path, in bins of the search FFT.
     """
@@ -116,15 +115,15 @@ class Referenced(NamedTuple):
         complex64 [rx, position, sample]: an echo of excess path d is `exp(j 2 pi f(t) d / c)`, the direct path a
         constant.
     frequency
-        float64 [position]: direct path's IF in cycles a sample, 0..1 (complex 1x) or -1/2..1/2.
+        float64 [position]: IF of the direct path in cycles per sample, 0..1 (complex 1x) or -1/2..1/2.
     amplitude
         complex128 [position]: its amplitude, phase at the centre of the linear samples.
     found
-        bool [position]: False where no credible direct path was found.
+        bool [position]: False without a credible direct path.
     drift
-        IF drift common to the row, radians a sample squared.
+        IF drift of the row, radians per sample squared.
     halves
-        complex64 [position, 2, rx, block]: the two halves of the burst, steered and turned as `samples` are.
+        complex64 [position, 2, rx, block]: the two halves of the burst, referenced like `samples`.
     """
 
     samples: NDArray[np.complex64]
@@ -138,13 +137,13 @@ class Referenced(NamedTuple):
 def excess_path_m(
     tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], points_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """`|v - tx| + |v - rx| - |tx - rx|`, metres, [rx, point], for rx [rx, 3] and points [point, 3]."""
+    """Return `|v - tx| + |v - rx| - |tx - rx|`, metres, [rx, point], for rx [rx, 3] and points [point, 3]."""
     out = np.linalg.norm(points_m - tx_m, axis=-1) + np.linalg.norm(points_m[None] - rx_m[:, None], axis=-1)
     return out - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
 
 
 def prepare(rig: Instrument, board: Board) -> DirectPath:
-    """Steering, search beam and estimator of a board, from the geometry alone."""
+    """Return steering, search beam and estimators of a board, from geometry alone."""
     chirp, (a, b) = rig.chirp, whole_blocks(rig.chirp.linear_samples)
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
@@ -152,7 +151,7 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     direct = np.linalg.norm(rx - tx, axis=-1)
     lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
 
-    # Echoes as the steered, demodulated samples see them: a tone at the excess path, with the object's own RX phases.
+    # Echoes in the steered, demodulated samples: a tone at the excess path, with the object's phases at the RX.
     grid = np.linspace(-3, 3, 25) * _SPREAD_M
     dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
     weight = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
@@ -185,18 +184,18 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
 
 
 def _least_squares(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """`(G^H R^-1 G)^-1 G^H R^-1` of a model G [sample, parameter] and a covariance R."""
+    """Return `(G^H R^-1 G)^-1 G^H R^-1` for a model G [sample, parameter] and a covariance R."""
     whitened = np.asarray(scipy.linalg.solve(covariance, model, assume_a="pos"), np.complex128)
     return np.linalg.solve(model.conj().T @ whitened, whitened.conj().T).astype(np.complex128)
 
 
 def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> Referenced:
-    """Find the direct path of every position and take its frequency and phase out of all RX.
+    """Find the direct path of every position and remove its frequency and phase from all RX.
 
     Parameters
     ----------
     aligned
-        A row's averages, compensated. Positions without a good chirp are not found.
+        Aligned averages of a row. Positions without a good chirp are not found.
     path
         From :func:`prepare`.
     chirp
@@ -213,7 +212,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     beam = _c64(path.beam[:, None] * path.folded_steering * window)
     bins, median = loops.search(aligned.halves, beam, _FFT, (nearest, farthest), _COMPARABLE)
     peaks = ((bins + _FFT // 2) % _FFT - _FFT // 2) / _FFT / FOLD
-    floor = median**2 / np.log(2) / (window**2).sum()  # the median bin's: tones fill few bins
+    floor = median**2 / np.log(2) / (window**2).sum()  # from the median bin, for tones fill few bins
     three, two = _c64(path.drift_estimator), _c64(path.estimator)
     frequency, estimate, _ = loops.refine(aligned.halves, path.folded_steering, three, peaks[0])
     drifts = _ratio(estimate[:, 2], estimate[:, 0])[usable]
@@ -222,15 +221,16 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     frequency, estimate, step = loops.refine(aligned.halves, flat, two, frequency)
     _try_others(aligned.halves, peaks, usable, (loops, flat, two), frequency, estimate, step)
 
-    # An IF outside the receiver's band was aliased or filtered away; a step that does not shrink has found no tone.
-    amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging shrank the tone
+    # An IF outside the receiver's band is an alias; if the last step is large, no tone was found.
+    amplitude = estimate[:, 0] * np.sinc(frequency) / np.sinc(frequency * FOLD)  # averaging attenuated the tone
     heard = aligned.centre + frequency
     heard = heard % 1.0 if chirp.if_mode == "complex1x" else (heard + 0.5) % 1.0 - 0.5
     band = heard < 0.9 if chirp.if_mode == "complex1x" else np.abs(heard) < 0.45
     strength = np.abs(amplitude)
     chirps = np.maximum(aligned.good.sum(axis=1), 1)
-    floor = np.median((floor * chirps)[usable]) / chirps if usable.any() else floor  # a chirp's noise is the row's
-    noise = floor / (np.abs(path.beam) ** 2).sum()  # of an averaged sample of one RX
+    # All chirps of a row have the same noise.
+    floor = np.median((floor * chirps)[usable]) / chirps if usable.any() else floor
+    noise = floor / (np.abs(path.beam) ** 2).sum()  # noise power of an averaged sample of one RX
     present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
     found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
     if found.any():
@@ -251,11 +251,10 @@ def _try_others(
     how: tuple[Loops, NDArray[np.complex64], NDArray[np.complex64]],
     *found: NDArray[np.generic],
 ) -> None:
-    """Where the amplitude is out of line with the row's, take the other peak if it is in line; changes `found`.
+    """Where the amplitude is an outlier in its row, use the second peak if it is not; changes `found` in place.
 
-    `how` are the loops, the steering and the estimator; `found` is frequency, estimate and last step, as `refine` gives
-    them. Out of line is beyond `_OUTLIER`
-    standard deviations, from the row's own median deviation.
+    `how` are the loops, the steering and the estimator; `found` are frequency, estimate and last step from `refine`.
+    An outlier is beyond `_OUTLIER` standard deviations, estimated from the median absolute deviation of the row.
     """
     level = np.log(np.maximum(np.abs(found[1][:, 0]), 1e-30))
     if not usable.any():
@@ -267,8 +266,8 @@ def _try_others(
         return
     loops, steering, estimator = how
     other = loops.refine(halves[odd], steering, estimator, peaks[1, odd])
-    theirs = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
-    better = np.abs(theirs - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
+    other_level = np.log(np.maximum(np.abs(other[1][:, 0]), 1e-30))
+    better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
     for whole, part in zip(found, other, strict=True):
         whole[odd[better]] = part[better]
 

@@ -1,8 +1,8 @@
-"""The receiver's high-pass filter, and its compensation.
+"""Model, compensation and fit of the receiver's high-pass filter.
 
-The AWR2243 filters the IF twice, with corners chosen in the profile (175/235/350/700 kHz and 350/700/1400/2800 kHz).
-The direct path and the object sit at different IF, and both move with every chirp's timing: amplitude and phase of
-the filter must go before anything else is estimated (paper, section 5.2).
+The AWR2243 has two high-pass sections in the IF, with corners selected in the profile (175/235/350/700 kHz and
+350/700/1400/2800 kHz). Direct path and object have different IF, which change with the timing of every chirp, so the
+filter is compensated before anything else is estimated (paper, section 5.2).
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.shared.config import Chirp
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 SMALLEST_GAIN = 0.25
-"""A gain below this is not undone further."""
+"""Smallest filter gain that is fully compensated."""
 
 REACH_BINS = 3.0
-"""Direct path and object lie within so many IF bins of their middle."""
+"""Distance of direct path and object from their middle, in IF bins."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +30,13 @@ class HighPass:
     """A linear constant-coefficient filter: a product of first-order high-pass sections.
 
     `H(f) = prod_i (jf / f_i) / (1 + jf / f_i)`, the response of `y' + 2 pi f_i y = x'` for each corner `f_i`.
-    No corners: the identity.
+    Without corners: the identity.
     """
 
     corners_hz: tuple[float, ...] = ()
 
     def response(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Complex response at IF frequencies (Hz, any shape)."""
+        """Return the complex response at IF frequencies (Hz, any shape)."""
         h = np.ones(np.shape(frequency_hz), complex)
         for corner in self.corners_hz:
             x = 1j * np.asarray(frequency_hz) / corner
@@ -43,7 +44,7 @@ class HighPass:
         return h
 
     def inverse(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """`conj(H) / max(|H|^2, 1/16)`: exactly 1/H where signal can be used, never more than fourfold noise."""
+        """Return `conj(H) / max(|H|^2, 1/16)`: 1/H where the gain allows it, and at most fourfold noise."""
         f = np.where(np.abs(frequency_hz) < 1.0, 1.0, frequency_hz)
         inverse: NDArray[np.complex128] = np.ones(np.shape(f), complex)
         for corner in self.corners_hz:
@@ -53,22 +54,22 @@ class HighPass:
 
 @dataclass(frozen=True)
 class Equaliser:
-    """Undoes the filter on the narrow band that a chirp's signal fills, with three taps.
+    """Compensates the filter in the narrow band of a chirp's signal, with three taps.
 
-    Mixed down by its centre f, a chirp's signal lies within some tens of kHz of zero. Taps t at -spacing, 0 and
-    +spacing samples have the response `t_0 exp(-jw) + t_1 + t_2 exp(jw)`; they are chosen to equal the inverse at f and
-    `reach` on either side, and repeat beyond, so that noise far away is not raised by the slope of 1/H.
+    After mixing down by its centre f, the signal of a chirp lies within some tens of kHz of zero. Taps t at -spacing, 0
+    and +spacing samples have the response `t_0 exp(-jw) + t_1 + t_2 exp(jw)`, which equals the inverse filter at f and
+    at `reach` on either side. It is periodic beyond, so that noise far away is not amplified by the slope of 1/H.
 
     Attributes
     ----------
     model
         The filter.
     sample_rate_hz, signed
-        Sampling, and whether IF is -1/2..1/2 of it (complex 2x) or 0..1 (complex 1x).
+        Sample rate; IF of -1/2..1/2 of it (complex 2x, signed) or 0..1 (complex 1x).
     spacing
         Samples between taps.
     reach
-        Cycles a sample.
+        Cycles per sample.
     """
 
     model: HighPass
@@ -79,12 +80,12 @@ class Equaliser:
 
     @classmethod
     def of(cls, model: HighPass, chirp: Chirp, spacing: int) -> Equaliser:
-        """For a chirp profile: exact at its signal's centre and `REACH_BINS` bins of its linear samples away."""
+        """Return the equaliser of a chirp: exact at the signal's centre and `REACH_BINS` IF bins away."""
         a, b = chirp.linear_samples
         return cls(model, chirp.sample_rate_hz, chirp.if_mode == "complex2x", spacing, REACH_BINS / (b - a))
 
     def taps(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Taps [..., 3] of signals centred at frequencies [...] in cycles a sample."""
+        """Return the taps [..., 3] for signals centred at frequencies [...] in cycles per sample."""
         f = frequency[..., None] + self.reach * np.array([-1.0, 0.0, 1.0])
         f = ((f + 0.5) % 1.0 - 0.5 if self.signed else f % 1.0) * self.sample_rate_hz
         low, middle, high = np.moveaxis(self.model.inverse(f), -1, 0)
@@ -95,9 +96,9 @@ class Equaliser:
 
 
 def shifted(terms: NDArray[np.complexfloating], spacing: int) -> NDArray[np.complexfloating]:
-    """`terms` [position, tap, rx, sample], each shifted by its tap; a single tap is none.
+    """Shift each of the terms [position, tap, rx, sample] by its tap; a single tap is not shifted.
 
-    Beyond its ends a term is continued by the parabola through three of its samples.
+    Beyond its ends a term is extrapolated by the parabola through three of its samples.
     """
     if terms.shape[1] == 1:
         return terms
@@ -111,13 +112,13 @@ def shifted(terms: NDArray[np.complexfloating], spacing: int) -> NDArray[np.comp
 
 
 def filtered(signal: NDArray[np.complex64], taps: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Signal [position, chirp, rx, sample] through its chirps' taps [position, chirp, tap], a sample apart."""
+    """Filter a signal [position, chirp, rx, sample] with taps [position, chirp, tap], one sample apart."""
     terms = signal[:, :, None] * taps[..., None, None]
     return shifted(terms.reshape(-1, *terms.shape[2:]), 1).sum(axis=1).reshape(signal.shape)
 
 
 def high_pass(chirp: Chirp) -> HighPass:
-    """The filter that a chirp profile programs; a corner of 0 is no section (simulated rigs only)."""
+    """Return the filter in a chirp profile; a corner of 0 means no section (simulated rigs only)."""
     return HighPass(tuple(khz * 1e3 for khz in (chirp.hpf1_khz, chirp.hpf2_khz) if khz))
 
 
@@ -127,30 +128,31 @@ def fit_high_pass(
     phase_rad: NDArray[np.float64] | None = None,
     sections: int = 2,
 ) -> HighPass:
-    """The filter behind a sweep: one reflector, measured while the receiver's start frequency moves its IF.
+    """Fit the filter to a sweep: one reflector, measured at several IF by changing the start frequency.
 
-    Least squares of log amplitude, and of phase where it is known, over the corners and a common gain (paper, Fig. 9).
+    Least squares of log amplitude, and of phase if known, over the corners and a common gain (paper, Fig. 9).
 
     Parameters
     ----------
     if_hz, amplitude
         float64 [point]: IF and linear amplitude, in any unit.
     phase_rad
-        float64 [point], up to a constant; None where each measurement had its own phase.
+        float64 [point], up to a constant; None if the phases of the measurements are unrelated.
     sections
         First-order sections to fit.
 
     Raises
     ------
     DataError
-        when there are too few points, or none near enough to a corner to tell it.
+        if there are too few points, or no points near a corner.
     """
     if_hz, amplitude = np.asarray(if_hz, np.float64), np.asarray(amplitude, np.float64)
     if if_hz.size < 2 * (sections + 2) or np.any(amplitude <= 0) or np.any(if_hz <= 0):
         raise DataError(
-            f"{if_hz.size} points do not tell {sections} corners",
+            f"{if_hz.size} points do not determine {sections} corners",
             "a sweep needs IF and amplitude above zero, at twice as many points as unknowns",
             "measure the same reflector at more start frequencies",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     measured = np.log(amplitude)
     turns = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
@@ -171,8 +173,9 @@ def fit_high_pass(
     if corners[0] < 1.1 * np.exp(limits[0]) or corners[-1] > 0.9 * np.exp(limits[1]):
         raise DataError(
             f"no filter fits the sweep: corners of {', '.join(f'{c / 1e3:.0f}' for c in corners)} kHz",
-            "the IF range does not reach down to the filter's corners, or the reflector moved",
+            "the IF range does not include the filter's corners, or the reflector moved",
             "measure at mean IFs from about 250 kHz, which trigger jitter of 200 kHz spreads to half the lower corner,"
             " to several times the upper corner (docs/how-to/calibration.md)",
+            code=ErrorCode.MISMATCH,
         )
     return HighPass(tuple(float(c) for c in corners))

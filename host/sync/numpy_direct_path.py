@@ -1,7 +1,7 @@
-"""The loops that find the direct path, in NumPy: the readable form of `direct_path.c`, with equal results.
+"""Loops over positions that find the direct path, in NumPy: the readable form of `direct_path.c`, with equal results.
 
-Halves are complex64 [position, 2, rx, block], as burst alignment leaves them (`align.AlignedRow`); frequencies are in
-cycles a sample. What is estimated, and why so, is in `direct_path.py`.
+Halves are complex64 [position, 2, rx, block] from burst alignment (`align.AlignedRow`); frequencies are in cycles per
+sample. The method is described in `direct_path.py`.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ _Real, _Complex = NDArray[np.float64], NDArray[np.complex64]
 def search(
     halves: _Complex, weights: _Complex, size: int, object_bins: tuple[int, int], comparable: float
 ) -> tuple[NDArray[np.int32], _Real]:
-    """Find the peak that is the direct path, and the other that might be it.
+    """Find the peak of the direct path and a second candidate.
 
-    The object's echo is later, so higher in IF by a distance the geometry tells. When the strongest peak has a
-    comparable one that far below it, the strongest is the object.
+    The object's echo has a higher IF, by a distance known from the geometry. If there is a comparable peak at that
+    distance below the strongest one, the strongest is the object.
 
     Parameters
     ----------
     halves
-        Their sum is searched.
+        Both halves are added.
     weights
         complex64 [rx, block]: beam, steering and window.
     size
-        Points of the transform.
+        Size of the FFT.
     object_bins
         Smallest and largest distance of the object, in bins.
     comparable
-        Amplitude beside the strongest, from which a lower peak is the direct path.
+        Smallest amplitude of the lower peak relative to the strongest to be the direct path.
 
     Returns
     -------
     bins
-        int32 [2, position]: of the direct path, and of the other.
+        int32 [2, position]: direct path, and second candidate.
     median
         float64 [position]: median magnitude of the spectrum.
     """
     beamed = np.einsum("rn,prn->pn", weights, halves[:, 0] + halves[:, 1])
     spectrum = np.abs(np.asarray(scipy.fft.fft(beamed, size, axis=-1)))
-    middle = np.sort(spectrum, axis=-1)[:, size // 2 - 1 : size // 2 + 1]  # its mean is the median, ten times as fast
+    middle = np.sort(spectrum, axis=-1)[:, size // 2 - 1 : size // 2 + 1]  # their mean is the median, ten times as fast
     rows = np.arange(len(beamed))
     top = np.argmax(spectrum, axis=-1)
     below = top[:, None] - np.arange(object_bins[0], object_bins[1] + 1)
@@ -69,18 +69,18 @@ def refine(
 ) -> tuple[_Real, NDArray[np.complex128], _Real]:
     """Refine frequencies by Gauss-Newton steps.
 
-    Demodulation is the same for all RX, so the estimator sums over them before it.
+    Demodulation is the same for all RX, so the estimator sums over RX first.
 
     Parameters
     ----------
     halves
-        Their sum holds the direct path.
+        Both halves are added.
     steering
         complex64 [rx, block].
     estimator
         complex64 [2 or 3, rx * block]: see `direct_path.DirectPath`.
     frequency
-        [position]: where to start.
+        [position]: starting values.
 
     Returns
     -------
@@ -113,22 +113,22 @@ def turn(
     phase: _Real,
     found: NDArray[np.bool_],
 ) -> tuple[_Complex, _Complex]:
-    """Take steering, frequency and phase out of a row.
+    """Apply the steering and remove frequency and phase of the direct path from a row.
 
     Parameters
     ----------
     mean
         complex64 [position, rx, sample].
     halves
-        Their blocks are `FOLD` samples of `mean` each.
+        One block is the average of `FOLD` samples.
     steering, folded_steering
         complex64 [rx, sample] and [rx, block].
     origin
-        The sample at which the phase is zero afterwards.
+        Sample at which `phase` is given.
     frequency, phase
-        [position], cycles a sample and radians.
+        [position], cycles per sample and radians.
     found
-        bool [position]: elsewhere the samples become zero.
+        bool [position]: other positions become zero.
 
     Returns
     -------

@@ -1,7 +1,7 @@
-"""The three passes over a burst's raw samples, in NumPy: what `compiled.py` does, plainly and more slowly.
+"""Three passes over the raw samples of a burst, in NumPy: the readable form of `passes.h`, with equal results.
 
-Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing is by `exp(-j 2 pi f (n -
-centre))`, with f in cycles a sample and `centre` the middle of the linear samples.
+Words are int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies by
+`exp(-j 2 pi f (n - centre))`, with f in cycles per sample and `centre` the middle of the linear samples.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from polysight.host.sync import high_pass_filter as hpf
 from polysight.host.sync.tone import block_edges, block_times, cis, phasor, refine, search_size, strongest
 
 CHUNK = 8
-"""Positions at a time: the working set stays in the second-level cache."""
+"""Positions per chunk: the working set fits in the second-level cache."""
 
 FOLD = 4
-"""Samples that are averaged before the second estimate: tones 2.7 IF bins off the middle lose 0.8 % of their power."""
+"""Samples averaged before the second estimate: tones 2.7 IF bins off the middle lose 0.8 % of their power."""
 
 BAND_BINS = 9
-"""IF bins over which the signal's centre is sought: direct path and object lie within."""
+"""Width in IF bins of the signal's band: direct path and object lie within it."""
 
 
 def match(
     words: NDArray[np.int16], reference: NDArray[np.intp], linear: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]:
-    """The tone between each chirp and a reference chirp: the strongest of their conjugate product, summed over the RX.
+    """Find the tone between each chirp and a reference chirp: the strongest in their conjugate product over all RX.
 
     Parameters
     ----------
@@ -40,12 +40,12 @@ def match(
     Returns
     -------
     frequency
-        float64 [position, chirp], cycles a sample, within some hundredths of a bin.
+        float64 [position, chirp], cycles per sample, within some hundredths of a bin.
     amplitude
         complex128 [position, chirp]: the tone's sum over RX and linear samples, at their middle.
     centre
-        float64 [position]: middle of the band that holds the reference chirp's signal, cycles a sample 0..1: where the
-        spectrum of all RX, smoothed over half `BAND_BINS` three times, is highest.
+        float64 [position]: middle of the band of the reference chirp, cycles per sample 0..1: maximum of the power
+        spectrum of all RX after three passes of a box filter of half `BAND_BINS`.
     energy
         float32 [position, chirp], over RX and linear samples.
     peak
@@ -63,7 +63,7 @@ def match(
 
     spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(chosen, axis=-1))
     power = (spectrum.real**2 + spectrum.imag**2).sum(axis=1)
-    for _ in range(3):  # three boxes make a bell: two tones within it give one peak, between them
+    for _ in range(3):  # nearly Gaussian: two tones give one peak between them
         power = scipy.ndimage.uniform_filter1d(power, BAND_BINS * size // n // 2, axis=-1, mode="wrap")
     energy = (inside.real**2 + inside.imag**2).sum(axis=(2, 3))
     parts = frames.view(np.float32)
@@ -78,7 +78,7 @@ def against_others(
     good: NDArray[np.bool_],
     linear: tuple[int, int],
 ) -> tuple[NDArray[np.float64], NDArray[np.complex128], NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-    """Mix down, average every `FOLD` samples, filter, and find the tone between each chirp and the sum of all others.
+    """Mix down, average every `FOLD` samples, filter; find the tone between each chirp and the sum of all others.
 
     Parameters
     ----------
@@ -89,21 +89,21 @@ def against_others(
     taps
         complex64 [position, chirp, tap]: one or three, one averaged sample apart (`high_pass.Equaliser`).
     good
-        bool [position, chirp]: chirps of the sum.
+        bool [position, chirp]: chirps in the sum.
     linear
         Linear samples `[a, b)`, a multiple of `FOLD` many.
 
     Returns
     -------
     frequency, amplitude
-        float64 and complex128 [position, chirp]: the tone, as of `tone.refine`, by two Newton steps from zero.
+        float64 and complex128 [position, chirp]: the tone from `tone.refine`, two Newton steps from zero.
     energy
-        float32 [position, chirp]: the chirp's own, over RX and averaged samples.
+        float32 [position, chirp]: energy of the chirp, over RX and averaged samples.
     level
         float32 [position]: energy of the good chirps' sum.
     apart
-        float64 [2, position, chirp]: what the tones seen by even and by odd RX differ by, with the chirp itself left
-        in: cycles a sample, and radians.
+        float64 [2, position, chirp]: difference of the tones from even and from odd RX, with the chirp itself in the
+        sum: cycles per sample, and radians.
     """
     a, b = linear
     turn = phasor(-frequency, np.zeros(frequency.shape), b - a, (b - a - 1) / 2)
@@ -137,7 +137,7 @@ def average(
     second_half: NDArray[np.bool_],
     linear: tuple[int, int],
 ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-    """Weighted sum over the chirps, each mixed down.
+    """Return the weighted sum of the chirps, each mixed down.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def average(
     weights
         complex64 [position, chirp, tap]: one or three, `FOLD` samples apart.
     second_half
-        bool [position, chirp]: which of two halves a chirp belongs to.
+        bool [position, chirp]: True for chirps of the second half.
     linear
         Linear samples `[a, b)`, a multiple of `FOLD` many.
 
@@ -157,8 +157,7 @@ def average(
     mean
         complex64 [position, rx, sample].
     halves
-        complex64 [position, 2, rx, averaged sample]: each half's part in the mean, every `FOLD` linear samples
-        averaged.
+        complex64 [position, 2, rx, block]: contribution of each half to the mean, averaged over `FOLD` linear samples.
     """
     a, b = linear
     frames = _complex(words)
@@ -173,7 +172,7 @@ def average(
 
 
 def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
-    """Complex64 [position, chirp, rx, sample] of raw words."""
+    """Return raw words as complex64 [position, chirp, rx, sample]."""
     positions, chirps, samples, _, rx = words.shape
     out = np.empty((positions, chirps, rx, samples), np.complex64)
     out.real = words[..., 0, :].swapaxes(2, 3)
@@ -182,7 +181,7 @@ def _complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
 
 
 def _fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Averages of every `FOLD` samples along the last axis."""
+    """Return the averages of every `FOLD` samples along the last axis."""
     out = signal[..., ::FOLD].copy()
     for q in range(1, FOLD):
         out += signal[..., q::FOLD]

@@ -1,8 +1,8 @@
-"""What is left of frequency, phase and amplitude errors after each stage of synchronisation (paper, Fig. 15).
+"""Residual frequency, phase and amplitude errors after each stage of synchronisation (paper, Fig. 15).
 
-Measured on the scan itself, whatever is in it: an error is half the difference between two measurements of the same
-thing that share no noise. For a chirp, and for the direct path, these are two halves of the RX; for the object beside
-the direct path, two averages of every other chirp.
+They are measured on the scan itself, for any scene: an error is half the difference between two measurements with
+independent noise. For a chirp and for the direct path these are two halves of the RX, for the object two averages of
+every other chirp.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from polysight.host.sync.numpy_passes import FOLD
 from polysight.host.sync.tone import Complex, Real, block_edges, block_times, cis, phasor, refine
 
 STAGES = {
-    "received": "one chirp as the hardware trigger left it",
+    "received": "one chirp as received",
     "aligned": "one chirp after burst alignment",
     "averaged": "the direct path in a position's average",
     "referenced": "the object beside the direct path in a position's average",
 }
 
 EXAMINED = 32
-"""Positions of a row whose residuals are estimated: standard deviations within 13 % for a row, 1 % for 150 rows."""
+"""Positions per row used for residuals: standard deviations within 13 % for a row, 1 % for 150 rows."""
 
 Errors = dict[str, NDArray[np.float64]]
 
@@ -31,10 +31,10 @@ Errors = dict[str, NDArray[np.float64]]
 def errors(
     aligned: AlignedRow, done: Referenced, path: DirectPath, sample_rate_hz: float, most: int = EXAMINED
 ) -> Errors:
-    """Errors after each stage in a row's valid positions, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
+    """Return the errors after each stage, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
 
-    Of more than `most` valid positions as many are taken, evenly spaced. Empty when no position is valid. `referenced`
-    holds only the positions that have an echo.
+    At most `most` valid positions are used, evenly spaced. Empty if no position is valid. `referenced` contains only
+    positions with an echo.
     """
     if not done.found.any():
         return {}
@@ -72,7 +72,7 @@ def errors(
 
 
 def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
-    """Noise power of a sample of one channel of one chirp, [position], from what two averages differ by; else nan."""
+    """Return the noise power of a sample of one channel of one chirp, [position], NaN with fewer than two chirps."""
     n = aligned.good.sum(axis=1)
     parts = np.stack([(n + 1) // 2, n // 2], axis=1)
     whole = (n[:, None] / np.maximum(parts, 1)).astype(np.float32)[..., None, None]
@@ -82,32 +82,32 @@ def noise_power(aligned: AlignedRow) -> NDArray[np.float64]:
 
 
 def _energy(signal: NDArray[np.complex64]) -> NDArray[np.float32]:
-    """Sum of squared magnitudes over RX and blocks, of signals [position, rx, block]."""
+    """Return the energy over RX and blocks of signals [position, rx, block]."""
     parts = np.ascontiguousarray(signal).view(np.float32)
     return np.einsum("prn,prn->p", parts, parts)
 
 
 def _direct_path(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
-    """Errors of the direct path [3, n] in referenced averages [position, rx, block], from two halves of the RX."""
+    """Return the errors of the direct path [3, n] in averages [position, rx, block], from two halves of the RX."""
     frequency, phase, size = [], [], []
     for h in (0, 1):
         amplitude, w = _estimate(mean[:, h::2], path.half_estimators[h])
         frequency.append(w / (2 * np.pi))
-        phase.append(np.angle(amplitude * np.conj(amplitude.mean())))  # less what the RX differ by, always
+        phase.append(np.angle(amplitude * np.conj(amplitude.mean())))  # without the constant difference of the RX
         size.append(np.abs(amplitude) / np.abs(amplitude).mean())
     return np.stack([x[0] - x[1] for x in (frequency, phase, size)]) / 2
 
 
 def _estimate(signal: NDArray[np.complex64], estimator: NDArray[np.complex128]) -> tuple[Complex, Real]:
-    """Amplitude and remaining frequency (radians a sample), [...], of a direct path in signals [..., rx, block]."""
+    """Return amplitude and frequency (radians per sample) [...] of the direct path in signals [..., rx, block]."""
     estimate = signal.reshape(*signal.shape[:-2], -1) @ estimator.T.astype(np.complex64)
     return estimate[..., 0].astype(complex), np.real(estimate[..., 1] / estimate[..., 0])
 
 
 def _object(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
-    """Errors of the object [3, n], from two referenced averages [position, 2, rx, block]; of positions with an echo."""
+    """Return the errors of the object [3, n] from two averages [position, 2, rx, block], for positions with an echo."""
     rx, n = halves.shape[2:]
-    # Each half referenced to its own direct path, which is then taken away: what is left is the object.
+    # Reference each half to its own direct path and subtract it; the object remains.
     amplitude, w = _estimate(halves, path.estimator)
     back = phasor(-w * FOLD / (2 * np.pi), -np.angle(amplitude), n, (n - 1) / 2)
     echo = halves * back[:, :, None]
@@ -115,16 +115,16 @@ def _object(halves: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float
     product = (echo[:, 0] * echo[:, 1].conj()).sum(axis=1)
     edges = block_edges(n)
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
-    # Amplitudes along the mean of both: the products of each with it are sums of these.
+    # Amplitudes relative to the mean of both halves.
     energy, common = np.stack([_energy(echo[:, h]) for h in (0, 1)], axis=1), product.sum(axis=1)
     size = np.abs(energy + np.stack([common, common.conj()], axis=1))
     contrast = (size[:, 0] - size[:, 1]) / np.maximum(size.sum(axis=1), 1e-30)
-    # Two records of noise are this coherent by chance; an echo that is no more so is none.
+    # Keep positions whose halves are more coherent than noise would be by chance.
     echoing = np.abs(tone.amplitude) > 4 / np.sqrt(rx * n) * np.sqrt(energy.prod(axis=1))
     return np.stack([tone.frequency / 2, np.angle(tone.amplitude) / 2, contrast])[:, echoing]
 
 
 def spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Root mean square of errors [3, n]."""
+    """Return the RMS of errors [3, n]."""
     f, p, a = np.sqrt((values**2).mean(axis=1))
     return float(f), float(p), float(a)

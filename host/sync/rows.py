@@ -1,4 +1,4 @@
-"""Recorded rows of a scan, synchronised: raw rows by the chain, rows of published cubes brought to our form."""
+"""Synchronise the rows of a source: raw rows with `synchronise_row`, rows of cubes by converting their form."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from polysight.host.capture import row_words
 from polysight.host.store import CubeRow, RowData, Source
 from polysight.host.sync.chain import BoardSetup, SyncedRow, synchronise_row
+from polysight.host.sync.cubes import CubeForm, detect_form
 from polysight.host.sync.high_pass_filter import HighPass
-from polysight.host.sync.synchronised import CubeForm, recognise
 from polysight.shared.config import Instrument
 
-_CUBE_ROWS = 7  # rows of a cube that tell its form
+_CUBE_ROWS = 7  # rows used to detect the form of a cube
 
 
 class RowSynchroniser:
@@ -25,9 +25,9 @@ class RowSynchroniser:
     source
         The scan.
     rig
-        Its rig, calibrated.
+        Its calibrated rig.
     filters
-        Board name to its receiver's measured high-pass filter; None: as the chirp profile programs it.
+        Measured high-pass filter of each receiver, by board name; None: as the chirp profile programs it.
     """
 
     def __init__(self, source: Source, rig: Instrument, filters: Mapping[str, HighPass | None]) -> None:
@@ -36,7 +36,7 @@ class RowSynchroniser:
         self._forms: dict[str, CubeForm] = {}
 
     def synchronise(self, board: str, recorded: RowData | CubeRow) -> tuple[SyncedRow, int]:
-        """Return one board's row, synchronised, and how many of its frames are whole. Raises DataError."""
+        """Synchronise a row of a board; return it and the number of whole frames. Raises DataError."""
         rig = self._source.instrument
         if isinstance(recorded, CubeRow):
             synced = self._form(board).synced(recorded.cube, rig.burst.chirps_a_position)
@@ -46,21 +46,21 @@ class RowSynchroniser:
 
     @property
     def direct_path_known(self) -> bool:
-        """Whether the rows' amplitudes are relative to the direct path; not of cubes that lack it."""
+        """True if amplitudes are relative to the direct path; False for cubes without it."""
         return not any(form.constant.any() for form in self._forms.values())
 
     def recording_facts(self) -> dict[str, Any]:
-        """What quality.json says of how the scan was recorded, and of the form of its cubes."""
+        """Return the entry on recording of quality.json, with the form of cubes."""
         facts = self._source.recording_facts()
         if self._forms:
             facts["recording"]["cubes"] = {name: form.how for name, form in self._forms.items()}
         return facts
 
     def _form(self, board: str) -> CubeForm:
-        """The form of a board's cube, found from a few of its rows."""
+        """Return the form of a board's cube, detected from a few of its rows."""
         if board not in self._forms:
             rig, rows = self._source.instrument, self._source.plan.rows
             some = sorted({int(r) for r in np.linspace(0, rows - 1, _CUBE_ROWS)})
             cubes = [row.cube for r in some if isinstance(row := self._source.read_row(board, r), CubeRow)]
-            self._forms[board] = recognise(cubes, rig, rig.by_name(board))
+            self._forms[board] = detect_form(cubes, rig, rig.by_name(board))
         return self._forms[board]

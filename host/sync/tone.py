@@ -1,4 +1,4 @@
-"""Frequency and phase of one tone in many short records, at the Cramer-Rao bound."""
+"""Estimate frequency and phase of a tone in many short records, at the Cramer-Rao bound; build phase ramps."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Complex = NDArray[np.complexfloating]
 
 
 class Tone(NamedTuple):
-    """`frequency` [...], cycles a sample, about -1/2..1/2; `amplitude` complex [...], at the record's centre."""
+    """`frequency` [...], cycles per sample, about -1/2..1/2; `amplitude` complex [...], at the record's centre."""
 
     frequency: NDArray[np.float64]
     amplitude: Complex
 
 
 def cis(angle: Real) -> NDArray[np.complex64]:
-    """`exp(j angle)`, within 3e-7; reduced in float64 first, since sine and cosine of float32 are vectorised."""
+    """Return exp(j angle) within 3e-7. The angle is reduced in float64; sine and cosine of float32 are vectorised."""
     turns = np.asarray(angle) / (2 * np.pi)
     turns -= np.rint(turns)
     small = (2 * np.pi * turns).astype(np.float32)
@@ -34,16 +34,16 @@ def cis(angle: Real) -> NDArray[np.complex64]:
 
 
 def phasor(frequency: Real, phase: Real, samples: int, origin: float) -> NDArray[np.complex64]:
-    """`exp(j (2 pi frequency (n - origin) + phase))` for n = 0..samples-1.
+    """Return exp(j (2 pi frequency (n - origin) + phase)) for n = 0..samples-1.
 
-    Built as an outer product of a coarse and a fine ramp: 32 exponentials instead of 256, phases in float64.
+    An outer product of a coarse and a fine ramp: 32 exponentials instead of 256, phases in float64.
 
     Parameters
     ----------
     frequency, phase
-        float64 [...], cycles a sample and radians (at `origin`).
+        float64 [...], cycles per sample, and radians at `origin`.
     samples, origin
-        Number of samples, and where among them the phase is `phase`.
+        Number of samples, and the sample at which the phase is `phase`.
 
     Returns
     -------
@@ -59,23 +59,23 @@ def phasor(frequency: Real, phase: Real, samples: int, origin: float) -> NDArray
 
 
 def block_edges(n: int) -> NDArray[np.intp]:
-    """Where a record of n samples is cut into eight blocks.
+    """Return the edges of eight blocks in a record of n samples.
 
-    For a frequency under half a cycle over the record, their sums lose less than 1.3 % of what the record tells.
+    For frequencies below half a cycle per record, block sums lose less than 1.3 % of the information.
     """
     return np.unique(np.linspace(0, n, min(_BLOCKS, n) + 1).astype(np.intp))
 
 
 def block_times(edges: NDArray[np.intp]) -> NDArray[np.float64]:
-    """The blocks' centres, in samples from the record's centre."""
+    """Return the centres of the blocks, in samples from the record's centre."""
     return (edges[:-1] + edges[1:] - 1) / 2 - (edges[-1] - 1) / 2
 
 
 def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
-    """Newton's method on the periodogram `|sum_n y_n exp(-j w t_n)|^2`, started at zero frequency.
+    """Maximise the periodogram |sum_n y_n exp(-j w t_n)|^2 by Newton's method, starting at zero frequency.
 
-    From the nearest bin of a twofold zero-padded FFT, two steps reach the bound (Rife and Boorstyn 1974) up to 30 dB;
-    the third makes the remaining bias, a thousandth of a bin, vanish.
+    From the nearest bin of a twofold zero-padded FFT, two steps reach the Cramer-Rao bound up to 30 dB (Rife and
+    Boorstyn 1974); the third removes the remaining bias of a thousandth of a bin.
 
     Parameters
     ----------
@@ -97,17 +97,17 @@ def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
         step = np.divide(-slope, curvature, out=np.zeros_like(slope), where=curvature < 0)
         step = np.clip(step, -limit, limit)
         w += step
-    # The sum at the last frequency, by its Taylor series about the one before: the last step is small.
+    # The sum at the final frequency, by a Taylor series about the one before: the last step is small.
     return Tone(w / (2 * np.pi), s0 - 1j * step * s1 - step**2 / 2 * s2)
 
 
 def search_size(n: int) -> int:
-    """Points of the FFT that seeks a tone of n samples: a power of two with at least a quarter of padding."""
+    """Return the FFT size to find a tone of n samples: a power of two, with at least a quarter of padding."""
     return 1 << int(np.ceil(np.log2(1.25 * n)))
 
 
 def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
-    """The strongest tone of each record, within some hundredths of a bin: an FFT's peak, moved by a parabola.
+    """Return the strongest tone of each record, within some hundredths of a bin: FFT peak with parabolic interpolation.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     Returns
     -------
     Tone
-        amplitude is the sum over the record (not the mean), at its centre.
+        The amplitude is the sum over the record (not the mean), at its centre.
     """
     size = z.shape[-1]
     spectrum: NDArray[np.complex64] = np.asarray(scipy.fft.fft(z, axis=-1, overwrite_x=True)).reshape(-1, size)
@@ -130,14 +130,14 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     bend = below - 2 * peak + above
     part = np.divide(0.5 * (below - above), bend, out=np.zeros(len(top)), where=bend < 0)
     whole = np.where(top < size // 2, top, top - size) / size
-    # Half a lobe off its peak the phase at the centre is the tone's: a symmetrical window's transform is real.
+    # The transform of a symmetrical window is real, so the phase of the bin is that of the tone at the centre.
     amplitude = at * cis(2 * np.pi * whole * (samples - 1) / 2)
     shape = z.shape[:-1]
     return Tone((whole + part / size).reshape(shape), amplitude.reshape(shape))
 
 
 def estimate_tone(z: NDArray[np.complex64], steps: int = 3) -> Tone:
-    """The strongest tone of each record [..., sample]: FFT, then Newton. Amplitude as of :func:`strongest`."""
+    """Return the strongest tone of each record [..., sample]: FFT, then Newton. Amplitude as in :func:`strongest`."""
     n = z.shape[-1]
     padded = np.zeros((*z.shape[:-1], search_size(n)), np.complex64)
     padded[..., :n] = z

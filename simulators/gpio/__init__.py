@@ -1,8 +1,8 @@
-"""A stand-in GPIO chip, for one program at a time: the unmodified libgpiod bindings talk to it as to a kernel.
+"""A stand-in GPIO chip for one program at a time, used through the unmodified libgpiod bindings.
 
-A library (`gpioshim.c` the calls, `lines.c` the lines, `spidev.c` an SPI controller beside them) is preloaded into the
-program and answers the calls of the GPIO character device and of spidev; its outside world are the simulated wires
-(shared/wires.py). It is compiled on demand; :func:`missing` tells what that needs.
+A preloaded library (`gpioshim.c`: system calls, `lines.c`: lines, `spidev.c`: SPI controller) replaces the system calls
+on the GPIO character device and on spidev; the lines are connected to the simulated wires (shared/wires.py). It is
+compiled on demand; :func:`missing` lists the packages needed.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _LIBRARIES = ("-ldl", "-lpthread")
 
 
 def missing() -> list[str]:
-    """Debian packages without which it cannot be compiled here; empty when all are there."""
+    """Return the missing Debian packages that compiling it needs."""
     lacking = {"gcc": shutil.which("gcc") is None, "libc6-dev": not Path("/usr/include/linux/gpio.h").is_file()}
     return [package for package, lacks in lacking.items() if lacks]
 
 
 def shim() -> Path:
-    """The compiled library. Raises DeviceError when it does not compile."""
+    """Compile the library; return its path. Raises DeviceError if it does not compile."""
     code = [str(p) for p in _SOURCES if p.suffix == ".c"]
     return compiled(
         "gpioshim.so",
@@ -46,26 +46,26 @@ def environment(
     spi: Path | None = None,
     **spi_settings: str,
 ) -> dict[str, str]:
-    """Environment variables of a program that shall find a chip at `chip`.
+    """Return the environment variables of a program that uses the stand-in chip at `chip`.
 
     Parameters
     ----------
     chip
-        Path of the device; it is made when the program starts, so one program at a time.
+        Path of the device, made when the program starts; for one program at a time.
     wires
-        Socket of the hub; None: nothing is connected to the chip.
+        Socket of the hub; None: the chip is not connected.
     label
-        What the chip calls itself.
+        Label of the chip.
     faults
-        From the start: `denied` (no permission), `no-edges` (no interrupts), `busy:LINE` (held by another program),
-        `slow:US` (every change of an output takes so long). Signal :data:`VANISH` makes the chip vanish.
+        `denied` (no permission), `no-edges` (no interrupts), `busy:LINE` (held by another program), `slow:US` (duration
+        of each change of an output). Signal :data:`VANISH` makes the chip vanish.
     wire_time
-        The thread that reads edges lives in wire time, where a sleep is exact and over at once: nothing is late,
-        however busy the machine is. Else everything is at real time.
+        The thread that reads edges uses wire time, in which a sleep is exact and returns at once, so that nothing is
+        late on a busy machine. Else real time.
     spi
-        Path of a spidev device, made too: its transfers are edges of MOSI, GPIO 10.
+        Path of a spidev device to make; its transfers become edges of MOSI, GPIO 10.
     spi_settings
-        `mosi`, `bufsiz`, `core_hz`: spidev.c says what they are.
+        `mosi`, `bufsiz`, `core_hz`: see spidev.c.
 
     Raises
     ------

@@ -31,7 +31,7 @@ BOOT_MS = 200
 STEP_POLL_MS, REST_POLL_MS = 2, 20
 _IN_CLOSE, _IN_OPEN = 0x08 | 0x10, 0x20  # inotify(7)
 _EVENT = struct.Struct("iIII")
-# A starved process slows the simulated world down rather than flooding it: at most so much wall time at once.
+# A process without CPU time slows the simulated world down: the longest advance at once, wall time.
 LONGEST_LEAP_NS = 20 * NS_PER_MS
 
 
@@ -66,11 +66,11 @@ class SerialPort:
 
     @property
     def is_open(self) -> bool:
-        """Whether a client held the port open when :meth:`opened` was last called."""
+        """True if a client held the port open at the last call of :meth:`opened`."""
         return self._clients > 0
 
     def wait(self, timeout_ms: int) -> None:
-        """Wait for bytes, or for a client to open or close the port, for at most `timeout_ms`."""
+        """Wait until bytes arrive, or a client opens or closes the port; at most `timeout_ms`."""
         poll = select.poll()
         poll.register(self._watch, select.POLLIN)
         if self.is_open:
@@ -105,14 +105,14 @@ class SerialPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        """What a client does not read in time is lost, as on a serial line."""
+        """Send bytes; those that a client does not read in time are lost, as on a serial line."""
         try:
             os.write(self._master, data)
         except OSError:  # EAGAIN: full
             return
 
     def flush(self) -> None:
-        """Forget what was received, and take bytes as they are."""
+        """Drop received bytes and set the terminal to raw mode."""
         tty.setraw(self._master, termios.TCSANOW)
         while self.read():
             pass
@@ -139,11 +139,11 @@ def serve(
         wall = now
         ticks += leap * time_scale * TICK_HZ * 1e-9
         now_ms = (now - started) // NS_PER_MS
-        if port.opened():  # opening the port resets the board; its boot loader swallows what comes meanwhile
+        if port.opened():  # opening the port resets the board; its boot loader ignores bytes until it ends
             boots_at, running = now + boot_ms * NS_PER_MS, False
         is_open = port.is_open
 
-        # Bytes first, so that a starved process does not mistake its own lateness for a silent host.
+        # Read bytes first, so that a late process does not detect a silent host.
         if not stage.stepping:
             stage.advance(int(ticks), now_ms)
         if is_open and not running and now >= boots_at:

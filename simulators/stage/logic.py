@@ -1,4 +1,4 @@
-"""What the Python stand-in of the stage does with its commands: legs, homing, hold, stop, alarms (stage.cpp)."""
+"""Commands of the Python stand-in of the stage: legs, homing, hold, stop, alarms (as arduino_stage/stage.cpp)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Refused(Exception):  # noqa: N818 - the answer to a command, not a failure
 
 
 class Event(Enum):
-    """What :meth:`StageLogic.service` has to tell."""
+    """Result of :meth:`StageLogic.service`."""
 
     NONE = 0
     DONE = 1
@@ -45,7 +45,7 @@ class Event(Enum):
 
 
 def homing_zero() -> int:
-    """Steps from where a switch closes to the zero that homing finds.
+    """Return the steps from the closing point of a switch to the zero of homing.
 
     The creep sees the switch open after its looks, takes the steps of its ramp to stop, and pulls off. Homing has to
     begin at least the ramp of the search away from the switch.
@@ -98,12 +98,12 @@ class StageLogic:
 
     @property
     def busy(self) -> bool:
-        """A motion command has not ended."""
+        """True while a motion command is active."""
         return self.activity != "idle"
 
     @property
     def state(self) -> str:
-        """The word in a status reply."""
+        """The state as in a status reply."""
         if self.busy and self._engine.hold and not self._engine.stepping:
             return "hold"
         if self.busy:
@@ -111,7 +111,7 @@ class StageLogic:
         return "alarm" if self.alarm else "idle"
 
     def execute(self, verb: str, args: tuple[int, ...]) -> None:
-        """Carry out one command. Raises Refused."""
+        """Execute a command. Raises Refused."""
         _require(verb in ARGUMENTS, StageError.UNKNOWN_COMMAND)
         _require(len(args) == ARGUMENTS[verb], StageError.ARGUMENT_COUNT)
         if verb == "HELLO":
@@ -197,7 +197,7 @@ class StageLogic:
         self._arm(self._engine.start(Leg(x - self._engine.x, y - self._engine.y, rate)))
 
     def immediate(self, byte: int) -> bool:
-        """Take a byte; False when it is not an immediate one."""
+        """Process a byte; return False if it is not an immediate one."""
         alone, confirmed = self._quiet, self._resume_begun
         self._quiet, self._byte_seen, self._resume_begun = False, True, byte == Immediate.RESUME
         if byte == Immediate.HOLD:
@@ -236,7 +236,7 @@ class StageLogic:
         return Event.ALARM
 
     def service(self, now_ms: int) -> Event:
-        """Go on to the next leg; watch heartbeat and switches. Call often."""
+        """Start the next leg, check heartbeat and switches. Call often."""
         engine = self._engine
         self._listen(now_ms)
         if engine.fault is not None:

@@ -16,7 +16,7 @@ NS_PER_TICK = 1_000_000_000 // TICK_HZ
 MIN_RATE, MAX_RATE = 31, 20_000
 SWITCH_X, SWITCH_Y, EMERGENCY = 1, 2, 4
 SWITCHES = SWITCH_X | SWITCH_Y
-LOOKS = 5  # after which a switch counts
+LOOKS = 5  # equal readings after which a switch changes (debouncing)
 
 
 class Leg(NamedTuple):
@@ -49,18 +49,18 @@ class StepEngine:
         self.set_accel(40_000)
 
     def set_accel(self, steps_s2: int) -> None:
-        """Acceleration of every ramp from now on, steps/s^2."""
+        """Set the acceleration, steps/s^2."""
         self.accel = steps_s2
         self._accel_q20 = steps_s2 * 8192 // 15625
         self._slowest = max(MIN_RATE, math.isqrt(steps_s2 // 2))
 
     def ramp_steps(self, rate: int) -> int:
-        """Steps from rest to `rate`: v^2 / 2a, rounded up."""
+        """Return the steps from rest to `rate`: v^2 / 2a, rounded up."""
         return 0 if rate <= self._slowest else -(-rate * rate // (2 * self.accel))
 
     @property
     def finished(self) -> bool:
-        """At rest with no step left."""
+        """True at rest with no step left."""
         return not self.stepping and self.left == 0
 
     @property
@@ -72,7 +72,7 @@ class StepEngine:
         return self.x_direction * (rate if self.x_major else rate * self.minor // self.major)
 
     def start(self, leg: Leg) -> int:
-        """Plan a leg; returns the ticks to its first step, 0 when there is none to make now."""
+        """Plan a leg; return the ticks to its first step, or 0 if there is none now."""
         nx, ny = abs(leg.dx), abs(leg.dy)
         self.leg = leg
         self.x_major = nx >= ny
@@ -85,7 +85,7 @@ class StepEngine:
         return self._from_rest()
 
     def resume(self) -> int:
-        """End a hold; returns the ticks to the next step when the stage was at rest, else 0."""
+        """End a hold; return the ticks to the next step if the stage was at rest, else 0."""
         self.hold = False
         return 0 if self.stepping else self._from_rest()
 
@@ -96,19 +96,19 @@ class StepEngine:
         return self.interval()
 
     def abandon(self) -> None:
-        """Give up the rest of the leg."""
+        """Drop the rest of the leg."""
         self.stepping = self.hold = self.cruise = False
         self.left = self.ramp = self.points_left = 0
         self.fault = None
 
     def look(self, inputs: int) -> None:
-        """Look at the switches: what differs from before counts after :data:`LOOKS` looks."""
+        """Read and debounce the switches: a change counts after :data:`LOOKS` equal readings."""
         self._looks = 0 if inputs == self.stable else self._looks + 1
         if self._looks >= LOOKS:
             self.stable, self._looks = inputs, 0
 
     def step(self, inputs: int) -> tuple[int, int, bool]:
-        """Make the step that is due: steps of x and y (signed), and whether the trigger is raised."""
+        """Make the step that is due; return the steps of x and y (signed), and True if the trigger is raised."""
         leg = self.leg
         if not self.stepping or self.left == 0:
             return 0, 0, False
@@ -129,7 +129,7 @@ class StepEngine:
         return self._advance(1)
 
     def skip(self, wait_ticks: int, clear_x: int, clear_y: int) -> tuple[int, int, int, int]:
-        """Take at once the steps at constant speed that bring no event.
+        """Skip the steps at constant speed that have no event.
 
         Parameters
         ----------
@@ -183,7 +183,7 @@ class StepEngine:
         return dx, dy, trigger
 
     def interval(self) -> int:
-        """Ticks until the next step; 0 = the stage is at rest."""
+        """Return the ticks until the next step; 0: the stage is at rest."""
         rate = self.leg.rate
         if not self.stepping or self.left == 0 or (self.hold and self.ramp == 0):
             self.stepping = self.cruise = False

@@ -17,12 +17,12 @@ from polysight.simulators.stage.logic import MOTION_VERBS, Event, Refused, Stage
 from polysight.simulators.stage.motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
 
 FIRMWARE = "0.1.0"
-TELL_TICKS = TICK_HZ // 100  # while the speed changes, tell it every 10 ms
+TELL_TICKS = TICK_HZ // 100  # interval of motion messages while the speed changes: 10 ms
 _TAIL = re.compile(rb"\*([^*]{4})")
 
 
 class Rig(NamedTuple):
-    """What the stage is built into, and where it stands when it is switched on (steps clear of its switches)."""
+    """Properties of the rig, and the stage's position at power-on (steps from its switches)."""
 
     steps_per_mm: float = 200.0
     trigger_line: int = 26
@@ -53,7 +53,7 @@ class PythonStage:
         self._armed = self._was_homed = False
         self._line = bytearray()
         self._greeted = self._fresh = False
-        self._last: Command | None = None  # the last answered line, whose repetition gets the same answer
+        self._last: Command | None = None  # the last answered line: its repetition gets the same answer
         self._last_answer = b""
         self._last_is_motion = False
         self._motion_sequence = 0
@@ -61,25 +61,25 @@ class PythonStage:
 
     @property
     def stepping(self) -> bool:
-        """A step is due."""
+        """True while steps are due."""
         return self._armed
 
     @property
     def at_rest(self) -> bool:
-        """Neither a step nor the end of a trigger pulse is due."""
+        """True if neither a step nor the end of a trigger pulse is due."""
         return not self._armed and self._fall is None
 
     def press(self, inputs: int) -> None:
-        """Fault: these inputs are pressed besides the modelled switches."""
+        """Inject a fault: these inputs are pressed besides the modelled switches."""
         self._pressed = inputs
 
     def slip(self, dx: int, dy: int) -> None:
-        """Fault: the motors lose steps."""
+        """Inject a fault: the motors lose steps."""
         self._x += dx
         self._y += dy
 
     def reset(self, now_ms: int) -> None:
-        """The reset button. The motors stay where they are."""
+        """Reset the board. The motors keep their position."""
         self._now_ms = now_ms
         moved = self._armed
         self._power_on()
@@ -90,14 +90,14 @@ class PythonStage:
         self._send(Reply("banner", fields={"fw": FIRMWARE, "proto": str(PROTOCOL_VERSION)}).encode())
 
     def receive(self, data: bytes) -> None:
-        """Bytes from the host."""
+        """Process bytes from the host."""
         for byte in data:
             if not self._logic.immediate(byte):
                 self._take(byte)
             self._settle()
 
     def advance(self, tick: int, now_ms: int) -> None:
-        """Let time go on, with every step and edge that is due."""
+        """Advance the time, with every step and edge that is due."""
         self._now_ms = now_ms
         self._settle()
         while self._armed and self._next <= tick:

@@ -1,6 +1,6 @@
-"""The emulated board under the command of a Python program: time goes on only when told.
+"""The emulated board in lockstep with a Python program: time advances only by command.
 
-Emulator and firmware are compiled on demand, once for the same sources; :func:`missing` tells what that needs.
+Emulator and firmware are compiled on demand, once for the same sources; :func:`missing` lists the packages needed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class PinEdge(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Worst cases since the last question, in cycles."""
+    """Worst cases since the last call of :meth:`EmulatedUno.cost`, in cycles."""
 
     interrupts: dict[int, int]  # by vector number: from entry to the end of reti
     step_pulse: int  # shortest
@@ -55,11 +55,11 @@ class EmulatedUno:
     program, image
         From :func:`polysight.simulators.uno.emulator` and :func:`polysight.simulators.uno.firmware`.
     start
-        Steps the stage stands clear of its switches.
+        Position at power-on: steps from the switches.
     watch
-        Pins whose edges are collected.
+        Pins whose edges are stored in `edges`.
     pty
-        Name to give a pseudo terminal with the serial line; None: :meth:`feed` and `received`.
+        Path of a pseudo terminal to make for the serial line; None: use :meth:`feed` and `received`.
     """
 
     def __init__(
@@ -114,23 +114,23 @@ class EmulatedUno:
         self._collect()
 
     def feed(self, data: bytes) -> None:
-        """Put bytes on the serial line; they arrive as time goes on."""
+        """Put bytes on the serial line; they arrive as time advances."""
         self._do(f"feed {data.hex()}")
 
     def run(self, cycles: int) -> None:
-        """Let time go on."""
+        """Advance the time by CPU cycles."""
         self._do(f"run {max(1, cycles)}")
 
     def run_ms(self, ms: float) -> None:
-        """Let time go on."""
+        """Advance the time by milliseconds."""
         self.run(round(ms * HZ / 1000))
 
     def settle(self, pty_bytes: int = 0) -> None:
-        """Until nothing is on the serial line; `pty_bytes`: how many were written to the pseudo terminal in all."""
+        """Run until the serial line is idle; `pty_bytes`: total number written to the pseudo terminal."""
         self._do(f"settle {pty_bytes}")
 
     def rest(self, limit_s: float = 600.0) -> None:
-        """Until no motor has stepped for 50 ms."""
+        """Run until no motor has stepped for 50 ms."""
         self._do(f"rest {round(limit_s * HZ)}")
 
     def press(self, mask: int) -> None:
@@ -138,29 +138,29 @@ class EmulatedUno:
         self._do(f"inputs {mask}")
 
     def slip(self, dx: int, dy: int) -> None:
-        """Lose steps."""
+        """Let the motors lose steps."""
         self._do(f"slip {dx} {dy}")
 
     def reset(self) -> None:
-        """The reset button."""
+        """Press the reset button."""
         self._do("reset")
 
     def hang(self) -> None:
-        """Let the main program stand still until the next reset; interrupts go on."""
+        """Stop the main program until the next reset; interrupts go on."""
         self._do("hang")
 
     def watch(self, *pins: int) -> None:
-        """Edges of these pins are collected from now on."""
+        """Store the edges of these pins from now on."""
         self._do("watch " + ",".join(map(str, pins)))
 
     def cost(self) -> Cost:
-        """Worst cases since the last question."""
+        """Return the worst cases since the last call."""
         self._counted = {}
         self._do("cost")
         return Cost(self._counted, *self._cost_pins)
 
     def close(self) -> None:
-        """End it."""
+        """End the emulator."""
         for stream in (self._process.stdin, self._process.stdout):
             if stream is not None:
                 stream.close()
@@ -168,7 +168,7 @@ class EmulatedUno:
 
 
 def missing() -> list[str]:
-    """Debian packages without which firmware or emulator cannot be compiled here; empty when all are there."""
+    """Return the missing Debian packages that compiling firmware and emulator needs."""
     lacking = {
         "gcc": shutil.which("gcc") is None,
         "make": shutil.which("make") is None,
@@ -182,23 +182,23 @@ def missing() -> list[str]:
 
 
 def emulator() -> Path:
-    """The compiled emulator. Raises DeviceError when it does not compile."""
+    """Compile the emulator; return its path. Raises DeviceError if it does not compile."""
     code = [str(p) for p in _SOURCES if p.suffix == ".c"]
     return compiled("unosim", _SOURCES, [*_CC, "-o", "{folder}/unosim", *code, *_LIBRARIES], _ON_FAILURE)
 
 
 def firmware(compiler: Path | None = None) -> Path:
-    """The image that `make flash` puts on a board, a .hex file.
+    """Compile the image that `make flash` puts on a board; return the .hex file.
 
     Parameters
     ----------
     compiler
-        Folder of another avr-gcc and its tools; None: those that are on the path.
+        Folder of another avr-gcc and its tools; None: those on the path.
 
     Raises
     ------
     DeviceError
-        when it does not compile, or its sources are not there.
+        if it does not compile, or its sources are missing.
     """
     if not SKETCH_DIR.is_dir():
         raise DeviceError(

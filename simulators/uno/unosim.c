@@ -1,6 +1,6 @@
 /* unosim - the firmware's machine code on an emulated Arduino UNO (libsimavr), in exact time, with the stage around it.
  *
- *   unosim [--pty LINK] [--start X,Y] [--watch PINS] FIRMWARE.hex                      lockstep: time goes on when told
+ *   unosim [--pty LINK] [--start X,Y] [--watch PINS] FIRMWARE.hex                      lockstep: time advances by command
  *   unosim --pty LINK --speed X [--wires SOCKET] [--line N] [--boot-ms N] ... FIRMWARE.hex         at X times real time
  *
  * The stage: PUL and DIR pins turn motors (counted), motors press switches, the trigger pin is reported. Without --pty
@@ -11,7 +11,7 @@
  *   settle [N]   until nothing is on the serial line (with --pty: and N bytes in all were read from it)
  *   rest CYCLES  ... until no motor has stepped for 50 ms         inputs MASK  press switches (1 x, 2 y, 4 emergency)
  *   slip DX DY   lose steps                                       reset        the reset button
- *   hang         the main program stands still until a reset; interrupts go on
+ *   hang         the main program stops until a reset; interrupts go on
  *   watch PINS   edges to report from now on                      cost         figures so far, below
  * R tells the motors' positions and how many bytes went to the pseudo terminal. What happened:
  *   T <cycle> <hex>                                     a byte from the board, at the end of its stop bit
@@ -141,7 +141,7 @@ static void keep_pace(double speed) {
 static int serve_real_time(double speed, uint64_t boot_cycles) {
   anchor_ns = wall_ns();
   while (!ended) {
-    if (pty_opened()) { /* the boot loader swallows what comes meanwhile */
+    if (pty_opened()) { /* the boot loader ignores bytes until it ends */
       reset();
       for (const uint64_t boots_at = avr->cycle + boot_cycles; avr->cycle < boots_at && !ended;) {
         avr->cycle += SLICE;
@@ -186,7 +186,7 @@ int main(int argc, char **argv) {
                     " [--parent PID] [--start X,Y] [--zero X,Y] [--watch PINS] FIRMWARE.hex\n");
     return 2;
   }
-  prctl(PR_SET_PDEATHSIG, SIGTERM); /* never outlive the program that asked for it */
+  prctl(PR_SET_PDEATHSIG, SIGTERM); /* never outlive the program that started it */
   if (getppid() != parent) return 0; /* it ended before that */
   signal(SIGTERM, on_signal);
   signal(SIGINT, on_signal);

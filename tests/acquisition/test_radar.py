@@ -7,7 +7,6 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 
 import msgspec
 import pytest
@@ -22,6 +21,7 @@ from polysight.shared.errors import ConfigError, DeviceError
 from polysight.shared.tables import decode, to_builtins
 from polysight.simulators.faults import Faults
 from polysight.simulators.radars import LineServer
+from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
 
@@ -52,13 +52,6 @@ def server():
     made.close()
 
 
-def until(condition) -> None:
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
 def test_each_row_sends_the_line_once_over_one_connection(server):
     with LineServers({"RH": server.address}, 5.0) as radars:
         client = server.accept()
@@ -79,7 +72,7 @@ def test_a_server_that_closes_after_each_line_gets_a_new_connection(server):
                 client = server.accept()
                 assert client.recv(100) == LINE
             client.close()
-            until(lambda: radars._is_closed("RH"))
+            wait_for(lambda: radars._is_closed("RH"), "radar")
             assert radars.states()["RH"].state is RadarState.UNKNOWN
 
 
@@ -90,18 +83,18 @@ def test_a_reset_is_a_fault_until_the_next_line(server):
         assert client.recv(100) == LINE
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.close()
-        until(lambda: radars.states()["RH"].state is RadarState.FAULT)
+        wait_for(lambda: radars.states()["RH"].state is RadarState.FAULT, "radar")
         assert "reset" in radars.states()["RH"].detail
         radars.arm(1)
         assert server.accept().recv(100) == LINE
         assert radars.states()["RH"].state is RadarState.UNKNOWN
 
 
-def test_refused_connection_says_what_to_do(server):
+def test_refused_connection_is_an_error_with_a_remedy(server):
     server.close()
-    with pytest.raises(DeviceError, match=r"RH: .*127\.0\.0\.1:\d+: connection refused") as e:
+    with pytest.raises(DeviceError) as e:
         LineServers({"RH": server.address}, 5.0)
-    assert "no server listens" in e.value.why
+    assert server.address in e.value.what
     assert "radar.servers" in e.value.remedy
 
 
@@ -109,14 +102,15 @@ def test_server_gone_between_rows_is_named(server):
     with LineServers({"RH": server.address}, 5.0) as radars:
         server.accept()
         server.close()
-        until(lambda: radars._is_closed("RH"))
-        with pytest.raises(DeviceError, match="connection refused"):
+        wait_for(lambda: radars._is_closed("RH"), "radar")
+        with pytest.raises(DeviceError):
             radars.arm(1)
 
 
 def test_unknown_host_is_named():
-    with pytest.raises(DeviceError, match=r"no-such-host\.invalid:5000"):
+    with pytest.raises(DeviceError) as e:
         LineServers({"RH": "no-such-host.invalid:5000"}, 2.0)
+    assert "no-such-host.invalid:5000" in e.value.what
 
 
 HALF_OPEN = """
@@ -210,7 +204,9 @@ def test_radar_in_fault_is_not_scanned_with_but_armed_again(rig, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
     assert (result.exit_status, result.retakes) == ("success", 1)
     assert rig.pi.rows_run[0] == (0, 2)  # the first take was never sent to the stage
-    assert "RH: the radar has stopped: RF core fault 7" in reasons(result.folder)
+    (fact,) = result.folder.facts("row_rejected")
+    assert fact["faults"] == [{"kind": "radar_stopped", "board": "RH"}, {"kind": "radar_stopped"}]
+    assert any("RF core fault 7" in reason for reason in fact["reasons"])
 
 
 def test_radar_that_faults_within_a_row_ends_it_at_once(rig, tmp_path):
@@ -245,7 +241,9 @@ def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):
 
     result = run_scan(msgspec.structs.replace(rig.instrument, limits=limits), tmp_path / "s", progress=progress)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert any("no data from RH" in r for r in reasons(result.folder))
+    faults = result.folder.facts("row_rejected")[0]["faults"]
+    assert faults[0] == {"kind": "no_data"}, "of the row that was aborted"
+    assert {"kind": "no_data", "board": "RH"} in faults
 
 
 def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_path):
@@ -262,17 +260,17 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
 # --- the simulated server ---
 
 
-def test_simulated_server_arms_once_a_line_and_fails_as_told():
+def test_simulated_server_arms_once_a_line_and_has_its_faults():
     armed = []
     made = LineServer("127.0.0.1:0", lambda: armed.append(1), Faults(retrigger_fails=(1,), retrigger_resets=(3,)))
     address = f"127.0.0.1:{made._listener.getsockname()[1]}"
     with LineServers({"RH": address}, 5.0) as radars:
         for n, want in enumerate([1, 1, 2, 2], 1):
             radars.arm(1)
-            until(lambda n=n: made.serve() or made.lines == n)
+            wait_for(lambda n=n: made.serve() or made.lines == n, "radar")
             assert len(armed) == want
-        until(lambda: radars.states()["RH"].state is RadarState.FAULT)
+        wait_for(lambda: radars.states()["RH"].state is RadarState.FAULT, "radar")
         radars.arm(1)
-        until(lambda: made.serve() or made.lines == 5)
+        wait_for(lambda: made.serve() or made.lines == 5, "radar")
         assert len(armed) == 3
     made.close()

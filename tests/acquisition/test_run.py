@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 import zlib
-from pathlib import Path
 
 import msgpack
 import msgspec
@@ -27,6 +26,7 @@ from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ScanError
 from polysight.shared.tables import to_builtins
 from tests.support.refusals import refused
+from tests.support.store.plain_scan import errors
 
 
 def digests(scan: ScanFolder) -> dict[str, str]:
@@ -35,10 +35,6 @@ def digests(scan: ScanFolder) -> dict[str, str]:
         for r in scan.committed().values()
         for b in r.boards.values()
     }
-
-
-def errors(path: Path) -> list[str]:
-    return [str(f) for f in validate(path) if f.severity == "error"]
 
 
 def test_whole_scan_is_bit_exact_and_valid(rig, payload, tmp_path):
@@ -107,20 +103,6 @@ def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, droppe
     assert [(r["row"], r["take"]) for r in rejected] == [(1, 1)]
     assert "RV" in rejected[0]["reasons"][0]
     assert errors(tmp_path / "s") == []
-
-
-def test_missed_pulse_is_seen_by_count(rig, tmp_path):
-    rig.cards["RH"].short[2, 1] = rig.instrument.frame_bytes
-    assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
-    reason = ScanFolder.load(tmp_path / "s").facts("row_rejected")[0]["reasons"][0]
-    assert "1 frames" in reason
-    assert "SYNC_IN" in reason
-
-
-def test_fault_of_the_pi_makes_the_row_be_taken_again(rig, tmp_path):
-    rig.pi.fail_rows[0, 1] = 103
-    assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
-    assert "edge" in ScanFolder.load(tmp_path / "s").facts("row_rejected")[0]["reasons"][0]
 
 
 def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
@@ -274,6 +256,13 @@ def test_port_in_use_is_named(rig, tmp_path):
         other.bind((board.host_address, board.data_port))
         with refused(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}", "ss -ulnp"):
             run_scan(rig.instrument, tmp_path / "s")
+
+
+def test_a_receive_buffer_below_two_bursts_ends_the_scan_before_it_begins(rig, tmp_path):
+    card = msgspec.structs.replace(rig.instrument.card, receive_buffer_bytes=4096)
+    with refused(ErrorCode.VALUE_INVALID, "sysctl -w net.core.rmem_max="):
+        run_scan(msgspec.structs.replace(rig.instrument, card=card), tmp_path / "s")
+    assert not (tmp_path / "s").exists()
 
 
 def test_existing_scan_is_not_overwritten(rig, tmp_path):

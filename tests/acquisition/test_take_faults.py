@@ -1,4 +1,4 @@
-"""The manifest says for programs what its reasons say for people: which kind of fault, and whose."""
+"""Faults of takes in the manifest: a kind and a board for programs beside the reasons for people."""
 
 from __future__ import annotations
 
@@ -11,27 +11,12 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.acquisition.take import ON_REQUEST, FaultKind, TakeFault
 from polysight.host.capture.dca1000 import Status
-from polysight.host.page.story import CAUSES, of_rejection
-from polysight.host.radar.interface import BoardState, RadarControl, RadarState
+from polysight.host.page.history import CAUSES, notice_of_rejection
 from polysight.shared.faults import PiFault, explain
 from tests.support.paths import REPO
 
 SPEC = REPO / "docs/spec/scan-folder.md"
 HELD = "held on the way: some positions were passed below full speed"
-
-
-class Stopped(RadarControl):
-    """RH stops before the first row, and is well once it is armed anew."""
-
-    def __init__(self) -> None:
-        self._armed = 0
-
-    def arm(self, frames: int) -> None:
-        del frames
-        self._armed += 1
-
-    def states(self) -> dict[str, BoardState]:
-        return {"RH": BoardState(RadarState.FAULT if self._armed == 1 else RadarState.ARMED, "RF core fault 7")}
 
 
 def lost_on_the_way(rig) -> None:
@@ -57,18 +42,6 @@ def unlocated(rig) -> None:
     rig.cards["RV"].short[0, 1] = 5 * rig.instrument.frame_bytes // 2
 
 
-def card_dropped(rig) -> None:
-    card, send_row = rig.cards["RV"], rig.cards["RV"].send_row
-
-    def overflowing(row: int, take: int) -> None:
-        if (row, take) == (0, 1):
-            said = struct.pack("<HHHH", 0xA55A, 0x0A, Status.DDR_FULL, 0xEEAA)
-            card.out.sendto(said, (card.board.host_address, card.board.command_port))
-        send_row(row, take)
-
-    card.send_row = overflowing
-
-
 def pi_fault(rig) -> None:
     rig.pi.fail_rows[0, 1] = int(PiFault.EDGE_LOST)
 
@@ -81,25 +54,37 @@ def pi_fault(rig) -> None:
         (frames_missing, {"kind": "frames_missing", "board": "RV"}),
         (held, {"kind": "held", "board": "RV"}),
         (unlocated, {"kind": "unlocated", "board": "RV"}),
-        (card_dropped, {"kind": "card_dropped", "board": "RV"}),
         (pi_fault, {"kind": "pi_fault", "number": 103}),
     ],
     ids=lambda x: x.__name__ if callable(x) else "",
 )
-def test_a_take_that_is_rejected_says_its_kind_and_board(rig, tmp_path, spoil, said):
+def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoil, said):
     spoil(rig)
     result = run_scan(rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 1)
     (fact,) = result.folder.facts("row_rejected")
     assert fact["faults"] == [said]
     assert len(fact["reasons"]) == 1
     assert fact["reasons"][0].startswith("RV: ") == ("board" in said)
 
 
-def test_a_radar_that_stopped_is_named(rig, tmp_path):
-    result = run_scan(rig.instrument, tmp_path / "s", radars=Stopped())
+@pytest.mark.parametrize("bit", [Status.DDR_FULL, Status.LVDS_BUFFER_FULL])
+def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, tmp_path, bit):
+    """Every expected byte comes without a gap in the counters: only the status shows the loss."""
+    card, send_row = rig.cards["RV"], rig.cards["RV"].send_row
+
+    def overflowing(row: int, take: int) -> None:
+        if (row, take) == (0, 1):
+            status = struct.pack("<HHHH", 0xA55A, 0x0A, bit, 0xEEAA)
+            card.out.sendto(status, (card.board.host_address, card.board.command_port))
+        send_row(row, take)
+
+    card.send_row = overflowing
+    result = run_scan(rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 1)
     (fact,) = result.folder.facts("row_rejected")
-    assert fact["faults"] == [{"kind": "radar_stopped", "board": "RH"}, {"kind": "radar_stopped"}]
-    assert len(fact["reasons"]) == 2
+    assert fact["faults"] == [{"kind": "card_dropped", "board": "RV"}]
+    assert [bool(fact["boards"][name]["card_status"] & bit) for name in ("RH", "RV")] == [False, True]
 
 
 def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
@@ -116,22 +101,7 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
     assert (fact["reasons"], fact["faults"]) == ([str(ON_REQUEST)], [{"kind": "on_request"}])
 
 
-def test_a_silent_board_is_the_kind_of_the_row_it_had_aborted(rig, tmp_path):
-    rig.cards["RH"].silent_data = True
-    rig.pi.hang_at, rig.pi.hang_after_captures = {0}, True
-
-    def progress(p) -> None:
-        if p.phase == "retake":
-            rig.pi.hang_at = set()
-            rig.cards["RH"].silent_data = False
-
-    result = run_scan(rig.instrument, tmp_path / "s", progress=progress)
-    fact = result.folder.facts("row_rejected")[0]
-    assert fact["faults"][0] == {"kind": "no_data"}
-    assert {"kind": "no_data", "board": "RH"} in fact["faults"]
-
-
-def test_a_row_that_is_kept_says_the_same(rig, tmp_path):
+def test_a_row_kept_incomplete_has_the_kind_and_board_of_its_fault(rig, tmp_path):
     for take in (1, 2, 3):
         rig.cards["RV"].drop[1, take] = {3}
     result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
@@ -144,7 +114,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
     assert set(re.findall(r"`([a-z_]+)`(?=[^|\n]*\|[^|\n]*\|$)", table, re.MULTILINE)) >= set(FaultKind)
     for kind in FaultKind:
         fault = TakeFault(kind, "text", "RV", 103 if kind is FaultKind.PI_FAULT else 0)
-        notice = of_rejection(0, 1, [str(fault)], [fault.fact()], "")
+        notice = notice_of_rejection(0, 1, [str(fault)], [fault.fact()], "")
         assert notice.why
         assert notice.do
     assert set(CAUSES) == set(FaultKind) - {FaultKind.PI_FAULT}
@@ -154,12 +124,12 @@ def test_words_follow_the_kind_alone():
     """Reasons are for people: whatever they say, the cause is that of the kind."""
     told = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (why, do) in CAUSES.items():
-        notice = of_rejection(0, 1, [told], [TakeFault(kind, told, "RV").fact()], "")
+        notice = notice_of_rejection(0, 1, [told], [TakeFault(kind, told, "RV").fact()], "")
         assert (notice.why, notice.do) == (why, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
-    notice = of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
+    notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()
     for unknown in ([], [{"kind": "of_a_newer_release", "board": "RV"}]):
-        notice = of_rejection(0, 1, [told], unknown, "")
+        notice = notice_of_rejection(0, 1, [told], unknown, "")
         assert (notice.why, notice.detail) == ("", told)
         assert notice.do

@@ -8,7 +8,6 @@ import shutil
 import signal
 import threading
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -24,6 +23,7 @@ from polysight.host.store.scan_folder import ScanFolder
 from polysight.host.store.validation import validate
 from polysight.shared import messages as m
 from polysight.shared.error_codes import ErrorCode
+from tests.support.acquisition.receivers import receivers
 from tests.support.refusals import refused
 
 
@@ -31,18 +31,7 @@ def limited(instrument, **limits):
     return msgspec.structs.replace(instrument, limits=msgspec.structs.replace(instrument.limits, **limits))
 
 
-def receivers() -> list[int]:
-    """Process ids of this process' receivers."""
-    children = Path(f"/proc/self/task/{threading.main_thread().native_id}/children").read_text().split()
-    found = []
-    for pid in children:
-        line = Path(f"/proc/{pid}/cmdline").read_bytes()
-        if b"polysight.host.capture.receiver_process" in line:
-            found.append(int(pid))
-    return found
-
-
-def test_next_row_waits_for_processing_and_says_so(rig, tmp_path):
+def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
     """Processing hangs on row 0: with one row allowed to wait, row 2 is committed last; released, all are."""
     release, started, at_wait = threading.Event(), [], []
 
@@ -180,14 +169,6 @@ def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
     assert facts[1]["note"].startswith("held")
     assert "note" not in facts[0]
     assert validate(tmp_path / "s") == []
-
-
-def test_row_held_so_long_that_the_cards_ended_their_records_is_taken_again(rig, tmp_path):
-    rig.pi.notes[1, 1] = "held on the way: some positions were passed below full speed"
-    rig.cards["RV"].short[1, 1] = 3 * rig.instrument.frame_bytes
-    result = run_scan(rig.instrument, tmp_path / "s")
-    assert (result.exit_status, result.retakes) == ("success", 1)
-    assert "the row was held" in result.folder.facts("row_rejected")[0]["reasons"][0]
 
 
 def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):

@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 import tomli_w
 
+from polysight.host.capture.card import CardClient
 from polysight.shared.config import Board, Instrument
 from polysight.shared.tables import to_builtins
 from polysight.simulators.faults import Faults
 from polysight.simulators.loopback import on_free_subnet
-from tests.support.capture.cards import Cards
+from tests.support.capture.cards import Cards, ScriptedCard
 from tests.support.rigs import rig_with
 
 
@@ -56,3 +57,17 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
             return made
 
         yield start
+
+
+@pytest.fixture
+def scripted(rig: Instrument) -> Iterator[Callable[..., tuple[CardClient, ScriptedCard]]]:
+    """Makes a client and a card with scripted answers, of board RV."""
+    board = rig.by_name("RV")
+    with ExitStack() as stack:
+
+        def make(answers, timeout_s: float = 30.0, source_port: int = 1024) -> tuple[CardClient, ScriptedCard]:
+            card = ScriptedCard(board, answers, source_port)
+            stack.callback(card.close)
+            return stack.enter_context(CardClient(board, timeout_s)), card
+
+        yield make

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,34 +18,33 @@ from polysight.shared.tables import to_builtins
 from polysight.simulators.cards import bound_udp
 from polysight.simulators.faults import Faults
 from tests.support.paths import POLYSIGHT
+from tests.support.processes import Bench, Ended
 
 LIMIT_S = 60.0
 NEW_MAC = "12:34:56:78:90:13"
 
 
 @pytest.fixture
-def card(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended]:
     """Runs `polysight card ...` beside the rig file."""
 
-    def run(*words: str, typed: str = "") -> subprocess.CompletedProcess[str]:
-        command = [str(POLYSIGHT), "card", *words]
-        return subprocess.run(
-            command, input=typed, capture_output=True, text=True, cwd=tmp_path, timeout=LIMIT_S, check=False
-        )
+    def run(*words: str, typed: str = "") -> Ended:
+        monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
+        return Bench(tmp_path).here("card", *words)
 
     return run
 
 
-def verdicts(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, dict[str, str]]]:
+def verdicts(done: Ended) -> dict[str, dict[str, dict[str, str]]]:
     """Hops by board and name."""
-    return {s["name"]: {hop["hop"]: hop for hop in s["hops"]} for s in json.loads(done.stdout)}
+    return {s["name"]: {hop["hop"]: hop for hop in s["hops"]} for s in json.loads(done.out)}
 
 
 def test_every_hop_of_every_card(cards, card):
     cards("LS", "RH", "RV")
     done = card("--json")
-    assert done.returncode == 0, done.stderr
-    surveys = json.loads(done.stdout)
+    assert done.status == 0, done.err
+    surveys = json.loads(done.out)
     assert [(s["name"], s["ok"], s["fpga_version"], s["silent_hop"]) for s in surveys] == [
         (name, True, "2.8", "") for name in ("LS", "RH", "RV")
     ]
@@ -61,7 +62,7 @@ def test_every_hop_of_every_card(cards, card):
         else:  # a right is missing: which, and what to do
             assert (receiver["verdict"], receiver["why"] != "") == ("warning", True)
             assert "limits.d" in receiver["remedy"]
-    text = card().stdout
+    text = card().out
     for part in ("RH (receive_h)", "not recorded", "replies, FPGA 2.8", "bytes granted", "polysight doctor", "core"):
         assert part in text
 
@@ -69,16 +70,16 @@ def test_every_hop_of_every_card(cards, card):
 def test_a_mute_card_is_named_and_its_neighbour_is_sound(cards, card):
     made = cards("RH", "RV", RV=Faults(mute=True))
     done = card("--json")
-    assert done.returncode == 1
+    assert done.status == 1
     hops = verdicts(done)
     assert hops["RH"]["card"]["verdict"] == "ok"
     assert hops["RV"]["card"]["verdict"] == "error"
     assert "did not answer ALIVE" in hops["RV"]["card"]["found"]
     assert hops["RV"]["card"]["remedy"]
     assert hops["RV"]["receiver"]["verdict"] == "not checked"
-    assert [s["silent_hop"] for s in json.loads(done.stdout)] == ["card", "", "card"]  # nobody plays LS
+    assert [s["silent_hop"] for s in json.loads(done.out)] == ["card", "", "card"]  # nobody plays LS
     assert made.endpoints["RV"].counts["requests"] > 0
-    text = card().stdout
+    text = card().out
     assert "error       card" in text
     assert "not checked receiver, buffer, radar" in text
 
@@ -89,7 +90,7 @@ def test_a_port_in_use_and_a_radar_that_does_not_stream(cards, card, rig, tmp_pa
     cards("RH", streams=recording)
     cards("LS", "RV")
     done = card("--listen", "1", "--json")
-    assert done.returncode == 1
+    assert done.status == 1
     hops = verdicts(done)
     assert hops["RH"]["radar"]["verdict"] == "ok", hops["RH"]["radar"]
     assert int(hops["RH"]["radar"]["found"].split()[0]) > 100
@@ -101,13 +102,13 @@ def test_a_port_in_use_and_a_radar_that_does_not_stream(cards, card, rig, tmp_pa
     assert (hop["verdict"], "is in use" in hop["found"], "ss -ulnp" in hop["remedy"]) == ("error", True, True)
 
 
-def test_a_buffer_below_two_bursts_is_an_error_with_what_to_do(cards, card, rig, tmp_path):
+def test_a_buffer_below_two_bursts_is_an_error_with_a_remedy(cards, card, rig, tmp_path):
     cards("LS", "RH", "RV")
     table = to_builtins(rig)
     table["card"]["receive_buffer_bytes"] = 8192
     (tmp_path / "instrument.toml").write_text(tomli_w.dumps(table))
     done = card("--json")
-    assert done.returncode == 1
+    assert done.status == 1
     hop = verdicts(done)["RH"]["buffer"]
     assert (hop["verdict"], "less than two bursts" in hop["found"]) == ("error", True)
     assert "sysctl -w net.core.rmem_max=" in hop["remedy"]
@@ -124,13 +125,13 @@ def test_a_buffer_below_two_bursts_is_an_error_with_what_to_do(cards, card, rig,
         (["reset", "RX"], "no board 'RX'"),
     ],
 )
-def test_what_is_refused_writes_nothing(cards, card, words, says):
+def test_refused_commands_write_nothing(cards, card, words, says):
     made = cards("RH")
     before = made.endpoints["RH"].card.network
     done = card(*words)
-    assert done.returncode == 2, done
-    assert says in done.stderr
-    assert "\n  do: " in done.stderr
+    assert done.status == 2, done
+    assert says in done.err
+    assert "\n  do: " in done.err
     made.power_cycle("RH")
     assert made.endpoints["RH"].card.network == before
 
@@ -139,8 +140,8 @@ def test_a_wrong_confirmation_writes_nothing(cards, card, rig):
     made = cards("RH")
     for typed in ("yes\n", rig.by_name("RV").card_address + "\n"):
         done = card("program", "RH", "--mac", NEW_MAC, typed=typed)
-        assert done.returncode == 2
-        assert "EEPROM not written" in done.stderr
+        assert done.status == 2
+        assert "EEPROM not written" in done.err
     made.power_cycle("RH")
     assert made.endpoints["RH"].card.network == made.network_of(rig.by_name("RH"))
 
@@ -182,10 +183,10 @@ def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
 def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp_path):
     made = cards("RH", RH=Faults(boot_s=4.0))
     done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "1")
-    assert done.returncode == 5
-    assert "written, but the card was not switched off" in done.stderr
+    assert done.status == 5
+    assert "written, but the card was not switched off" in done.err
     done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
-    assert (done.returncode, "`polysight card` tells" in done.stdout) == (0, True)
+    assert (done.status, "`polysight card` tells" in done.out) == (0, True)
     assert "it answers at" in programmed(made, "RH", tmp_path, rig.by_name("RH").card_address, "RH")
     assert made.endpoints["RH"].card.network.mac.hex(":") == NEW_MAC
 
@@ -193,24 +194,24 @@ def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp
 def test_a_mute_card_is_not_programmed(cards, card):
     cards("RH", RH=Faults(mute=True))
     done = card("program", "RH", "--mac", NEW_MAC, "--yes")
-    assert done.returncode == 5
-    assert "did not answer" in done.stderr
-    assert "written" not in done.stdout
+    assert done.status == 5
+    assert "did not answer" in done.err
+    assert "written" not in done.out
 
 
-def test_an_eeprom_failure_is_told(cards, card):
+def test_an_eeprom_failure_is_reported(cards, card):
     cards("RH", RH=Faults(command_status=((0x04, 2),)))
     done = card("program", "RH", "--mac", NEW_MAC, "--yes", "--wait", "0")
-    assert done.returncode == 5
-    assert "EEPROM failure" in done.stderr
+    assert done.status == 5
+    assert "EEPROM failure" in done.err
 
 
 def test_reset(cards, card):
     made = cards("RH")
     made.endpoints["RH"].card._packetiser.sequence = 77
     done = card("reset", "RH", "--radar")
-    assert (done.returncode, "armed again" in done.stdout) == (0, True)
+    assert (done.status, "armed again" in done.out) == (0, True)
     assert made.endpoints["RH"].card._packetiser.sequence == 77
     done = card("reset", "RH")
-    assert (done.returncode, "configures it anew" in done.stdout) == (0, True), done
+    assert (done.status, "configures it anew" in done.out) == (0, True), done
     assert made.endpoints["RH"].card._packetiser.sequence == 1

@@ -99,27 +99,19 @@ def a_whole_picture(tmp_path: Path) -> bytes:
         (lambda _p: Path(sys.executable).resolve().read_bytes()[: 1 << 20], False),
     ],
 )
-def test_what_is_no_capture_has_a_status_of_its_own(tmp_path, capsys, content, is_capture):
+def test_files_that_are_no_recordings_have_their_own_status(tmp_path, capsys, content, is_capture):
     path = tmp_path / "x.bin"
     path.write_bytes(content(tmp_path))
     assert inspect_file(path, None, None, "", as_json=False) == (0 if is_capture else DataError.exit_status)
     assert ("not a capture" in capsys.readouterr().out) is not is_capture
 
 
-def test_faults_are_told(tmp_path):
+def test_empty_and_truncated_recordings_are_reported(tmp_path):
     path = tmp_path / "x.bin"
-    words = row(4, False, dead=2)
-    words[8] = 32767
-    words.tofile(path)
-    with path.open("ab") as f:
-        f.write(b"12345")
-    text = main_text(inspect_bin(path))
-    for part in ("RX 2", "1 values are at full scale", "5 bytes after"):
-        assert part in text
+    path.write_bytes(row(4, False).tobytes() + b"12345")
+    assert "5 bytes after" in main_text(inspect_bin(path))
     np.zeros(4096, dtype=np.uint8).tofile(path)
     assert "every sample is zero" in main_text(inspect_bin(path, Known(4, samples=256, q_first=False)))
-    (row(4, False).view("<u2") ^ 0x8000).tofile(path)
-    assert "offset binary" in main_text(inspect_bin(path, Known(4, samples=256)))
 
 
 @pytest.mark.parametrize("lanes", [4, 2])
@@ -137,7 +129,7 @@ def test_real_samples_are_recognised(tmp_path, lanes, samples):
 @pytest.mark.parametrize(
     "given", [Shape(2, True, 256), Shape(4, True, 512), Shape(4, False, 256), Shape(2, False, 256)]
 )
-def test_a_layout_that_does_not_fit_is_told(tmp_path, given):
+def test_a_layout_that_does_not_fit_is_reported(tmp_path, given):
     path = tmp_path / "x.bin"
     row(4, False).tofile(path)
     assert inspect_shape(path, Shape(4, True, 256)).remarks == []
@@ -145,22 +137,12 @@ def test_a_layout_that_does_not_fit_is_told(tmp_path, given):
     assert any(str(Shape(4, True, 256)) in text for text in remarks)
 
 
-def test_wrong_order_of_i_and_q_is_told(tmp_path):
+def test_swapped_i_and_q_are_reported(tmp_path):
     path = tmp_path / "x.bin"
     row(4, True).tofile(path)
     assert any("I and Q" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks)
     assert inspect_shape(path, Shape(4, True, 256), q_first=True).remarks == []
     assert inspect_shape(path, Shape(4, True, 256), q_first=None).q_first
-
-
-def test_offset_binary_and_constant_offset_are_told(tmp_path):
-    path = tmp_path / "x.bin"
-    (row(4, False).view("<u2") ^ 0x8000).tofile(path)
-    r = inspect_bin(path)
-    assert any("offset binary" in text for text in r.remarks)
-    assert (r.lanes, r.is_complex, r.samples, r.clipped) == (4, True, 256, 0)
-    (row(4, False) + np.int16(4000)).tofile(path)
-    assert any("constant offset of 56" in text for text in inspect_shape(path, Shape(4, True, 256)).remarks)
 
 
 def altered(words: np.ndarray, fault: str) -> np.ndarray:
@@ -183,7 +165,7 @@ def altered(words: np.ndarray, fault: str) -> np.ndarray:
         ("clipping", "full scale"),
     ],
 )
-def test_a_fault_is_told_and_the_layout_is_still_recognised(tmp_path, lanes, is_complex, fault, says):
+def test_a_fault_is_reported_and_the_layout_still_recognised(tmp_path, lanes, is_complex, fault, says):
     """Nothing is given: the layout is guessed from data with the fault in it, and the fault is the only remark."""
     sound = row(lanes, False) if is_complex else real_row(lanes)
     path = tmp_path / "x.bin"
@@ -199,7 +181,7 @@ def test_a_fault_is_told_and_the_layout_is_still_recognised(tmp_path, lanes, is_
 
 @pytest.mark.parametrize("lanes", [4, 2])
 @pytest.mark.parametrize("dead", [0, 3])
-def test_a_missing_antenna_is_told_in_either_layout(tmp_path, lanes, dead):
+def test_a_missing_antenna_is_reported_in_either_layout(tmp_path, lanes, dead):
     path = tmp_path / "x.bin"
     row(lanes, False, dead=dead).tofile(path)
     r = inspect_bin(path)
@@ -272,7 +254,7 @@ def test_pcap_forms(tmp_path, order, magic, tick):
     assert found[0].source == ("192.168.33.180", 1024)
 
 
-def test_pcap_with_loss_is_placed_and_told(tmp_path):
+def test_lost_packets_of_a_pcap_are_masked_and_reported(tmp_path):
     data = row(4, False).tobytes()
     count, sequence = 2**48 - 30_000, 2**32 - 3
     starts = range(0, len(data), 1456)

@@ -23,6 +23,7 @@ from polysight.host.capture.segment import read_index
 from polysight.shared.config import Board
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DeviceError
+from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
 FULL = 1456
@@ -52,13 +53,6 @@ def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
         card.sendto(packet, (board.host_address, board.data_port))
 
 
-def wait_until(condition, limit_s: float = 60.0) -> None:
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
 def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
     size = 300 * 4096
     first, second, third = (noise(size, s) for s in (1, 2, 3))
@@ -73,10 +67,10 @@ def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
             if k == 1:
                 some = [*some[2:50], some[51], some[50], some[51], *some[52:]]  # head lost, reordered, duplicate
                 send(card, board, [*some, b"tiny"])
-                wait_until(lambda: receiver.report().received == size - 2 * FULL)
+                wait_for(lambda: receiver.report().received == size - 2 * FULL, "packets")
             else:
                 send(card, board, some)
-                wait_until(lambda: receiver.poll().complete)
+                wait_for(lambda: receiver.poll().complete, "packets")
             row = receiver.end_row()
             assert (row.row, row.take, row.expected, row.located) == (k, 1, size, True)
             assert row.crc32 == zlib.crc32(path.read_bytes())
@@ -105,7 +99,7 @@ def test_data_counts_from_any_source_port(board, tmp_path, source_port):
     ):
         receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part")
         send(card, board, packets(data, 1, 0))
-        wait_until(lambda: receiver.poll().complete)
+        wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row()
     assert (row.complete, row.strangers) == (True, 0)
     assert (tmp_path / "a.part").read_bytes() == data
@@ -116,11 +110,11 @@ def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
     other = (board.host_address, 0)
     with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*other, "stranger")) as stranger:
         send(card, board, packets(noise(5000, 5), 1, 0))
-        wait_until(lambda: _waiting(board) > 0)
+        wait_for(lambda: _waiting(board) > 0, "packets")
         assert receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part") == 4
         stranger.sendto(packets(noise(5000, 6), 1, 0)[0], (board.host_address, board.data_port))
         send(card, board, packets(data, 70, 999))
-        wait_until(lambda: receiver.poll().complete)
+        wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row()
     assert row.complete
     assert (row.strangers, row.stale) == (1, 4)
@@ -138,12 +132,11 @@ def _waiting(board: Board) -> int:
     return 0
 
 
-def test_discard_and_an_empty_row(board, tmp_path):
+def test_a_new_row_discards_the_one_before_and_may_be_empty(board, tmp_path):
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 4096, 4096, tmp_path / "a.part")
-        receiver.discard()
+        receiver.begin_row(0, 2, 4096, 4096, tmp_path / "b.part")
         assert not (tmp_path / "a.part").exists()
-        receiver.begin_row(0, 2, 4096, 4096, tmp_path / "a.part")
         row = receiver.end_row()
     assert (row.packets, row.missing, row.first_arrival_ns) == (0, [(0, 4096)], 0)
 
@@ -187,7 +180,9 @@ def test_ends_when_its_host_is_killed(board, tmp_path):
         assert host.stdout is not None
         pid = int(host.stdout.readline())
         host.kill()
-    wait_until(lambda: not Path(f"/proc/{pid}/cmdline").exists() or not Path(f"/proc/{pid}/cmdline").read_bytes())
+    wait_for(
+        lambda: not Path(f"/proc/{pid}/cmdline").exists() or not Path(f"/proc/{pid}/cmdline").read_bytes(), "packets"
+    )
     with closing(bind_udp(board.host_address, board.data_port, "free again")):
         pass
 
@@ -217,7 +212,7 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         for packet in some[:20]:
             card.sendto(packet, (other.host_address, other.data_port))
         os.kill(swamped.pid, signal.SIGCONT)
-        wait_until(lambda: quiet.report().received == 20 * FULL)
+        wait_for(lambda: quiet.report().received == 20 * FULL, "packets")
         hit, spared = swamped.end_row(), quiet.end_row()
         assert hit.kernel_drops == 2000 - hit.packets > 0
         assert spared.kernel_drops == 0
@@ -226,12 +221,12 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         assert swamped.end_row().kernel_drops == 0
 
 
-def test_what_the_card_dropped_itself_is_reported_with_the_row(board, card, tmp_path):
+def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
     data = noise(20_000, 4)
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, len(data), 1000, tmp_path / "a.part")
         send(card, board, packets(data, 1, 0))
-        wait_until(lambda: receiver.poll().complete)
+        wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row(Status.LVDS_BUFFER_FULL | Status.RECORD_COMPLETED)
     assert row.lost_before_packets == Status.LVDS_BUFFER_FULL
     assert not row.complete
@@ -240,12 +235,12 @@ def test_what_the_card_dropped_itself_is_reported_with_the_row(board, card, tmp_
     assert read_index(tmp_path / "a.idx")[0]["card_status"] == row.card_status
 
 
-def test_the_short_last_packet_is_told_unasked(board, card, tmp_path):
+def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
     """Frames were missed: the byte count is never reached, and the card's short tail says that nothing follows."""
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part")
         send(card, board, packets(noise(36_864, 4), 1, 0))
-        wait_until(lambda: receiver.poll().ended)
+        wait_for(lambda: receiver.poll().ended, "packets")
         assert not receiver.poll().complete
         row = receiver.end_row()
     assert not row.located

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from polysight.host.capture.dca1000 import Status
 from polysight.host.capture.receiver import ReceiverProcess
 from polysight.shared.config import Card
 from polysight.simulators.faults import Faults
+from tests.support.processes import wait_for
 
 SIZE = 300 * 4096 + 1300  # ends with a short packet
 FULL = 1456
@@ -30,13 +30,6 @@ def recording(tmp_path) -> Path:
     return path
 
 
-def wait_until(condition) -> None:
-    deadline = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def records(rig, folder, count=2):
     """Rows received of a card that plays the recording, one record each, until the card says that each is completed."""
     board = rig.by_name("RH")
@@ -47,7 +40,7 @@ def records(rig, folder, count=2):
             path = folder / f"{k}.bin"
             receiver.begin_row(k, 1, SIZE, 4096, path)
             card.record_start()
-            wait_until(lambda: Status.RECORD_COMPLETED in card.take_status())
+            wait_for(lambda: Status.RECORD_COMPLETED in card.take_status(), "packets")
             yield receiver.end_row(card.take_status()), np.fromfile(path, dtype=np.uint8)
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.pi_controller.executor import REPLAYED_IN_A_ROW, Executor, Request
+from polysight.pi_controller.executor import REPLAYED_IN_A_ROW, Executor
 from polysight.pi_controller.journal import Journal
 from polysight.pi_controller.trigger import TriggerLoop
 from polysight.shared import messages as m
@@ -59,7 +59,8 @@ class Bench:
 
     def ask(self, command: m.AnyCommand) -> Any:
         replies: list[m.AnyReply] = []
-        self.turn(Request(command, replies.append))
+        assert self.executor.submit(command, replies.append)
+        self.turn()
         return replies[0] if replies else None
 
     def begin(self, scan_id: str = "s", heartbeat_s: float = HEARTBEAT_S) -> Any:

@@ -10,7 +10,7 @@ import tomli_w
 from polysight.host.cli.main import main
 from polysight.host.store.sources.open import open_source
 from polysight.host.store.sources.published import PublishedCubes
-from polysight.host.sync.synchronised import recognise
+from polysight.host.sync.cubes import detect_form
 from polysight.shared.config import Image
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.tables import to_builtins
@@ -106,7 +106,7 @@ def test_an_empty_cube_is_an_error(tmp_path):
     source = open_source(folder, SMALL)
     assert isinstance(source, PublishedCubes)
     with refused(ErrorCode.NO_DATA):
-        recognise([0 * source.read_row("RH", 0).cube], source.instrument, source.instrument.receivers[0])
+        detect_form([0 * source.read_row("RH", 0).cube], source.instrument, source.instrument.receivers[0])
 
 
 def test_cubes_are_processed_like_any_scan_but_have_no_sync_report(tmp_path):

@@ -4,32 +4,20 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from polysight.shared.errors import DeviceError
-from polysight.shared.wires import WireEdge, WireMessage, WireMotion
 from polysight.simulators.builds import SKETCH_DIR, build_sketch, sketch_compiler
 from polysight.simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
-from tests.support.paths import REPO, RIG_FILE
-from tests.support.stage import conversation as conversations
 from tests.support.stage.drivers import Driver, FirmwareDriver, PortDriver, PythonDriver, UnoDriver
+from tests.support.stage.processes import StageProcess
 from tests.support.stage.uno_host import Host
 
 _SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
-
-
-def edges(wires: list[WireMessage]) -> list[WireEdge]:
-    return [w for w in wires if isinstance(w, WireEdge)]
-
-
-def motions(wires: list[WireMessage]) -> list[WireMotion]:
-    return [w for w in wires if isinstance(w, WireMotion)]
 
 
 @pytest.fixture(scope="session")
@@ -97,22 +85,10 @@ def host(make_uno: Callable[..., EmulatedUno]) -> Host:
     return Host(make_uno(start=(300, 250))).ready()
 
 
-@pytest.fixture
-def conversation() -> ModuleType:
-    """Plays dialogue files."""
-    return conversations
-
-
-@pytest.fixture
-def port_driver() -> type[Driver]:
-    """What talks to a stage through a serial port, as --stage-port does."""
-    return PortDriver
-
-
 @pytest.fixture(params=["pc", "sanitized", "python", "uno", "port"])
 def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
     """Any stage, just switched on."""
-    kind = request.param
+    kind, closed = request.param, ExitStack()
     if kind == "pc":
         driver = FirmwareDriver(request.getfixturevalue("firmware_program"))
     elif kind == "sanitized":
@@ -129,29 +105,13 @@ def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
         elif dialogue is not None or request.config.getoption("--long"):
             # Three times real time, but a heartbeat is one of the wall clock, however fast the motion runs.
             speed = 1.0 if dialogue is not None and dialogue.stem == "heartbeat" else 3.0
-            driver = PortDriver(request.getfixturevalue("simulated_port")(speed), speed)
+            process = closed.enter_context(closing(StageProcess(tmp_path, "pc", speed)))
+            driver = PortDriver(str(process.link), speed)
         else:
             pytest.skip("minutes at a port: --long, or a real stage: --stage-port /dev/ttyACM0 (it homes and moves)")
     yield driver
     driver.close()
-
-
-@pytest.fixture
-def simulated_port(tmp_path: Path) -> Iterator[Callable[[float], str]]:
-    """Starts a simulated stage at so many times real time; its serial port."""
-    with ExitStack() as started:
-
-        def start(time_scale: float) -> str:
-            port = str(tmp_path / "ttySTAGE")
-            command = [sys.executable, "-m", "polysight.simulators.stage", "--config", str(RIG_FILE)]
-            command += ["--link", port, "--time-scale", repr(time_scale)]
-            stage = started.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPO))
-            started.callback(stage.terminate)
-            assert stage.stdout is not None
-            assert stage.stdout.readline().startswith("ready")
-            return port
-
-        yield start
+    closed.close()
 
 
 @pytest.fixture(params=["firmware", "python"])
@@ -166,35 +126,14 @@ def stage(request: pytest.FixtureRequest) -> Iterator[Driver]:
 
 
 @pytest.fixture
-def both(firmware_program: Path) -> Iterator[tuple[Driver, Driver]]:
-    """The firmware and the stand-in side by side."""
-    drivers = FirmwareDriver(firmware_program), PythonDriver()
-    yield drivers
-    for driver in drivers:
-        driver.close()
-
-
-@pytest.fixture
-def driver_pair(firmware_program: Path) -> Iterator[Callable[[float], tuple[Driver, Driver]]]:
-    """Makes the two with other steps per millimetre."""
+def both(firmware_program: Path) -> Iterator[Callable[..., tuple[Driver, Driver]]]:
+    """Makes the firmware and the stand-in side by side, with these steps per millimetre."""
     made: list[Driver] = []
 
-    def make(steps_per_mm: float) -> tuple[Driver, Driver]:
+    def make(steps_per_mm: float = 200.0) -> tuple[Driver, Driver]:
         made.extend([FirmwareDriver(firmware_program, steps_per_mm), PythonDriver(steps_per_mm)])
         return made[-2], made[-1]
 
     yield make
     for driver in made:
         driver.close()
-
-
-@pytest.fixture
-def only_edges() -> object:
-    """Picks the S lines."""
-    return edges
-
-
-@pytest.fixture
-def only_motions() -> object:
-    """Picks the M lines."""
-    return motions

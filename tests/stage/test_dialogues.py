@@ -20,12 +20,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.stage.conversation import play
+
 DIALOGUES = sorted((Path(__file__).parent / "dialogues").glob("*.txt"))
 
 
 @pytest.mark.parametrize("path", DIALOGUES, ids=lambda p: p.stem)
-def test_dialogue(talker, conversation, path: Path):
-    conversation.play(talker, path)
+def test_dialogue(talker, path: Path):
+    play(talker, path)
 
 
 def test_there_are_dialogues():

@@ -44,7 +44,7 @@ def _act(rng: random.Random, sequence: int) -> tuple[str, object]:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_same_words_and_same_wires(both, seed: int):
-    firmware, python = both
+    firmware, python = drivers = both()
     rng = random.Random(seed)
     greetings = [
         ("rx", Command(n, v, a).encode()) for n, v, a in ((0, "HELLO", ()), (1, "ENABLE", (1,)), (2, "HOME", ()))
@@ -56,20 +56,20 @@ def test_same_words_and_same_wires(both, seed: int):
         script.append(_act(rng, sequence))
     for i, (name, argument) in enumerate(script):
         arguments = argument if isinstance(argument, tuple) else () if argument is None else (argument,)
-        for driver in both:
+        for driver in drivers:
             getattr(driver, name)(*arguments)
         where = f"seed {seed}, action {i}: {name} {argument}"
         assert firmware.received == python.received, where
         assert firmware.wires == python.wires, where
         assert firmware.t_ns == python.t_ns, where
-        for driver in both:
+        for driver in drivers:
             driver.received = b""
             driver.wires.clear()
 
 
 @pytest.mark.parametrize("steps_per_mm", [80.0, 157.48])
-def test_same_positions_with_other_screws(driver_pair, steps_per_mm: float):
-    firmware, python = driver_pair(steps_per_mm)
+def test_same_positions_with_other_screws(both, steps_per_mm: float):
+    firmware, python = both(steps_per_mm)
     for driver in (firmware, python):
         driver.ready()
         driver.motion("ROW", 3000, 77, 10, 1234, 1111)

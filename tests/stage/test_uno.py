@@ -156,7 +156,7 @@ def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest
     host.obeyed("MOVE", 200, 200, 4000)
     host.uno.rest()
     host.replies()
-    for _ in range(100 if request.config.getoption("--long") else 6):
+    for _ in range(100 if request.config.getoption("--long") else 3):
         host.obeyed("MOVE", 900, 900, 2000)
         host.uno.run(rng.randint(20 * MS, 200 * MS))
         host.uno.press(mask)

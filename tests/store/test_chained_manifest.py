@@ -6,21 +6,18 @@ import hashlib
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from polysight.host.capture.segment import write_index
 from polysight.host.store import manifest
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
 from polysight.host.store.validation import validate
-from polysight.shared.raster import plan_raster
 from polysight.simulators.scene import decode_scene, simulate
-from tests.support.acquisition.fake_rig import small_instrument
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, PET, scene_of
+from tests.support.store.plain_scan import errors, write_scan
 
 SOME = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
 
@@ -116,28 +113,7 @@ def test_a_manifest_without_chain_reads_as_before_and_goes_on_with_one(tmp_path)
 
 @pytest.fixture
 def scan(tmp_path) -> Path:
-    """Four rows of a small rig, and the end that counts them."""
-    instrument = small_instrument()
-    scan = ScanFolder.create(tmp_path / "scan", instrument, plan_raster(instrument.grid), simulated=True)
-    frames = instrument.grid.columns * instrument.burst.pulses
-    with scan.writer() as writer:
-        for row in scan.plan:
-            boards = {}
-            for name in ("RH", "RV"):
-                path = scan.row_path(name, row.index)
-                data = np.full(instrument.row_bytes, row.index, dtype=np.uint8)
-                data.tofile(path)
-                index = write_index(path.with_suffix(".idx"), {"missing": []}, np.zeros((2, 2), dtype=np.int64))
-                boards[name] = {
-                    "file": str(path.relative_to(scan.path)), "bytes": data.size, "frames_expected": frames,
-                    "frames_received": frames, "missing_bytes": 0, "index_crc32": f"{index:08x}",
-                    "crc32": f"{manifest.zlib.crc32(data.tobytes()):08x}",
-                }  # fmt: skip
-            committed = {"fact": "row_committed", "row": row.index, "take": 1, "direction": row.direction}
-            writer.append({**committed, "boards": boards, "pulses": frames})
-        writer.append({"fact": "scan_ended", "exit_status": "success", "reason": "", "rows_committed": 4})
-    (scan.path / "events.msgpack").write_bytes(b"")
-    return scan.path
+    return write_scan(tmp_path / "scan")
 
 
 def without(folder: Path, *numbers: int) -> None:
@@ -146,15 +122,12 @@ def without(folder: Path, *numbers: int) -> None:
     (folder / MANIFEST).write_bytes(b"".join(line for n, line in enumerate(lines, 1) if n not in numbers))
 
 
-def errors(folder: Path) -> str:
-    return "\n".join(str(f) for f in validate(folder) if f.severity == "error")
-
-
 def test_a_row_s_line_that_is_gone_is_an_error_that_names_line_and_row(scan):
     assert validate(scan) == []
     without(scan, 4)
-    assert "manifest.jsonl line 4" in errors(scan)
-    assert "row 2 " in errors(scan)
+    found = "\n".join(errors(scan))
+    assert "manifest.jsonl line 4" in found
+    assert "row 2 " in found
     found = ScanFolder.load(scan)
     assert list(found.rows()) == [0, 1, 3]
     assert {f.line for f in found.manifest_faults} == {4}
@@ -165,8 +138,9 @@ def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
     facts = [json.loads(line) for line in lines]
     plain = [{k: v for k, v in f.items() if k not in ("crc", "count", "previous")} for f in facts]
     (scan / MANIFEST).write_bytes(b"".join(encode_line(f) for f in plain if f.get("row") != 3))
-    assert "scan_ended counts 4 rows" in errors(scan)
-    assert "row 3 " in errors(scan)
+    found = "\n".join(errors(scan))
+    assert "scan_ended counts 4 rows" in found
+    assert "row 3 " in found
 
 
 def test_a_row_taken_again_makes_the_gap_a_note(scan):
@@ -176,7 +150,7 @@ def test_a_row_taken_again_makes_the_gap_a_note(scan):
         writer.append({"fact": "scan_resumed", "rows_missing": 1})
         writer.append({**lost, "take": 2})
         writer.append({"fact": "scan_ended", "exit_status": "success", "reason": "", "rows_committed": 4})
-    assert errors(scan) == ""
+    assert errors(scan) == []
     assert "line 4" in "\n".join(map(str, validate(scan)))
 
 

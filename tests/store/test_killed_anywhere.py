@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from polysight.host.store.scan_folder import ScanFolder
-from polysight.host.store.validation import Finding, validate
+from polysight.host.store.validation import validate
 from tests.support.store.faulty_disk import FaultyDisk, Killed
+from tests.support.store.plain_scan import errors
 from tests.support.store.small_scan import Samples, SmallScan
 
 POWER_CUTS = 4  # draws of what is left, for each place
@@ -20,10 +21,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # who is killed closes nothing
     pytest.mark.timeout(3600),  # with --long
 ]
-
-
-def errors(path: Path) -> list[Finding]:
-    return [f for f in validate(path) if f.severity == "error"]
 
 
 def retaken(path: Path) -> set[int]:

@@ -17,12 +17,13 @@ from polysight.host.process.request import ProcessRequest
 from polysight.host.store.append_only import AppendFile
 from polysight.host.store.raw import drop, droppable, dropped_files, require_raw
 from polysight.host.store.scan_folder import MANIFEST, ScanFolder
-from polysight.host.store.validation import damaged_rows, validate
+from polysight.host.store.validation import damaged_rows
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, DataError, ScanError
 from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.refusals import refused
 from tests.support.scenes import small_scene
+from tests.support.store.plain_scan import errors
 
 ROWS, BOARDS = 4, 2
 SCENE = small_scene(8, ROWS, metal=False)
@@ -55,15 +56,11 @@ def payloads(scan: Path) -> set[Path]:
     return set(scan.glob("raw/*/*.bin"))
 
 
-def errors(scan: Path) -> list[str]:
-    return [str(f) for f in validate(scan) if f.severity == "error"]
-
-
 def contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
 
 
-def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
+def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     products, digests = contents(scan / "products"), processed_digests(scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
     done = polysight("drop-raw", scan, typed="drop\n")
@@ -92,11 +89,11 @@ def test_dropped_rows_are_gone_and_everybody_says_so(scan, capsys):
     assert "dropped already" in capsys.readouterr().out
 
 
-def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
+def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
     before = payloads(scan)
     for typed in ("", "yes\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
-        with pytest.raises(ConfigError, match="nothing dropped"):
+        with pytest.raises(ConfigError):
             drop_raw(scan, None, yes=False)
     with refused(ErrorCode.FILE_MISSING):
         drop_raw(scan, tmp_path / "none", yes=True)
@@ -106,14 +103,14 @@ def test_nothing_is_dropped_unasked_or_unprocessed(scan, tmp_path, monkeypatch, 
         board["raw_crc32"] = dict.fromkeys(board["raw_crc32"], "00000000")  # of another scan
     quality.write_text(json.dumps(said))
     capsys.readouterr()
-    with pytest.raises(DataError, match="nothing can be dropped"):
+    with pytest.raises(DataError):
         drop_raw(scan, None, yes=True)
     assert capsys.readouterr().out.count("differs from the data of the products") == ROWS * BOARDS
     quality.write_text("{}")
-    with pytest.raises(DataError, match="does not say what it was made from"):
+    with pytest.raises(DataError):
         drop_raw(scan, None, yes=True)
     (scan / "products" / "image.npz").write_bytes(b"half of it")
-    with pytest.raises(DataError, match="not an image product"):
+    with refused(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
     assert payloads(scan) == before
     assert not ScanFolder.load(scan).facts("raw_dropped")

@@ -14,13 +14,13 @@ from polysight.host.capture.earlier_records import Past
 from polysight.host.jobs.placement import inspect_placement, replace_folder
 from polysight.host.store import ManifestWriter, ScanFolder, replace_rows
 from polysight.host.store.append_only import crc32
-from polysight.host.store.validation import validate
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.raster import plan_raster
 from tests.support.capture.records import Record, log_of, mask_of
 from tests.support.refusals import refused
 from tests.support.rigs import rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
+from tests.support.store.plain_scan import errors
 
 
 def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder, bytes]:
@@ -65,11 +65,7 @@ def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None
         assert (row.payload[~row.mask] == want[~row.mask]).all()
 
 
-def errors(scan: ScanFolder) -> list[str]:
-    return [str(f) for f in validate(scan.path) if f.severity == "error"]
-
-
-def test_what_comes_out_the_same_is_not_touched(tmp_path):
+def test_rows_with_the_same_result_are_not_touched(tmp_path):
     scan, data = scan_with(tmp_path / "scan", lost=9)
     before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
     assert [(r.changed, r.left) for r in replace_rows(scan)] == [(False, "")] * 2
@@ -77,15 +73,15 @@ def test_what_comes_out_the_same_is_not_touched(tmp_path):
     holds(scan, data, [(9 * 1456, 10 * 1456)])
 
 
-def test_a_row_that_was_masked_in_vain_is_committed_anew(tmp_path, capsys):
+def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     scan, data = scan_with(tmp_path / "scan", lost=9, wrong=True)
-    assert errors(scan) == []
+    assert errors(scan.path) == []
     assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 1
     assert "committed  differently" in capsys.readouterr().out
     assert replace_folder(scan.path, as_json=False) == 0
     assert f"{len(data)} bytes missing before, 1456 now" in capsys.readouterr().out
     scan.reload()
-    assert errors(scan) == []
+    assert errors(scan.path) == []
     holds(scan, data, [(9 * 1456, 10 * 1456)])
     names = {p.name for p in scan.path.rglob("raw/RH/*")}
     assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS}"}
@@ -107,7 +103,7 @@ def test_a_kill_while_rows_are_replaced_loses_nothing(tmp_path):
         with pytest.raises(Killed), FaultyDisk(folder, "killed within", at)():
             replace_rows(scan)
         scan = ScanFolder.load(scan.path)
-        assert errors(scan) == [], counting.done[at - 1]
+        assert errors(scan.path) == [], counting.done[at - 1]
         replace_rows(scan)
         holds(scan, data, [(9 * 1456, 10 * 1456)])
     gc.collect()  # files that nobody closed are this test's, not the next one's
@@ -115,7 +111,7 @@ def test_a_kill_while_rows_are_replaced_loses_nothing(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx", PACKETS])
 @pytest.mark.parametrize("other", [False, True])
-def test_a_damaged_file_is_told_and_never_placed(tmp_path, suffix, other):
+def test_a_damaged_file_is_reported_and_never_placed(tmp_path, suffix, other):
     """One bit of it is turned, or it is another board's."""
     scan, _ = scan_with(tmp_path / "scan", lost=9)
     path = scan.path / f"raw/RH/0000{suffix}"
@@ -149,4 +145,4 @@ def test_a_row_without_its_packets_is_left(tmp_path):
     (scan.path / f"raw/RH/0000{PACKETS}").unlink()
     (scan.path / f"raw/RV/0000{PACKETS}").write_bytes(b"no")
     assert [bool(r.left) for r in replace_rows(scan)] == [True, True]
-    assert len(errors(scan)) == 2
+    assert len(errors(scan.path)) == 2

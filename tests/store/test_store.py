@@ -6,12 +6,10 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from polysight.host.capture.segment import write_index
 from polysight.host.store import manifest
 from polysight.host.store.events import EventWriter, read_events
 from polysight.host.store.manifest import ManifestWriter, encode_line, parse
@@ -20,10 +18,11 @@ from polysight.host.store.source import RawSource
 from polysight.host.store.validation import to_json, validate
 from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import ConfigError, PolysightError
-from polysight.shared.messages import Fault, RunStarted
+from polysight.shared.messages import Fault
 from polysight.shared.raster import plan_raster
 from tests.support.acquisition.fake_rig import small_instrument
 from tests.support.refusals import refused
+from tests.support.store.plain_scan import write_scan
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
@@ -40,7 +39,7 @@ def test_manifest_round_trip(some):
     raw = b"".join(map(encode_line, some))
     found = parse(raw)
     assert found.facts == some
-    assert (found.length, found.torn, found.damaged) == (len(raw), False, [])
+    assert (found.length, found.torn, found.faults) == (len(raw), False, [])
 
 
 @given(st.lists(facts, min_size=1, max_size=3), st.data())
@@ -56,7 +55,7 @@ def test_flipped_bit_is_never_a_fact(some, data):
     for fact in found.facts:
         assert fact in some
     assert len(found.facts) <= len(some)
-    assert found.torn or found.damaged or found.facts == some
+    assert found.torn or found.faults or found.facts == some
 
 
 def test_every_truncation_gives_the_whole_lines_before_it(tmp_path):
@@ -70,7 +69,7 @@ def test_every_truncation_gives_the_whole_lines_before_it(tmp_path):
         found = parse(raw[:n])
         assert found.facts == some[:whole]
         assert found.torn == (n not in ends)
-        assert found.damaged == []
+        assert found.faults == []
         path.write_bytes(raw[:n])
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
@@ -91,47 +90,8 @@ def test_two_writers_never_share_a_scan(tmp_path):
 
 @pytest.fixture
 def whole(tmp_path) -> Path:
-    """A scan folder of four rows, written without any rig; row 1 of RV lacks some bytes."""
-    instrument = small_instrument()
-    scan = ScanFolder.create(tmp_path / "scan", instrument, plan_raster(instrument.grid), simulated=True)
-    frames = instrument.grid.columns * instrument.burst.pulses
-    events = EventWriter(scan.path / "events.msgpack")
-    events.append(RunStarted(scan_id=scan.scan_id, seq=1, t_mono_ns=1, plan=scan.plan))
-    events.append(Fault(scan_id=scan.scan_id, seq=2, t_mono_ns=2, number=101, what="test"))
-    events.sync()
-    events.close()
-    with scan.writer() as writer:
-        for row in scan.plan:
-            boards = {}
-            for name in ("RH", "RV"):
-                gaps = [(100, 200), (5000, 6000)] if (name, row.index) == ("RV", 1) else []
-                data = np.full(instrument.row_bytes, row.index + 1, dtype=np.uint8)
-                for a, b in gaps:
-                    data[a:b] = 0
-                path = scan.row_path(name, row.index)
-                data.tofile(path)
-                index_crc = write_index(path.with_suffix(".idx"), {"missing": gaps}, np.zeros((2, 2), dtype=np.int64))
-                boards[name] = {
-                    "file": str(path.relative_to(scan.path)),
-                    "bytes": data.size,
-                    "frames_expected": frames,
-                    "frames_received": frames - 2 * bool(gaps),
-                    "missing_bytes": sum(b - a for a, b in gaps),
-                    "crc32": f"{manifest.zlib.crc32(data.tobytes()):08x}",
-                    "index_crc32": f"{index_crc:08x}",
-                }
-            writer.append(
-                {
-                    "fact": "row_committed",
-                    "row": row.index,
-                    "take": 1,
-                    "direction": row.direction,
-                    "boards": boards,
-                    "pulses": frames,
-                }
-            )
-        writer.append({"fact": "scan_ended", "exit_status": "success", "reason": ""})
-    return scan.path
+    """A scan folder of four rows; row 1 of RV lacks some bytes."""
+    return write_scan(tmp_path / "scan", {("RV", 1): [(100, 200), (5000, 6000)]})
 
 
 def test_whole_scan_is_valid_and_reads_back(whole):
@@ -225,7 +185,7 @@ def test_read_row_refuses_damage(whole):
         scan.read_row("RH", 17)
 
 
-def test_what_is_no_scan_is_refused(whole, tmp_path):
+def test_other_folders_are_refused(whole, tmp_path):
     with refused(ErrorCode.FILE_MISSING):
         validate(tmp_path / "nothing")
     (whole / "manifest.jsonl").write_bytes(b"")
@@ -280,7 +240,7 @@ def test_scan_ids_fit_the_wire():
     json.dumps(name)
 
 
-def test_start_that_died_before_its_first_line_is_begun_anew(tmp_path):
+def test_start_that_died_before_its_first_line_is_repeated(tmp_path):
     instrument = small_instrument()
     for torn in (b"", b'{"fact":"scan_star'):
         (tmp_path / "manifest.jsonl").write_bytes(torn)

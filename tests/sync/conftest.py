@@ -1,4 +1,4 @@
-"""Small test signals of known truth: direct path, echoes, per-chirp offsets, noise."""
+"""Small test signals of known truth: direct path, echoes, noise."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def sweep_hz(rig: Instrument) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def paths(rig: Instrument) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """(ideal signal [position, rx, sample], direct path [rx]) with echoes around the mirror point."""
+    """`paths(board, positions, echo, rng)`: ideal signal [position, rx, sample], and direct path [rx], metres."""
 
     def make(
         board: Board, positions: int, echo: float, rng: np.random.Generator, echoes: int = 1, spread_m: float = 0.1
@@ -43,7 +43,7 @@ def paths(rig: Instrument) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 
 @pytest.fixture(scope="session")
 def noise() -> Callable[..., np.ndarray]:
-    """Complex white noise of a power in dB."""
+    """`noise(shape, power_db, rng)`: complex white noise."""
 
     def make(shape: tuple[int, ...], power_db: float, rng: np.random.Generator) -> np.ndarray:
         return 10 ** (power_db / 20) / np.sqrt(2) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
@@ -64,7 +64,7 @@ def counts() -> Callable[..., np.ndarray]:
 
 @pytest.fixture(scope="session")
 def align_single(counts: Callable[..., np.ndarray]) -> Callable[..., AlignedRow]:
-    """Positions [position, rx, sample] of one chirp each, as burst alignment hands them on."""
+    """Align positions [position, rx, sample] of one chirp each."""
 
     def align(received: np.ndarray, usable: np.ndarray, linear: tuple[int, int] = (0, 192)) -> AlignedRow:
         return align_row(counts(received.swapaxes(0, 1)[:, :, None]), usable[:, None], linear)

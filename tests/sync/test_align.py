@@ -1,3 +1,5 @@
+"""Burst alignment: offsets at the Cramer-Rao bound, averages, and bad, missing or silent chirps."""
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ CHIRPS = 16
 
 @pytest.fixture
 def burst(paths, noise, rig, counts):
-    """Raw words [position, chirp, sample, 2, rx], true frequency and phase of each chirp, the signal behind them."""
+    """Raw words [position, chirp, sample, 2, rx], true frequency and phase of each chirp, and the ideal signal."""
 
     def make(positions, snr_db, echo=1.0, seed=0, chirps=CHIRPS):
         rng = np.random.default_rng(seed)
@@ -26,14 +28,14 @@ def burst(paths, noise, rig, counts):
 
 
 def _errors(aligned, df, phase):
-    """Error of each chirp's frequency (cycles a sample) and phase against the others of its burst."""
+    """Errors of frequency (cycles per sample) and phase of each chirp relative to its burst."""
     f = aligned.frequency - df
     turns = np.exp(1j * (aligned.phase - phase))
     return f - f.mean(axis=1, keepdims=True), np.angle(turns / turns.mean(axis=1, keepdims=True))
 
 
 def _bound(signal, snr_db):
-    """Cramer-Rao bound of offsets of a known waveform in white noise: its energy and its energy's spread in time."""
+    """Cramer-Rao bounds of frequency and phase offset of a known waveform in white noise."""
     inside = signal[..., slice(*LINEAR)]
     n = np.arange(inside.shape[-1]) - CENTRE
     energy = (np.abs(inside) ** 2).sum(axis=1)
@@ -58,7 +60,7 @@ def test_offsets_are_at_the_cramer_rao_bound(burst, snr_db, echo):
 
 
 def _divided(words):
-    """Frequency of each chirp against the first, as the paper has it: division, long FFT, highest peak of all RX."""
+    """Frequency of each chirp relative to the first by the paper's method: division, long FFT, highest peak."""
     frames = (words[..., 0, :] + 1j * words[..., 1, :])[:, :, slice(*LINEAR)]
     ratio = frames / np.where(frames[:, :1] == 0, 1, frames[:, :1])
     spectrum = np.abs(np.fft.fft(ratio, 4096, axis=2)).sum(axis=-1)
@@ -67,7 +69,7 @@ def _divided(words):
 
 
 @pytest.mark.parametrize("snr_db", [0, 5])
-def test_at_low_snr_no_gross_errors_and_half_of_divisions_at_most(burst, snr_db):
+def test_at_low_snr_there_are_no_gross_errors_and_half_the_error_of_division(burst, snr_db):
     frames, df, phase, signal = burst(30, snr_db)
     f, _ = _errors(align_row(frames, np.ones(df.shape, bool), LINEAR), df, phase)
     bin_ = 1 / 192
@@ -75,7 +77,7 @@ def test_at_low_snr_no_gross_errors_and_half_of_divisions_at_most(burst, snr_db)
     assert np.abs(f).max() < 8 * _bound(signal, snr_db)[0]
     divided = _divided(frames) - df
     divided -= np.median(divided, axis=1, keepdims=True)
-    small = np.abs(divided) < bin_ / 2  # its gross errors are left out
+    small = np.abs(divided) < bin_ / 2  # without its gross errors
     assert f.std() < 0.5 * divided[small].std()
 
 
@@ -83,7 +85,7 @@ def test_average_is_the_signal_with_its_noise_reduced(burst):
     frames, df, _, signal = burst(20, 10)
     mean = align_row(frames, np.ones(df.shape, bool), LINEAR).mean / 1000
     n = np.arange(signal.shape[-1])
-    for p in range(20):  # the average is in the frame of its reference chirp: one frequency and phase from the signal
+    for p in range(20):  # the average differs by the frequency and phase of its reference chirp
         z = (mean[p] * signal[p].conj()).sum(axis=0)[:192]
         grid = np.fft.fft(z, 1 << 16)
         f = np.argmax(np.abs(grid)) / (1 << 16)
@@ -92,7 +94,7 @@ def test_average_is_the_signal_with_its_noise_reduced(burst):
         assert residual < 1.5 * 0.1 / CHIRPS
 
 
-def test_frequency_and_phase_common_to_the_chirps_change_nothing_else(burst, counts):
+def test_a_common_frequency_and_phase_of_all_chirps_has_no_other_effect(burst, counts):
     frames, df, _, _ = burst(6, 15)
     n = np.arange(frames.shape[2])
     received = (frames[..., 0, :] + 1j * frames[..., 1, :]).transpose(3, 0, 1, 2) / 1000
@@ -104,7 +106,7 @@ def test_frequency_and_phase_common_to_the_chirps_change_nothing_else(burst, cou
     np.testing.assert_allclose(np.abs(other.mean), np.abs(one.mean), atol=10)  # a hundredth of the direct path
 
 
-def test_residual_tells_the_true_error(burst):
+def test_the_residual_is_the_true_error(burst):
     frames, df, phase, _ = burst(60, 12)
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
     for k, error in enumerate(_errors(aligned, df, phase)):
@@ -112,7 +114,7 @@ def test_residual_tells_the_true_error(burst):
 
 
 @pytest.mark.parametrize("bad", [0, 7])
-def test_a_bad_chirp_does_not_spoil_its_burst(burst, noise, bad):
+def test_a_chirp_of_noise_is_left_out(burst, noise, bad):
     frames, df, _, _ = burst(12, 15)
     rng = np.random.default_rng(5)
     frames[:, bad] = np.rint(1000 * noise(frames[:, bad].shape, 3, rng).real)
@@ -127,7 +129,7 @@ def test_a_bad_chirp_does_not_spoil_its_burst(burst, noise, bad):
 @pytest.mark.parametrize("how", ["saturated", "silent", "another signal"])
 @pytest.mark.parametrize("bad", [0, 9])
 def test_one_spoiled_chirp_of_16_changes_nothing(burst, how, bad):
-    """The average is that of the 15 others, whatever the bad one holds."""
+    """The average is that of the 15 others for any content of the bad chirp."""
     frames, df, _, _ = burst(6, 15)
     spoiled = frames.copy()
     if how == "saturated":
@@ -142,7 +144,7 @@ def test_one_spoiled_chirp_of_16_changes_nothing(burst, how, bad):
     got = align_row(spoiled, np.ones(df.shape, bool), LINEAR)
     expected = align_row(frames, without, LINEAR)
     np.testing.assert_array_equal(got.good, without)
-    # Averages have the frame of their own reference chirp: what is compared is what does not depend on it.
+    # Magnitudes do not depend on the reference chirp.
     np.testing.assert_allclose(np.abs(got.mean), np.abs(expected.mean), atol=30)
 
 
@@ -161,7 +163,7 @@ def test_missing_chirps_and_missing_positions(burst):
     np.testing.assert_allclose(np.abs(aligned.mean[6]), np.abs(alone.T), rtol=1e-4, atol=1e-2)
 
 
-def test_nothing_but_silence_gives_nothing():
+def test_silent_chirps_give_no_average():
     aligned = align_row(np.zeros((3, 2, 256, 2, 4), np.int16), np.ones((3, 2), bool), LINEAR)
     assert not aligned.good.any()
     assert not aligned.mean.any()

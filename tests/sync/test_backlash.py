@@ -1,4 +1,4 @@
-"""Stage backlash between even and odd rows, recovered from simulated raw data."""
+"""Backlash of the stage is recovered from simulated raw data, or not reported."""
 
 import numpy as np
 import pytest
@@ -37,11 +37,11 @@ def test_backlash_is_recovered_with_everything_else_disturbed(echoes, backlash_m
     assert found.std_mm < 0.05
 
 
-def test_an_empty_plane_tells_nothing(echoes):
+def test_an_empty_plane_gives_no_backlash(echoes):
     found = estimate_backlash(*echoes(0.3, points=[]))
     assert found is None or found.std_mm > 0.1
 
 
-def test_a_few_rows_tell_nothing(echoes):
+def test_too_few_rows_give_no_backlash(echoes):
     rows, rig = echoes(0.3, rows=20)
     assert estimate_backlash({r: rows[r] for r in range(8)}, rig) is None

@@ -1,3 +1,5 @@
+"""A row of raw chirps is synchronised: offsets and filter are removed, residuals measured, bad chirps left out."""
+
 from dataclasses import replace
 
 import msgspec
@@ -7,8 +9,9 @@ import pytest
 from polysight.host.sync import BoardSetup, synchronise_row
 from polysight.host.sync.high_pass_filter import high_pass
 from polysight.host.sync.tone import estimate_tone
-from polysight.shared.errors import DataError
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
+from tests.support.refusals import refused
 
 POSITIONS, PULSES = 9, 6
 
@@ -56,7 +59,7 @@ def _relative_error(row, ideal, inside=slice(0, 192)):
     return np.sqrt((np.abs(scaled - ideal)[..., inside] ** 2).mean() / (np.abs(ideal)[..., inside] ** 2).mean())
 
 
-def test_disturbed_row_comes_back_to_the_ideal(row, setup):
+def test_a_disturbed_row_is_restored_to_the_ideal(row, setup):
     frames, valid, ideal = row()
     done = synchronise_row(frames, valid, setup)
     assert done.valid.all()
@@ -65,14 +68,14 @@ def test_disturbed_row_comes_back_to_the_ideal(row, setup):
     assert _relative_error(done, ideal) < 1.3 * noise_floor
 
 
-def test_offsets_change_nothing_but_noise(row, setup):
+def test_offsets_have_no_effect_beyond_noise(row, setup):
     with_offsets = synchronise_row(*row(offsets=True, snr_db=30)[:2], setup)
     without = synchronise_row(*row(offsets=False, snr_db=30)[:2], setup)
     difference = np.abs(with_offsets.samples - without.samples)[..., :192]
     assert np.sqrt((difference**2).mean()) < 0.04 * 800
 
 
-def test_the_high_pass_filter_is_undone(row, small, setup):
+def test_the_high_pass_filter_is_compensated(row, small, setup):
     frames, valid, ideal = row(filtered=True, snr_db=30)
     undone = synchronise_row(frames, valid, BoardSetup.of(small, small.receivers[1]))
     left = synchronise_row(frames, valid, setup)
@@ -80,7 +83,7 @@ def test_the_high_pass_filter_is_undone(row, small, setup):
     assert _relative_error(undone, ideal, slice(12, 192)) < 0.4 * _relative_error(left, ideal, slice(12, 192))
 
 
-def test_stages_shrink_from_received_to_averaged(row, setup):
+def test_errors_shrink_from_received_to_averaged(row, setup):
     done = synchronise_row(*row()[:2], setup)
     assert list(done.stages) == ["received", "aligned", "averaged", "referenced"]
     f, phase, amplitude = zip(*done.stages.values(), strict=True)
@@ -93,7 +96,7 @@ def test_stages_shrink_from_received_to_averaged(row, setup):
 
 
 def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
-    """The object and the direct path, known to be the same at every position: what scatters is the error."""
+    """Object and direct path are the same at every position, so their scatter is the error."""
     positions, snr_db, board = 400, 12.0, rig.receivers[1]
     signal, _ = paths(board, 1, 1.0, np.random.default_rng(8))
     rng = np.random.default_rng(3)
@@ -114,7 +117,7 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     assert done.stages["averaged"][2] == pytest.approx(done.direct_amplitude.std() / 800, rel=0.15)
 
 
-def test_a_sample_of_positions_tells_what_all_of_them_tell(rig, paths, noise, setup):
+def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, noise, setup):
     signal, rng = paths(rig.receivers[1], 300, 1.0, np.random.default_rng(8))[0], np.random.default_rng(3)
     turn = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
     frames = 800 * (signal.swapaxes(0, 1)[:, :, None] * turn)
@@ -145,7 +148,7 @@ def test_clipped_and_missing_chirps_are_left_out(row, setup):
 
 
 def test_bursts_of_one_chirp(row, setup):
-    """Nothing to align with: the direct path alone synchronises, and what needs two chirps is not told."""
+    """Only the direct path synchronises them; residuals that need two chirps are missing."""
     frames, valid, ideal = row(snr_db=20)
     one = replace(setup, pulses=1)
     done = synchronise_row(frames[:, ::PULSES], valid[::PULSES], one)
@@ -156,7 +159,7 @@ def test_bursts_of_one_chirp(row, setup):
     assert _relative_error(done, ideal) < 1.3 * 10 ** (-20 / 20)
 
 
-def test_a_row_of_nothing_is_all_invalid(setup):
+def test_a_row_without_frames_is_invalid(setup):
     done = synchronise_row(np.zeros((4, 2 * PULSES, 256), np.complex64), np.zeros(2 * PULSES, bool), setup)
     assert not done.valid.any()
     assert done.stages == {}
@@ -164,5 +167,5 @@ def test_a_row_of_nothing_is_all_invalid(setup):
 
 @pytest.mark.parametrize("shape", [(3, PULSES, 256), (4, PULSES + 1, 256), (4, PULSES, 128)])
 def test_frames_of_another_rig_are_refused(setup, shape):
-    with pytest.raises(DataError, match="are not bursts"):
+    with refused(ErrorCode.MISMATCH, shape[1]):
         synchronise_row(np.zeros(shape, np.complex64), np.ones(shape[1], bool), setup)

@@ -1,9 +1,11 @@
-"""The compiled loops and their NumPy form give the same results, at every width of vectors that the processor has."""
+"""The compiled loops and their NumPy form give equal results, for every vector width of the processor."""
 
 from __future__ import annotations
 
 import logging
 import shutil
+import subprocess
+import sys
 from contextlib import suppress
 
 import numpy as np
@@ -18,7 +20,7 @@ WIDTHS = (128, 256, 512)
 
 @pytest.fixture(scope="module")
 def library_file(tmp_path_factory):
-    """The one beside the sources, where it is of these; else compiled for this test."""
+    """The library beside the sources if it is up to date; otherwise compiled for this test."""
     with suppress(compiled.LoadError):
         compiled.Library()
         return build.HERE / build.LIBRARY
@@ -35,7 +37,7 @@ def loops(library_file, request):
 
 
 def bursts(positions=5, chirps=6, samples=256, seed=4):
-    """Tones of every chirp's own frequency and phase, in noise: int16 [position, chirp, sample, 2, rx]."""
+    """Noisy tones with a frequency and phase per chirp: int16 [position, chirp, sample, 2, rx]."""
     rng, n = np.random.default_rng(seed), np.arange(samples)[:, None]
     f = 0.2 + 0.02 * rng.standard_normal((positions, chirps, 1, 1))
     tones = np.exp(2j * np.pi * (f * n + rng.uniform(size=(positions, chirps, 1, 1)))) * np.exp(1j * np.arange(4))
@@ -51,9 +53,9 @@ def same(one: AlignedRow, other: AlignedRow):
     """Equal within float32 rounding; phases may wrap."""
     np.testing.assert_array_equal(one.good, other.good)
     np.testing.assert_array_equal(one.peak, other.peak)
-    some = other.good.any(axis=1)  # silence has no band
+    some = other.good.any(axis=1)  # silent chirps have no band
     np.testing.assert_array_equal(one.centre[some], other.centre[some])
-    usable = (other.coherence > 0.1) & some[:, None]  # the tone of a chirp that matches nothing is any
+    usable = (other.coherence > 0.1) & some[:, None]  # the tone of a chirp without match is arbitrary
     for name in ("mean", "halves"):
         a, b = getattr(one, name), getattr(other, name)
         assert a.dtype == b.dtype
@@ -80,7 +82,7 @@ def test_any_linear_part(loops, rig, linear, filtered):
 
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
 def test_any_number_of_samples(loops, rig, samples, linear):
-    """Nothing depends on whole vectors, or on blocks that fill a chirp."""
+    """Also if samples do not fill whole vectors or blocks."""
     words, valid = bursts(samples=samples), np.ones((5, 6), bool)
     equaliser = equaliser_of(rig)
     same(align(loops, words, valid, linear, equaliser), align_in_numpy(words, valid, linear, equaliser))
@@ -88,7 +90,7 @@ def test_any_number_of_samples(loops, rig, samples, linear):
 
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
 def test_any_number_of_chirps(loops, rig, chirps):
-    """Sixteen are transformed at once; one alone has nothing to be compared with."""
+    """Sixteen are transformed at once; a single one has no reference."""
     words, valid = bursts(positions=3, chirps=chirps), np.ones((3, chirps), bool)
     equaliser = equaliser_of(rig)
     same(align(loops, words, valid, (0, 192), equaliser), align_in_numpy(words, valid, (0, 192), equaliser))
@@ -101,7 +103,7 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
     words[2, 4] = 0
     words[3, 2, 100, 1, 3], words[3, 5, 7, 0, 0] = 32767, -32768
     rng = np.random.default_rng(3)
-    words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other: another reference is taken
+    words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other chirp, so another reference is tried
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
     words[6] = 0
     done = align(loops, words, valid, (0, 192), equaliser_of(rig))
@@ -138,7 +140,7 @@ def test_any_number_of_positions_and_none(loops):
 
 
 def test_the_direct_path(loops, rig, paths, noise, counts):
-    """Of a row with positions that are absent, that hold noise only, and where the other peak is the direct path."""
+    """A row with missing positions, noise only, and positions where the second peak is the direct path."""
     board, rng = rig.receivers[0], np.random.default_rng(5)
     ideal, _ = paths(board, 37, 1.5, rng)
     ideal[7] = 0
@@ -176,7 +178,7 @@ def test_three_receivers_are_aligned_in_numpy():
     assert align_row(words, np.ones(words.shape[:2], bool), (0, 192)).good.all()
 
 
-def test_the_compiled_loops_are_used_where_they_are(library_file, monkeypatch):
+def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
     found = compiled.Library(library_file)
     monkeypatch.setattr(compiled, "library", lambda: found)
     monkeypatch.setattr("polysight.host.sync.align.align_in_numpy", None)
@@ -192,7 +194,7 @@ def fresh_library():
 
 @pytest.mark.usefixtures("fresh_library")
 @pytest.mark.parametrize("broken", ["absent", "of other sources", "no library"])
-def test_without_them_a_warning_says_once_what_why_and_what_to_do(library_file, tmp_path, monkeypatch, caplog, broken):
+def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, monkeypatch, caplog, broken):
     file = tmp_path / build.LIBRARY
     if broken == "of other sources":
         shutil.copyfile(library_file, file)
@@ -204,13 +206,17 @@ def test_without_them_a_warning_says_once_what_why_and_what_to_do(library_file, 
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
-    assert len(caplog.records) == 1
-    said = caplog.records[0].getMessage()
-    assert "in NumPy" in said
-    assert "python -m polysight.host.sync.build" in said
+    (record,) = caplog.records
+    assert "python -m polysight.host.sync.build" in record.getMessage()
 
 
-def test_a_compiler_that_fails_is_an_error_that_shows_what_it_said(tmp_path, monkeypatch):
+def test_the_build_command_does_not_import_itself_twice():
+    """`python -m polysight.host.sync.build` would warn if importing the package imported this module."""
+    code = "import sys, polysight.host.sync; sys.exit('polysight.host.sync.build' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_failing_compiler_is_an_error_with_its_command(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", "false")
     with pytest.raises(build.BuildError, match="false"):
         build.build(tmp_path)

@@ -1,3 +1,5 @@
+"""The direct path is found beside an equally strong object, with its phase at the Cramer-Rao bound."""
+
 import msgspec
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ def board(request, rig):
 
 @pytest.fixture
 def run(rig, paths, noise, prepared, align_single):
-    """Reference randomly offset positions; return result, frequency error (Hz) and phase error (rad)."""
+    """`run(board, ...)`: reference positions with random offsets; result, frequency error (Hz), phase error (rad)."""
 
     def go(board, echo=1.0, snr_db=None, positions=150, seed=0, direct=1.0, gain=0.0, drift_hz=0.0, **more):
         rng = np.random.default_rng(seed)
@@ -62,7 +64,7 @@ def test_the_object_3_to_4_bins_away_does_not_bias_it(run, board, echo, echoes):
 
 
 @pytest.mark.parametrize(("z_mm", "bins"), [(400, 2.35), (499, 3.56), (620, 5.30)])
-def test_bias_is_small_for_every_object_distance_that_the_rig_file_tells(rig, align_single, board, z_mm, bins):
+def test_the_bias_is_small_for_every_object_distance(rig, align_single, board, z_mm, bins):
     rig = msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=z_mm))
     rng, n = np.random.default_rng(1), 300
     tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
@@ -119,8 +121,8 @@ def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig,
     assert error.std() < 1.2 * np.sqrt(10**-1.6 / 2 / (4 * 192))
 
 
-def test_the_other_peak_is_taken_where_the_amplitude_is_out_of_line(rig, paths, prepared, align_single, board):
-    """An object that is far stronger at some positions hides the direct path there, but not what it should be."""
+def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(rig, paths, prepared, align_single, board):
+    """A far stronger object at some positions hides the direct path there; its amplitude is known from the row."""
     signal, _ = paths(board, 40, 0.5, np.random.default_rng(6), spread_m=0.02)
     pure, length = paths(board, 40, 0.0, np.random.default_rng(6))
     strong = np.arange(40) % 8 == 3
@@ -132,13 +134,13 @@ def test_the_other_peak_is_taken_where_the_amplitude_is_out_of_line(rig, paths, 
     assert np.abs(done.frequency - true).max() * 192 < 0.1  # IF bins; the object is 3.5 away
 
 
-def test_the_lower_of_two_peaks_is_taken_when_the_object_is_stronger(run, board):
+def test_the_lower_of_two_peaks_is_used_if_the_object_is_stronger(run, board):
     done, f, _ = run(board, echo=1.0, direct=0.5, spread_m=0.05)
     assert done.found.all()
     assert np.abs(f).max() < 100
 
 
-def test_slope_difference_of_the_crystals_is_taken_out(run, board):
+def test_a_slope_difference_of_the_crystals_is_removed(run, board):
     done, _, phase = run(board, drift_hz=5.5e3, snr_db=20)
     assert done.found.all()
     inside = done.samples[:, :, :192] / 1000
@@ -147,7 +149,7 @@ def test_slope_difference_of_the_crystals_is_taken_out(run, board):
     assert phase.std() < 0.01
 
 
-def test_referenced_echo_has_positive_phase_of_its_excess_path(rig, paths, prepared, align_single, board):
+def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths, prepared, align_single, board):
     rng = np.random.default_rng(3)
     only_direct, length = paths(board, 1, 0.0, rng)
     v = np.add(specular_midpoint_m(rig, board), (0.02, -0.03, 0))
@@ -175,7 +177,7 @@ def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, prepare
     assert not done.samples[:, [5, 9, 20]].any()
 
 
-def test_a_row_of_nothing_but_noise_has_no_direct_path(rig, noise, prepared, align_single, board):
+def test_a_row_of_noise_has_no_direct_path(rig, noise, prepared, align_single, board):
     received = noise((400, 4, 256), 0, np.random.default_rng(7)).astype(np.complex64)
     assert not reference(align_single(received, np.ones(400, bool)), prepared[board.name], rig.chirp).found.any()
 

@@ -1,3 +1,5 @@
+"""Tones are estimated at the Cramer-Rao bound; phase ramps are exact."""
+
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,14 +1,16 @@
-"""Simulated capture cards, served by a thread of the test's process."""
+"""Capture cards, simulated or with scripted answers, served by a thread of the test's process."""
 
 from __future__ import annotations
 
 import select
+import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import repeat
 from pathlib import Path
 
+from polysight.host.capture import dca1000
 from polysight.shared.config import Board
 from polysight.simulators.cards import MAC, CardEndpoint, Network, Pace
 from polysight.simulators.faults import Faults
@@ -67,3 +69,43 @@ class Cards:
             self._thread.join()
         for endpoint in self.endpoints.values():
             endpoint.close()
+
+
+class ScriptedCard:
+    """A card that sends `answers(code, count)` to each request, `count` being how often the code was received."""
+
+    def __init__(self, board: Board, answers: Callable[[int, int], Iterable[bytes]], source_port: int = 1024) -> None:
+        self.seen: list[tuple[int, bytes]] = []
+        self._answers = answers
+        self._in = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._in.bind((board.card_address, board.command_port))
+        self._in.settimeout(0.02)
+        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._out.bind((board.card_address, source_port))
+        self.host = (board.host_address, board.command_port)
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._end.is_set():
+            try:
+                code, data = dca1000.decode_request(self._in.recv(2048))
+            except TimeoutError:
+                continue
+            self.seen.append((code, data))
+            for raw in self._answers(code, sum(c == code for c, _ in self.seen)):
+                self._out.sendto(raw, self.host)
+
+    def say(self, raw: bytes) -> None:
+        self._out.sendto(raw, self.host)
+
+    def close(self) -> None:
+        self._end.set()
+        self._thread.join()
+        self._in.close()
+        self._out.close()
+
+
+def reply(code: int, status: int = 0) -> bytes:
+    return dca1000.encode_reply(code, status)

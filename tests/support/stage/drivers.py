@@ -12,13 +12,21 @@ import serial
 
 from polysight.shared.errors import ProtocolError
 from polysight.shared.stage_line import Command, Immediate, Reply
-from polysight.shared.wires import WireMessage, parse
+from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
 from polysight.simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
 from polysight.simulators.uno import HZ, EmulatedUno
 
 LIMIT_S = 60.0
 LIMIT_TICKS = 600 * TICK_HZ
 TICKS_PER_MS = TICK_HZ // 1000
+
+
+def edges(wires: list[WireMessage]) -> list[WireEdge]:
+    return [w for w in wires if isinstance(w, WireEdge)]
+
+
+def motions(wires: list[WireMessage]) -> list[WireMotion]:
+    return [w for w in wires if isinstance(w, WireMotion)]
 
 
 class Driver:

@@ -1,9 +1,9 @@
-"""Cubes that were synchronised by another program: what they are referenced to, and how to bring them to our form.
+"""Cubes that another program has synchronised: detect their conventions and convert them to ours.
 
-Ours is: an echo of excess path d over the direct path is `a exp(+j 2 pi f d / c)`, the direct path a constant. Of a
-cube from elsewhere only its shape is known. The geometry says where direct path and object must lie, so the data itself
-tells the rest: the sign of its phase, whether delays count from the transmitter or from the direct path, whether each
-RX is referenced to its own direct path or all to that of RX1, and whether the direct path is still in it.
+Our convention: an echo of excess path d is `a exp(+j 2 pi f d / c)`, and the direct path is constant. The conventions
+of a cube are unknown, but the geometry determines where direct path and object must lie. From that `detect_form` finds
+the sign of the phase, whether delays count from the transmitter or from the direct path, whether each RX is referenced
+to its own direct path or all to that of RX1, and whether the direct path was removed.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from polysight.shared.errors import DataError
 from polysight.shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight.shared.units import SPEED_OF_LIGHT_M_S
 
-_SPREAD_M = 0.15  # echoes come from this far to either side of the mirror point
-_NOISE = 1e-3  # noise power of one sample beside the object's, for the direct path's estimate
-_AS_LEFT = 0.7  # the simplest reading stands unless another puts this much more of the power where the object is
-_COHERENT = 0.5  # part of a direct path's power that is the same at all positions, if it is the reference
-_FOUND = 0.5  # of the positions
-_ALONE = 0.8  # part of the power that lies where the object is, if nothing else is in the cube
+_SPREAD_M = 0.15  # echoes come from within this distance of the mirror point
+_NOISE = 1e-3  # noise power of a sample relative to the object, for the estimate of the direct path
+_PREFER_SIMPLE = 0.7  # the simplest convention is kept if it explains this part of the best one's power
+_COHERENT = 0.5  # smallest constant share of the direct path's power if the cube is referenced to it
+_MIN_FOUND = 0.5  # smallest share of positions with a direct path
+_ALONE = 0.8  # share of power at the object above which the cube contains nothing else
 
 
 @dataclass(frozen=True)
 class CubeForm:
-    """How a board's cube is brought to our form. Build with :func:`recognise`.
+    """Conversion of a board's cube to our convention. Create with :func:`detect_form`.
 
     Attributes
     ----------
     conjugate
-        Its phases have the opposite sign.
+        The phases have the opposite sign.
     turn
-        complex64 [rx, sample]: multiplies it, after that.
+        complex64 [rx, sample]: multiplies the cube after that.
     constant
-        complex64 [rx]: a direct path to put back in, where it was removed; the RX are then taken to be alike.
+        complex64 [rx]: direct path to add if it was removed (equal RX are assumed); otherwise zero.
     path
-        Find the direct path of every position and reference to it; None where the cube is referenced already.
+        Estimator to reference every position to its direct path; None if the cube is referenced already.
     chirp
-        The scan's.
+        Chirp of the scan.
     how
         One sentence for quality.json.
     """
@@ -63,9 +63,9 @@ class CubeForm:
     how: str
 
     def synced(self, cube: NDArray[np.complex64], pulses: int) -> SyncedRow:
-        """One row of the cube, complex64 [rx, position, sample], positions as they were met; zeros are masked.
+        """Convert a row of the cube, complex64 [rx, position, sample] in order of recording; zeros are masked.
 
-        The receiver's filter is left as it is.
+        The receiver's filter is not compensated.
         """
         valid = np.isfinite(cube).all(axis=(0, 2)) & (cube != 0).any(axis=(0, 2))
         samples = self._turned(np.where(valid[:, None], cube, 0)) + self.constant[:, None, None]
@@ -81,25 +81,28 @@ class CubeForm:
         return ((cube.conj() if self.conjugate else cube) * self.turn[:, None]).astype(np.complex64)
 
 
-def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Board) -> CubeForm:
-    """Find the form of a board's cube.
+def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Board) -> CubeForm:
+    """Detect the conventions of a board's cube.
 
     Parameters
     ----------
     rows
-        Some rows of it, complex64 [rx, position, sample] each.
+        Some of its rows, complex64 [rx, position, sample] each.
     rig, board
-        The scan's rig file, and the board.
+        Rig of the scan, and the board.
 
     Raises
     ------
     DataError
-        when the rows hold no data.
+        if the rows have no data.
     """
     cube = np.concatenate([r[:, np.isfinite(r).all(axis=(0, 2)) & (r != 0).any(axis=(0, 2))] for r in rows], axis=1)
     if cube.shape[1] == 0:
         raise DataError(
-            f"the cube of board {board.name} holds no data", "it is all zero", "fetch it again", code=ErrorCode.NO_DATA
+            f"the cube of board {board.name} has no data",
+            "all samples are zero",
+            "copy it again",
+            code=ErrorCode.NO_DATA,
         )
     chirp = rig.chirp
     (a, b), sweep = chirp.linear_samples, chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
@@ -107,7 +110,7 @@ def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Boa
     direct_m = np.linalg.norm(rx - tx, axis=1)
     gate = _gate_echoes(sweep[a:b], _gate_m(rig, board, tx, rx))
     absolute = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
-    conjugate, counted_from_tx = _reading(cube, absolute, gate, (a, b))
+    conjugate, counted_from_tx = _sign_and_origin(cube, absolute, gate, (a, b))
     turn = absolute if counted_from_tx else np.ones_like(absolute)
     said = ["conjugated"] * conjugate + ["delays counted from the transmitter"] * counted_from_tx
     cube = (cube.conj() if conjugate else cube) * turn[:, None]
@@ -125,7 +128,7 @@ def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Boa
     else:
         own = prepare(rig, board)
         _, found, _, _ = _referenced(cube.astype(np.complex64), np.ones(cube.shape[1], bool), own, chirp)
-        if found.mean() > _FOUND and _share(cube[..., a:b], gate) < _ALONE:
+        if found.mean() > _MIN_FOUND and _share(cube[..., a:b], gate) < _ALONE:
             path = own
             said.append("not referenced to a direct path; referenced here")
         else:
@@ -136,16 +139,16 @@ def recognise(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: Boa
     return CubeForm(conjugate, turn.astype(np.complex64), constant.astype(np.complex64), path, chirp, how)
 
 
-def _reading(
+def _sign_and_origin(
     cube: NDArray[np.complexfloating],
     absolute: NDArray[np.complex128],
     gate: NDArray[np.complex128],
     linear: tuple[int, int],
 ) -> tuple[bool, bool]:
-    """Whether a cube is conjugated, and whether its delays count from the transmitter.
+    """Return two flags: the cube is conjugated, and its delays count from the transmitter.
 
-    `absolute` [rx, sample] takes the direct path's delay out, `gate` [path, sample] are echoes from the object. The
-    reading is taken that puts the most power where the object must be; the simplest one in doubt.
+    `absolute` [rx, sample] removes the delay of the direct path, `gate` [path, sample] are echoes from the object. The
+    combination with the most power at the object is chosen; in doubt the simplest one.
     """
     a, b = linear
     readings = list(product((False, True), (False, True)))
@@ -154,39 +157,39 @@ def _reading(
         turn = absolute if counted_from_tx else np.ones_like(absolute)
         part = ((cube.conj() if conjugate else cube) * turn[:, None])[..., a:b]
         power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
-    return readings[0 if power[0] >= _AS_LEFT * max(power) else int(np.argmax(power))]
+    return readings[0 if power[0] >= _PREFER_SIMPLE * max(power) else int(np.argmax(power))]
 
 
 def _direct_path(
     part: NDArray[np.complexfloating], gate: NDArray[np.complex128]
 ) -> tuple[NDArray[np.complexfloating], float]:
-    """The direct path's mean over positions, [rx], in samples [rx, position, sample]; and its share of power.
+    """Return the mean direct path [rx] in samples [rx, position, sample], and its share of power.
 
-    By the estimate that does not hear the object (generalised least squares).
+    Generalised least squares, which suppresses the object.
     """
     samples = part.shape[-1]
     covariance = gate.T @ gate.conj() / len(gate) + _NOISE * np.eye(samples)
     weights = scipy.linalg.solve(covariance, np.ones(samples), assume_a="pos").conj()
-    heard = part @ (weights / weights.sum())  # [rx, position]
-    mean = heard.mean(axis=1)
-    return mean, float(np.mean(np.abs(mean) ** 2 / np.mean(np.abs(heard) ** 2, axis=1)))
+    direct = part @ (weights / weights.sum())  # [rx, position]
+    mean = direct.mean(axis=1)
+    return mean, float(np.mean(np.abs(mean) ** 2 / np.mean(np.abs(direct) ** 2, axis=1)))
 
 
 def _gate_m(rig: Instrument, board: Board, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[float, float]:
-    """Excess paths of echoes from the object plane."""
+    """Return the smallest and largest excess path of echoes from the object plane."""
     dx, dy = (m.ravel() for m in np.meshgrid(*2 * [np.linspace(-1, 1, 9) * _SPREAD_M]))
     excess = excess_path_m(tx, rx, np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1))
     return float(excess.min()), float(excess.max())
 
 
 def _gate_echoes(sweep_hz: NDArray[np.floating], gate_m: tuple[float, float]) -> NDArray[np.complex128]:
-    """Echoes of paths over the gate, [path, sample]."""
+    """Return echoes of evenly spaced paths in the gate, [path, sample]."""
     paths = np.linspace(*gate_m, 33)
     return np.exp(2j * np.pi * np.outer(paths, sweep_hz) / SPEED_OF_LIGHT_M_S)
 
 
 def _share(part: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -> float:
-    """Part of the power of samples [..., sample] that echoes from the gate can explain."""
+    """Return the share of the power of samples [..., sample] explained by echoes in the gate."""
     _, strength, basis = np.linalg.svd(gate, full_matrices=False)
     inside = part @ basis[strength > 1e-2 * strength[0]].conj().T
     return float((np.abs(inside) ** 2).sum() / (np.abs(part) ** 2).sum())
@@ -195,9 +198,9 @@ def _share(part: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -> f
 def _referenced(
     cube: NDArray[np.complex64], valid: NDArray[np.bool_], path: DirectPath, chirp: Chirp
 ) -> tuple[NDArray[np.complex64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Samples referenced to their direct path, where it was found, its IF (Hz) and its amplitude.
+    """Reference positions to their direct path; return samples, mask of found positions, IF (Hz) and amplitude.
 
-    The cube's positions are taken for averages of one chirp.
+    Each position of the cube is treated as the average of one chirp.
     """
     rx, positions, samples = cube.shape
     a, b = whole_blocks(chirp.linear_samples)
@@ -219,6 +222,6 @@ def _referenced(
         none + 1,
         np.zeros((positions, 1), np.int32),
     )
-    near_zero = bool(abs(np.median(centre)) < 0.4)  # mixed down already: no IF is outside the receiver's band then
+    near_zero = bool(abs(np.median(centre)) < 0.4)  # mixed down already, so any IF is within the band
     done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x") if near_zero else chirp)
     return done.samples, done.found, done.frequency * chirp.sample_rate_hz, np.abs(done.amplitude)

@@ -1,0 +1,102 @@
+"""Simulated stages as processes, with a listener at their wires."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from polysight.shared.wires import WireEdge, WireMessage, WireMotion, parse
+from tests.support.paths import REPO, RIG_FILE
+
+LIMIT_S = 60.0
+# The commands of a stage: the sketch for this machine, its Python stand-in, machine code on an emulated UNO.
+COMMANDS = {"pc": ("stage",), "python": ("stage", "--python"), "uno": ("uno",)}
+
+
+class StageProcess:
+    """`python -m polysight.simulators.stage` or `.uno`: its port is `link`; `messages` has what came over its wires."""
+
+    def __init__(self, folder: Path, kind: str, time_scale: float = 1.0) -> None:
+        self.link = folder / "ttySTAGE"
+        self.messages: list[WireMessage] = []
+        module, *options = COMMANDS[kind]
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+            listener.bind(str(folder / "wires"))
+            listener.listen()
+            listener.settimeout(LIMIT_S)
+            command = [sys.executable, "-m", f"polysight.simulators.{module}", "--config", str(RIG_FILE), "--boot-ms"]
+            command += ["50", "--wires", str(folder / "wires"), "--link", str(self.link), *options]
+            self.process = subprocess.Popen(
+                [*command, "--time-scale", str(time_scale)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                cwd=REPO,
+            )  # fmt: skip
+            self.wires, _ = listener.accept()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == f"ready {self.link}\n"
+
+    def _listen(self) -> None:
+        with self.wires, self.wires.makefile("r", encoding="ascii") as lines:
+            for line in lines:
+                self.messages.append(parse(line))
+
+    @property
+    def rising(self) -> list[WireEdge]:
+        return [e for e in self.messages if isinstance(e, WireEdge) and e.value]
+
+    @property
+    def motions(self) -> list[WireMotion]:
+        return [m for m in self.messages if isinstance(m, WireMotion)]
+
+    def end(self, number: int = signal.SIGTERM) -> list[WireMessage]:
+        """End it with a signal; everything that came over the wires."""
+        self.process.send_signal(number)
+        assert self.process.wait(LIMIT_S) == 0
+        self._listener.join(LIMIT_S)
+        assert not self.link.is_symlink()
+        return self.messages
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+        self._listener.join(LIMIT_S)
+
+
+PARENT = """
+import subprocess, sys, time
+child = subprocess.Popen(sys.argv[2:], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+child.stdout.readline()  # it has started: before that it cannot know its parent
+child.stdin.write(sys.argv[1].encode())
+child.stdin.flush()
+print(child.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "") -> bool:
+    """Start a command by another process, kill that one, and see if the command goes on."""
+    arguments = [sys.executable, "-c", PARENT, standard_input, *map(str, command)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, cwd=REPO) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        parent.kill()
+    limit = time.monotonic() + LIMIT_S
+    while runs(child):
+        if time.monotonic() > limit:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

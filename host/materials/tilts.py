@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from polysight.host.imaging import Rise, levelled
+from polysight.host.imaging import Rise, correct_tilt
 from polysight.host.materials.inputs import ImagePair
 from polysight.host.materials.segment import Segmentation
 
@@ -36,5 +36,5 @@ def level(images: ImagePair, found: Segmentation, tilts: Tilts | None = None) ->
         tilts = Tilts(rises, images.lit.across)
     there = [p for p in found.patches if p.label in tilts.rises]
     masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
-    h, v = levelled(images.h, images.v, images.lit, masks, own)
+    h, v = correct_tilt(images.h, images.v, images.lit, masks, own)
     return replace(images, h=h, v=v), tilts

@@ -23,8 +23,8 @@ from polysight.host.imaging import (
 from polysight.host.jobs.progress import counted, current_step, say
 from polysight.host.materials import (
     TruthPlate,
+    find_truth,
     read_labels,
-    truth_beside,
 )
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
@@ -100,7 +100,7 @@ def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, C
 
 def truth_of(data: Path) -> tuple[TruthPlate, ...]:
     """Plates of the truth.json beside the data; none, and a note on stderr, when it is not a truth file."""
-    plates, note = truth_beside(data)
+    plates, note = find_truth(data)
     if note:
         sys.stderr.write(f"note: {note}\n")
     return plates

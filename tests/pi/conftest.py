@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,9 @@ from polysight.pi_controller.service import Service
 from polysight.shared import messages as m
 from polysight.shared.config import Instrument
 from polysight.shared.tables import to_builtins
+from polysight.simulators.wires import WireHub
 from tests.support.pi.fake_stage import FakeStage
 from tests.support.pi.host_side import HostSide
-from tests.support.pi.mini_hub import MiniHub
 from tests.support.pi.program import Process
 from tests.support.rigs import at_stage_port, published_rig, timed_by_the_program
 
@@ -72,10 +72,13 @@ def config(instrument: Instrument, write_config: Callable[[Instrument], Path]) -
 @pytest.fixture
 def hub(tmp_path: Path) -> Iterator[Path]:
     """A wire hub; gives its socket."""
-    path = tmp_path / "w"
-    hub = MiniHub(path)
-    yield path
-    hub.close()
+    path, stop = tmp_path / "w", threading.Event()
+    with closing(WireHub(path, lambda _: None)) as hub:
+        thread = threading.Thread(target=hub.serve, args=(stop, 0.02))
+        thread.start()
+        yield path
+        stop.set()
+        thread.join()
 
 
 @pytest.fixture

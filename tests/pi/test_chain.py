@@ -43,23 +43,18 @@ def rig(gpio_rig, tmp_path):
 
 
 @pytest.fixture
-def hub(rig, write_config, tmp_path):
-    """Hub and board; gives the hub's socket."""
-    hub, started = tmp_path / "wires", []
-    board = ["--config", write_config(rig), "--wires", hub, "--link", rig.stage.port, "--time-scale", SPEED]
-    for command in (["polysight.simulators.wires", "--socket", hub], ["polysight.simulators.uno", *board]):
-        process = subprocess.Popen(
-            [sys.executable, "-m", *map(str, command)], cwd=REPO, stdout=subprocess.PIPE, text=True
-        )
-        started.append(process)
+def board(rig, write_config, hub):
+    """The emulated UNO's process, at the port of the rig."""
+    command = ["polysight.simulators.uno", "--config", write_config(rig), "--wires", hub, "--link", rig.stage.port]
+    command = [sys.executable, "-m", *map(str, command), "--time-scale", str(SPEED)]
+    with subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready")
-    yield hub
-    for process in reversed(started):
+        yield
         process.terminate()
-        process.communicate(timeout=60)
 
 
+@pytest.mark.usefixtures("board")
 @pytest.mark.slow
 def test_every_point_of_a_row_is_a_burst(rig, hub, start):
     with closing(WiresLog(hub, TRIGGER, SYNC)) as wires:

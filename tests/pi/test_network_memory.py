@@ -106,12 +106,12 @@ def test_a_queue_that_never_empties_is_not_a_hang(pi, monkeypatch):
     monkeypatch.setattr(executors, "TURN_TIMEOUT_S", 0.05)
     longest = 0.0
     done = threading.Event()
-    for _ in range(30):
+    for _ in range(60):
         pi.service.executor.post(lambda: time.sleep(0.05))
     pi.service.executor.post(done.set)
     while not done.wait(0.02):
         longest = max(longest, pi.service.executor.unresponsive_s)
-    assert longest < 1.0
+    assert longest < 2.0
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
 
 

@@ -158,8 +158,8 @@ def test_a_line_in_use_ends_the_program_with_fault_and_remedy(rig, write_config,
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_outputs_are_low_after_a_signal_inside_a_pulse(rig, in_row, wires, number):
-    """The chip takes 0.3 s to change an output: the signal comes while the line is high."""
-    program, _ = in_row(rig, "slow:300000")
+    """The chip takes half a second to change an output: the signal comes while the line is high."""
+    program, _ = in_row(rig, "slow:500000")
     wires.until(lambda: wires.level(SYNC) == 1)
     status, _, err = program.end(number)
     assert status == (0 if number == signal.SIGTERM else -signal.SIGKILL), err

@@ -1,4 +1,4 @@
-"""The Pi half against the simulated stage and wires, both as processes: the sketch's dialogue, wire time."""
+"""The Pi half and the simulated stage, both as processes: the sketch's dialogue, wire time."""
 
 import subprocess
 import sys
@@ -12,26 +12,26 @@ from tests.support.paths import REPO
 
 
 @pytest.fixture
-def hub(instrument, tmp_path):
-    """Wires and stage, at the port of the rig; gives the hub's socket."""
-    hub, port = tmp_path / "w", instrument.stage.port
-    wires = ["polysight.simulators.wires", "--socket", hub]
-    stage = ["polysight.simulators.stage", "--config", "instrument.toml", "--wires", hub, "--link", port]
-    stage += ["--time-scale", "30", "--python"]
-    processes = []
-    for command in (wires, stage):
-        process = subprocess.Popen(
-            [sys.executable, "-m", *map(str, command)], cwd=REPO, stdout=subprocess.PIPE, text=True
-        )
-        processes.append(process)
+def simulated_stage(instrument, hub):
+    """The stage's process, at the port of the rig."""
+    stage = [
+        "polysight.simulators.stage",
+        "--config",
+        "instrument.toml",
+        "--wires",
+        hub,
+        "--link",
+        instrument.stage.port,
+    ]
+    command = [sys.executable, "-m", *map(str, stage), "--time-scale", "30", "--python"]
+    with subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline().startswith("ready")
-    yield hub
-    for process in reversed(processes):
+        yield
         process.terminate()
-        process.communicate(timeout=10)
 
 
+@pytest.mark.usefixtures("simulated_stage")
 def test_rows_abort_hold_and_retake(hub, start, instrument):
     _, host = start(instrument, "--wires", hub)
     host.accepted(host.begin())

@@ -23,7 +23,15 @@ import numpy as np
 
 from polysight.data import packaged
 from polysight.host.imaging import PlaneEstimate
-from polysight.host.materials import UNKNOWN, PatchEstimate, Seen, invert, match_truth, measured_ratio, truth_plates
+from polysight.host.materials import (
+    UNKNOWN,
+    PatchEstimate,
+    PatchMeasurement,
+    invert,
+    match_truth,
+    measured_ratio,
+    truth_plates,
+)
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
 from polysight.host.process import Findings, Options
@@ -244,7 +252,7 @@ def nominal_widths(repeats: int = 5) -> tuple[float, float]:
     first, size = runs[0], np.abs([p.permittivity or np.nan for p in runs[0].inversion.patches])
     theta = float(np.mean(first.theta_rad))
     seen = [
-        Seen(complex(measured_ratio(p.inverse_ratio, *first.inversion.leakage)), max(float(s), 1e-5), theta)
+        PatchMeasurement(complex(measured_ratio(p.inverse_ratio, *first.inversion.leakage)), max(float(s), 1e-5), theta)
         for p, s in zip(first.inversion.patches, noise, strict=True)
     ]
     least = invert(seen, replace(first.prior, reference_std=float(np.median(noise))))

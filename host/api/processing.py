@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.materials import pixel_accuracy, truth_beside
+from polysight.host.materials import find_truth, pixel_accuracy
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import ratio
 from polysight.host.process import Options, materials_content
@@ -75,7 +75,7 @@ class Processing:
         """
         pipeline, options = self.pipeline, self.options
         unnamed = options.unnamed(pipeline.rig)
-        plates, note = truth_beside(self.folder)
+        plates, note = find_truth(self.folder)
         if note:
             warnings.warn(note, stacklevel=2)
         findings = pipeline.examine(self._images, options, plates)

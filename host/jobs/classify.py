@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.jobs.print_verdict import print_verdict
+from polysight.host.jobs.materials import print_verdict
 from polysight.host.materials import (
     PATCHES,
     SIMULATED_LIBRARY,
@@ -22,7 +22,7 @@ from polysight.host.materials import (
     MatchedPatch,
     NamedPatch,
     PatchName,
-    SeenPatches,
+    ScanPatches,
     match_patches,
     read_materials,
 )
@@ -208,7 +208,7 @@ def _print_right(rows: Sequence[dict[str, Any]], names: Container[str]) -> None:
         sys.stdout.write(f"{right} of {len(known)} patches named right, {share:.1%} of their pixels\n")
 
 
-def _without(scan: SeenPatches, refused: Container[int]) -> SeenPatches:
+def _without(scan: ScanPatches, refused: Container[int]) -> ScanPatches:
     """The patches of a scan that may be judged."""
     return replace(scan, patches=tuple(p for p in scan.patches if p.label not in refused))
 

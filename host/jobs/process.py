@@ -23,8 +23,8 @@ from polysight.host.imaging import (
 from polysight.host.jobs.progress import counted, current_step, say
 from polysight.host.materials import (
     TruthPlate,
+    find_truth,
     read_labels,
-    truth_beside,
 )
 from polysight.host.pipeline import Pipeline
 from polysight.host.polarimetry import PlaneReference, plane_reference
@@ -100,7 +100,7 @@ def imaged(data: Path, config: Path | None, bands: int = 1) -> tuple[Pipeline, C
 
 def truth_of(data: Path) -> tuple[TruthPlate, ...]:
     """Plates of the truth.json beside the data; none, and a note on stderr, when it is not a truth file."""
-    plates, note = truth_beside(data)
+    plates, note = find_truth(data)
     if note:
         sys.stderr.write(f"note: {note}\n")
     return plates
@@ -284,7 +284,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
 
 def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstimate) -> list[str]:
-    """What `focus` says: the plane by the plates where there are any, and by sharpness."""
+    """Text of `focus`: the plane by the plates, if there are any, and by sharpness."""
     lines = []
     if plates.known:
         mm, std = 1e3 * plates.offset_m, 1e3 * plates.offset_std_m
@@ -312,7 +312,7 @@ def _focus_lines(head: str, distance_mm: float, found: Focus, plates: PlaneEstim
 
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:
-    """What synchronisation leaves of errors: figures, JSON, text; returns the exit status. Raises PolysightError."""
+    """Write figures, JSON and text of the residual errors of synchronisation; return the exit status."""
     from polysight.host.capture import row_words
     from polysight.host.report import SyncReport, write_sync_report
     from polysight.host.sync import BoardSetup, synchronise_row

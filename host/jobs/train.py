@@ -32,11 +32,11 @@ from polysight.host.materials import (
     TrainingScan,
     analyse,
     check_labels,
-    drawn_specimens,
     make_library,
     material_of,
     patches_from_plates,
     read_truth,
+    specimen_seed,
 )
 from polysight.host.polarimetry import incidence_choice
 from polysight.host.process import Options
@@ -198,7 +198,7 @@ def _from_truth(data: Path, config: Path) -> TrainingScan:
     images = pipeline.form_images()
     known, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     found = pipeline.find_materials(images, MetalChoice(metal.box_mm), KnownScene(known, plates))
-    drawn = drawn_specimens(data / TRUTH)
+    drawn = specimen_seed(data / TRUTH)
     specimens = {} if drawn is None else {n: f"{source.scan_id}/{drawn}/{n}" for n in names}
     return TrainingScan(source.scan_id, found, source.simulated, versions=versions(), names=names, specimens=specimens)
 
@@ -282,7 +282,7 @@ def told_apart(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
 
 
 def _summary(out: Path, library: Library) -> list[str]:
-    """What a library holds, by material; names that differ in nothing but small and capital letters are pointed out."""
+    """Contents of a library by material; with a note on names that differ only in case."""
     lines = [f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"]
     for name in library.names:
         mine = [e for e in library.entries if e.name == name]

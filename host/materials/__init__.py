@@ -34,8 +34,8 @@ from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, ImagePair, Kno
 from polysight.host.materials.inversion import (
     Inversion,
     PatchEstimate,
-    Seen,
-    Uncertain,
+    PatchMeasurement,
+    RigPrior,
     invert,
     measured_ratio,
     ratio_error,
@@ -67,12 +67,18 @@ from polysight.host.materials.layer_rows import LAYER_FORMS, fit_row, incidence_
 from polysight.host.materials.layers import METAL, Layer
 from polysight.host.materials.library import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Entry, Library
 from polysight.host.materials.measure import NOT_PASSIVE, Refused
-from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box
-from polysight.host.materials.metal_evidence import MetalEvidence, metal_evidence
+from polysight.host.materials.metal import (
+    MetalEvidence,
+    MetalReference,
+    find_metal,
+    metal_by_label,
+    metal_evidence,
+    metal_in_box,
+)
 from polysight.host.materials.patch_files import (
     PATCHES,
     MatchedPatch,
-    SeenPatches,
+    ScanPatches,
     match_patches,
     pack_patches,
     read_patches,
@@ -80,13 +86,13 @@ from polysight.host.materials.patch_files import (
 from polysight.host.materials.permittivity import Permittivity, estimate_permittivity, format_permittivity, median_ratio
 from polysight.host.materials.published import (
     LabelledScan,
+    angle_in_text,
     entries_of_boxes,
+    image_orientation,
     label_folders,
     read_labelled_scan,
     read_material,
     read_materials,
-    reading_of,
-    told_angle,
 )
 from polysight.host.materials.result import MaterialsResult, PatchResult
 from polysight.host.materials.samples import CHANNELS, Model, Samples, SceneErrors, by_angle, feature_matrix
@@ -110,17 +116,16 @@ from polysight.host.materials.train import (
     fit_library,
     make_library,
     score,
-    strangers,
+    score_unseen_materials,
 )
 from polysight.host.materials.truth import (
     TRUTH,
     Plates,
     TruthPlate,
-    drawn_specimens,
+    find_truth,
     match_truth,
     read_truth,
-    truth_beside,
-    truth_labels,
+    specimen_seed,
     truth_plates,
 )
 
@@ -167,23 +172,24 @@ __all__ = [
     "Optics",
     "Patch",
     "PatchEstimate",
+    "PatchMeasurement",
     "PatchName",
     "PatchResult",
     "Permittivity",
     "Plates",
     "Refused",
+    "RigPrior",
     "Samples",
+    "ScanPatches",
     "SceneErrors",
     "Score",
-    "Seen",
-    "SeenPatches",
     "SegmentSettings",
     "Segmentation",
     "TrainingScan",
     "TruthPlate",
-    "Uncertain",
     "Weights",
     "analyse",
+    "angle_in_text",
     "axis_mm",
     "bands_of_row",
     "best_model",
@@ -194,13 +200,13 @@ __all__ = [
     "check_labels",
     "clean_name",
     "concentrations",
-    "drawn_specimens",
     "entries_of",
     "entries_of_boxes",
     "estimate_permittivity",
     "expected_pixel_accuracy",
     "feature_matrix",
     "find_metal",
+    "find_truth",
     "fit_concentration",
     "fit_layer",
     "fit_library",
@@ -210,6 +216,7 @@ __all__ = [
     "format_permittivity",
     "image_centre_mm",
     "image_extent_mm",
+    "image_orientation",
     "incidence_std_rad",
     "insides",
     "invert",
@@ -243,13 +250,10 @@ __all__ = [
     "read_materials",
     "read_patches",
     "read_truth",
-    "reading_of",
     "score",
+    "score_unseen_materials",
     "segment",
-    "strangers",
-    "told_angle",
-    "truth_beside",
-    "truth_labels",
+    "specimen_seed",
     "truth_plates",
     "with_bands",
 ]

@@ -1,4 +1,4 @@
-"""From the two images to named patches: segmentation, metal reference, joint inversion, classification."""
+"""Find and name patches in the two images: segmentation, metal reference, joint inversion, classification."""
 
 from __future__ import annotations
 
@@ -9,28 +9,41 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, features_of
-from polysight.host.materials.explain import explained
-from polysight.host.materials.inputs import FOUND, UNKNOWN_SCENE, Image, ImagePair, KnownScene, MetalChoice, Optics
-from polysight.host.materials.inversion import Inversion, invert
+from polysight.host.materials.classify import UNKNOWN, Classifier, NamedPatch, add_explanation, features_of
+from polysight.host.materials.inputs import (
+    FOUND,
+    UNKNOWN_SCENE,
+    Image,
+    ImagePair,
+    KnownScene,
+    MetalChoice,
+    Optics,
+    level,
+)
+from polysight.host.materials.inversion import Inversion, PatchMeasurement, RigPrior, invert
 from polysight.host.materials.measure import (
     AMPLIFIES,
     BELOW_AIR,
     LEAST_STD,
     Refused,
-    all_refused,
     background,
+    check_patches,
+    measure_patch,
     reference_std,
-    seen,
 )
-from polysight.host.materials.metal import MetalReference, find_metal, metal_by_label, metal_in_box, no_metal
-from polysight.host.materials.metal_evidence import metal_evidence
+from polysight.host.materials.metal import (
+    MetalReference,
+    find_metal,
+    metal_by_label,
+    metal_evidence,
+    metal_in_box,
+    no_metal,
+)
 from polysight.host.materials.permittivity import Permittivity, inverse_spread, permittivity_of_patch
 from polysight.host.materials.result import MaterialsResult, PatchResult
 from polysight.host.materials.samples import SceneErrors
-from polysight.host.materials.scene_errors import scene_errors
 from polysight.host.materials.segment import Patch, Segmentation, SegmentSettings, axis_mm, segment, whole_plane
-from polysight.host.materials.tilts import level
+from polysight.host.materials.specimens import features, relative, softened
 from polysight.host.materials.truth import match_truth
 from polysight.host.polarimetry import (
     Calibrated,
@@ -47,9 +60,9 @@ from polysight.host.polarimetry import (
 from polysight.shared.errors import DataError
 
 FILLED = 0.1
-"""|H| relative to metal over an image without edges from which on one material fills it, rather than none."""
+"""Least |H| relative to metal at which an image without edges counts as filled with one material."""
 ACTIVE = 2.0
-"""Standard deviations of gain, or of a real part below 1, beyond which a permittivity is that of no material."""
+"""Limit in standard deviations of gain, or of a real part below 1, for a permittivity to be impossible."""
 
 
 def analyse(
@@ -59,14 +72,14 @@ def analyse(
     known: KnownScene = UNKNOWN_SCENE,
     classifier: Classifier | None = None,
 ) -> MaterialsResult:
-    """Find the patches of an image pair and say what they are; without a classifier they are not named.
+    """Find the patches of an image pair, estimate their permittivities, and name them if there is a classifier.
 
-    A scene without patches or without metal is no error: its result has none, and says so (`metal`, `refused`).
+    A scene without patches or without metal is no error; see `metal` and `refused` of the result.
 
     Raises
     ------
     DataError
-        when the image has no valid pixel, or a box or number given for the metal is none.
+        if the image has no valid pixel, or the given metal box or patch number does not exist.
     """
     plane = metal.plane
     if plane is not None:
@@ -77,13 +90,13 @@ def analyse(
     reference = _reference(images, metal, found)
     raw = to_metal(images.h, images.v, reference, plane)
     rh, rv = (smooth_inside(c, found, optics.smooth_px) for c in (raw.h, raw.v))
-    refused = all_refused(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
+    refused = check_patches(found, rh, rv, background(raw.h, raw.v, found, images.usable), reference.mask)
     std = reference_std(reference_spread(rh, rv, reference, plane))
     common, local = (std, 0.0) if plane is None else (LEAST_STD, std)
     prior = optics.prior(common)
     judged = [p for p in found.patches if p.label not in refused and p.label != reference.label]
     theta = np.asarray(optics.theta_rad, np.float64)
-    measured = [seen(p, rh, rv, _angle(theta, p), local) for p in judged]
+    measured = [measure_patch(p, rh, rv, _angle(theta, p), local) for p in judged]
     if plane is None:
         channel = _channel_ratio(images, reference) if optics.channel_ratio_known else None
         reference = replace(reference, evidence=metal_evidence(measured, prior, channel))
@@ -122,7 +135,7 @@ def _names(
     errors: SceneErrors | None,
     theta_rad: float,
 ) -> dict[int, NamedPatch]:
-    """Patch number to its name, with the error budget's share in it; the metal reference is not named by itself."""
+    """Name the judged patches, with the scene's error budget; return patch number to name."""
     if classifier is None or not judged:
         return {}
     h, v, p = channels
@@ -132,14 +145,14 @@ def _names(
         by_h, by_q = _to_angle(estimate.permittivity, theta_rad + inversion.theta_error_rad, classifier.angles_deg)
         features.append(features_of(np.abs(h[at]) * by_h, np.abs(v[at]) * by_h * abs(by_q), p[at] / by_q))
     named = classifier.scan(features, errors)
-    told = (
-        explained(n, e.permittivity, e.covariance, classifier) for n, e in zip(named, inversion.patches, strict=True)
-    )
-    return dict(zip((patch.label for patch in judged), told, strict=True))
+    return {
+        patch.label: add_explanation(name, e.permittivity, e.covariance, classifier)
+        for patch, name, e in zip(judged, named, inversion.patches, strict=True)
+    }
 
 
 def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequence[float]) -> tuple[float, complex]:
-    """Factors of |H| and of V / H that bring a half space from one angle to the library's."""
+    """Return the factors of |H| and of V / H that convert a half space from the scan's angle to the library's."""
     if permittivity is None or len(angles_deg) != 1 or permittivity.real < 1:
         return 1.0, 1.0 + 0j
     (s, p), (own_s, own_p) = (fresnel(permittivity, angle) for angle in (np.radians(angles_deg[0]), theta_rad))
@@ -147,33 +160,33 @@ def _to_angle(permittivity: complex | None, theta_rad: float, angles_deg: Sequen
 
 
 def _no_material(e: Permittivity) -> Refused | None:
-    """Why a permittivity is that of no passive material beyond its error; None when it may be one."""
+    """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
     if e.value is None or e.real_std is None or e.loss_std is None:
         return None
-    move = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
-    points = "it points to leakage, a layered plate, a wrong metal reference, or H and V not on the same place"
+    remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
+    why = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
     if e.value.imag > ACTIVE * e.loss_std + 0.02:
-        return Refused(AMPLIFIES, points, move)
+        return Refused(AMPLIFIES, why, remedy)
     if e.value.real < 1 - ACTIVE * e.real_std - 0.02:
-        return Refused(BELOW_AIR, points, move)
+        return Refused(BELOW_AIR, why, remedy)
     return None
 
 
 def _angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
-    """Mean incidence angle over a patch, radians."""
+    """Return the mean incidence angle over a patch, radians."""
     inside = theta[patch.interior] if theta.ndim and patch.interior.any() else theta
     return float(np.mean(inside))
 
 
 def _channel_ratio(images: ImagePair, metal: MetalReference) -> complex | None:
-    """V / H of the metal reference in the images themselves."""
+    """Return V / H of the metal reference in the images; None without signal."""
     h, v = images.h[metal.mask], images.v[metal.mask]
     power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
     return complex(np.vdot(h.astype(np.complex128), v)) / power if power > 0 else None
 
 
 def _patches(images: ImagePair, plane: PlaneReference | None, known: KnownScene) -> Segmentation:
-    """The known patches, as far as the image reaches, or those that are found."""
+    """Return the known patches, cut to the valid pixels, or else find them."""
     given = _within(known.segmentation, images.valid)
     if given:
         return given
@@ -188,7 +201,7 @@ def _patches(images: ImagePair, plane: PlaneReference | None, known: KnownScene)
 
 
 def _reference(images: ImagePair, metal: MetalChoice, found: Segmentation) -> MetalReference:
-    """The metal that was chosen, or the patch that must be metal; none without patches."""
+    """Return the chosen metal reference, or else the brightest patch; none without patches."""
     if metal.plane is not None:
         return MetalReference(metal.plane.valid, None, metal.plane.how, given=True)
     if metal.box_mm is not None:
@@ -199,9 +212,9 @@ def _reference(images: ImagePair, metal: MetalChoice, found: Segmentation) -> Me
 
 
 def to_metal(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> Calibrated:
-    """Both channels relative to metal, in the scene or scanned on its own; leakage is still in them.
+    """Divide both channels by metal, in the scene or scanned separately; leakage is not removed.
 
-    Where there is no signal to divide by, the images stay as they are.
+    Without any signal of metal to divide by, the images are returned unchanged.
     """
     if reference is not None:
         return reference.apply(h, v)
@@ -214,26 +227,26 @@ def to_metal(h: Image, v: Image, metal: MetalReference, reference: PlaneReferenc
 
 
 def without_leakage(c: Calibrated, leakage: tuple[complex, complex]) -> Calibrated:
-    """Metal-referenced channels with leakage removed."""
+    """Remove the leakage from metal-referenced channels."""
     h, v = correct_leakage(c.h, c.v, *leakage)
     return Calibrated(h, v, ratio(h, v), c.metal_h, c.metal_v)
 
 
 def reference_spread(h: Image, v: Image, metal: MetalReference, reference: PlaneReference | None) -> float:
-    """Spread of the metal's own pixels about it, relative."""
+    """Return the relative spread of the metal's pixels."""
     spread = inverse_spread(h[metal.mask], v[metal.mask]) if reference is None else reference.spread
     return spread if np.isfinite(spread) else 0.0
 
 
 def _within(found: Segmentation | None, valid: npt.NDArray[np.bool_] | None) -> Segmentation | None:
-    """The same patches, if any, their interiors cut to the pixels that are valid."""
+    """Cut the interiors of patches to the valid pixels."""
     if found is None or valid is None:
         return found
     return replace(found, patches=tuple(replace(p, interior=p.interior & valid) for p in found.patches))
 
 
 def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
-    """Gaussian filter over each patch's interior by itself, however close the next one; not a number elsewhere."""
+    """Apply a Gaussian filter inside each patch separately; NaN elsewhere."""
     out = np.full(image.shape, complex(np.nan, np.nan), image.dtype)
     reach = int(np.ceil(4 * sigma_px))
     for patch in found.patches:
@@ -247,7 +260,7 @@ def smooth_inside(image: Image, found: Segmentation, sigma_px: float) -> Image:
 
 
 def pixel_accuracy(result: MaterialsResult) -> float | None:
-    """Share of interior pixels named right over all patches of known truth; None where there are none.
+    """Return the share of interior pixels named right over all patches of known truth; None without such patches.
 
     Patches rightly called unknown, because the library does not hold their material, do not count.
     """
@@ -256,7 +269,7 @@ def pixel_accuracy(result: MaterialsResult) -> float | None:
 
 
 def expected_pixel_accuracy(result: MaterialsResult) -> float | None:
-    """Share of the pixels of :func:`pixel_accuracy` that the best classifier is expected to name right.
+    """Return the share of the pixels of :func:`pixel_accuracy` that the best classifier is expected to name right.
 
     It is the mean probability of each pixel's likeliest material, so that no choice of names is expected to do better
     on these data. None without known truth, or if the classifier gives no probabilities.
@@ -267,19 +280,19 @@ def expected_pixel_accuracy(result: MaterialsResult) -> float | None:
 
 
 def _pixels_with_truth(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
-    """Named patches whose truth is known, with the truth's name; without those rightly called unknown."""
+    """Return the named patches of known truth, each with the true name; without those rightly called unknown."""
     judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
     return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]
 
 
 def image_centre_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[float, float]:
-    """Rig-frame position, in millimetres, of the image centre from which boxes and outlines count."""
+    """Return the image centre in the rig frame, millimetres: the origin of boxes and outlines."""
     x, y = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
     return float(x[0] * 1e3 - axis_mm(x)[0]), float(y[0] * 1e3 - axis_mm(y)[0])
 
 
 def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict[str, Any]:
-    """Largest relative change of a patch's permittivity (Eq. 3) if the other angle were used; for quality.json.
+    """Return the largest relative change of a patch's permittivity (Eq. 3) with the other angle, for quality.json.
 
     `largest_permittivity_change` is |eps_other / eps - 1|, `of_patch` its number; empty without any permittivity.
     """
@@ -294,3 +307,47 @@ def permittivity_change(found: MaterialsResult, angles: IncidenceChoice) -> dict
         return {}
     largest, label = max(changes)
     return {"largest_permittivity_change": round(largest, 5), "of_patch": label}
+
+
+REFERENCE_BRIGHTNESS_STD = 0.1
+"""Standard deviation of ln|H| and ln|V| of all patches by a metal plate that lies high or tilted; an assumed prior."""
+
+
+def scene_errors(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> SceneErrors:
+    """Return the remaining errors of ln|H|, ln|V| and arg P of the patches after the inversion, for naming them.
+
+    Common to all patches are the leakage of p into H (da) and of s into V (db), the metal reference (rho), the angle,
+    and the reference's brightness, which V / H does not determine. Each patch has the errors of its own V / H and of
+    its brightness, equal in both channels.
+    To first order about the solution, for the patches' true features with t = r_p / r_s and fixed permittivity:
+    d ln|H| = Re((1 - t) da), d t = -(1 - t) (t da + db) - t rho - (dt / dtheta) dtheta.
+    """
+    t = np.array([p.inverse_ratio for p in found.patches], np.complex128)
+    none = np.zeros_like(t)
+    by_h = np.stack([1 - t, none, none], axis=1)
+    by_t = np.stack([-(1 - t) * t, -(1 - t), -t], axis=1)
+    scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
+    columns = [relative((unit * scale * by_h).real, unit * scale * by_t, t[:, None]) for unit in (1.0, 1j)]
+    design = np.stack(columns, axis=2).reshape(len(t), 6, 3)
+    bright = np.tile([1.0, 1.0, 0.0], (len(t), 1, 1))
+    design = np.concatenate([design, _by_angle(found, prior, seen)[:, None], bright], axis=1).swapaxes(1, 2)
+    covariance = np.zeros((8, 8))
+    covariance[:7, :7] = found.nuisance_covariance[:7, :7]
+    covariance[7, 7] = REFERENCE_BRIGHTNESS_STD**2
+    own_h = np.zeros((len(t), 3, 3))
+    own_h[:, :2, :2] = found.brightness_std**2
+    noise = np.array([s.std for s in seen]) / softened(t)
+    return SceneErrors(own_h + noise[:, None, None] ** 2 * np.diag([0.0, 1.0, 1.0]), design, covariance)
+
+
+def _by_angle(found: Inversion, prior: RigPrior, seen: Sequence[PatchMeasurement]) -> npt.NDArray[np.float64]:
+    """Return the change of the features by one standard deviation of the angle, at fixed permittivity, [patch, 3]."""
+    out = np.zeros((len(seen), 3))
+    for i, (patch, one) in enumerate(zip(found.patches, seen, strict=True)):
+        if patch.permittivity is not None:
+            step = prior.theta_std_rad
+            (here_h, here_t), (there_h, there_t) = (
+                features(patch.permittivity, [one.theta_rad + found.theta_error_rad + more]) for more in (0.0, step)
+            )
+            out[i] = relative(here_h - there_h, here_t - there_t, here_t)[0]
+    return out

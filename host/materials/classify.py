@@ -1,7 +1,7 @@
-"""Naming the pixels and patches of a scan by a reference library, and the models that can do it.
+"""Name the pixels and patches of a scan by a reference library; the available models.
 
-`MODELS` makes each classifier: the paper's KNN, the discriminant of error sources, and others from scikit-learn to
-compare with. `Classifier` uses the one that was fitted with the library, or that is asked for.
+`MODELS` lists the models: the paper's KNN, the discriminant of error sources, and others of scikit-learn for
+comparison. `Classifier` uses the library's model, or the requested one. `add_explanation` gives the reason of a name.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy.typing as npt
 from polysight.host.materials.discriminant import ErrorDiscriminant
 from polysight.host.materials.knn import PaperKnn, Weights
 from polysight.host.materials.library import Library
+from polysight.host.materials.permittivity import format_permittivity
 from polysight.host.materials.samples import (
     WIDTH,
     Model,
@@ -27,38 +28,39 @@ from polysight.host.materials.samples import (
     feature_matrix,
     usable,
 )
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 PAPER = "weighted KNN (paper)"
 DISCRIMINANT = "discriminant of error sources"
 SLOW = "metric learning (NCA) + KNN"
-"""Takes seconds to fit, too long for every start of a program: judged, but not chosen."""
+"""Takes seconds to fit, too long for every start of a program; never the default."""
 SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT}
-"""What the commands call some of them."""
+"""Names of models in commands."""
 EARLIER = {"own-spread": DISCRIMINANT, "discriminant of error sources, own spread": DISCRIMINANT}
-"""What earlier releases and their libraries called models that are one now."""
+"""Names of models in earlier releases and their libraries."""
 UNKNOWN = "unknown"
 INCLUSIONS = 0.05
-"""Share of a patch's pixels that may be of another material than the patch: a pixel's name starts from its patch's."""
+"""Share of a patch's pixels that may be of another material; a pixel's prior is its patch's name otherwise."""
 LIKELY = 0.005
-"""Runners-up of less probability are not listed."""
+"""Materials of less probability are not listed."""
 
 
-class Learnt(Model):
-    """An estimator of scikit-learn on the columns of its channels; unknown is what lies far in the discriminant."""
+class SklearnModel(Model):
+    """A scikit-learn estimator on some channels; unknown pixels are those far from the discriminant's materials."""
 
     def __init__(self, estimator: Any, channels: str) -> None:
         self.estimator, self.channels = estimator, channels
         self.distributions = ErrorDiscriminant()
 
-    def fit(self, samples: Samples) -> Learnt:
-        """Learn from labelled pixels."""
+    def fit(self, samples: Samples) -> SklearnModel:
+        """Fit the estimator to labelled pixels."""
         self.estimator.fit(self._columns(samples.x), samples.names)
         self.distributions.fit(samples)
         return self
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Name of each pixel, and its distance to that material over the threshold."""
+        """Name each pixel; return the names and the distances to those materials over the threshold."""
         names = self.estimator.predict(self._columns(x))
         return names, self.distributions.distance(x, names)
 
@@ -68,7 +70,7 @@ class Learnt(Model):
 
 
 def log_features(x: Real) -> Real:
-    """ln|H|, ln|V| and the direction of V / H for each angle; features of fewer channels are left as they are."""
+    """Return ln|H|, ln|V| and the direction of V / H for each angle; features of fewer channels unchanged."""
     if x.shape[1] % WIDTH:
         return x
     h, v, q = by_angle(x)
@@ -77,7 +79,7 @@ def log_features(x: Real) -> Real:
     return np.concatenate(logs, axis=1)
 
 
-def _sklearn(channels: str, *names: str) -> Learnt:
+def _sklearn(channels: str, *names: str) -> SklearnModel:
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis, QuadraticDiscriminantAnalysis
     from sklearn.neighbors import KNeighborsClassifier, NeighborhoodComponentsAnalysis
     from sklearn.pipeline import make_pipeline
@@ -91,7 +93,7 @@ def _sklearn(channels: str, *names: str) -> Learnt:
         "nca": lambda: NeighborhoodComponentsAnalysis(random_state=0, max_iter=60),
         "knn": lambda: KNeighborsClassifier(15),
     }
-    return Learnt(make_pipeline(*(parts[n]() for n in names)), channels)
+    return SklearnModel(make_pipeline(*(parts[n]() for n in names)), channels)
 
 
 MODELS: dict[str, Callable[[str], Model]] = {
@@ -106,26 +108,26 @@ MODELS: dict[str, Callable[[str], Model]] = {
 
 @dataclass(frozen=True)
 class PatchName:
-    """What one patch was called.
+    """Name of one patch, with its confidence and reason.
 
     Attributes
     ----------
     name
         Material, or "unknown".
     confidence
-        How sure: the probability of that name, or for the KNN the share of its pixels.
+        Probability of that name; for the KNN the share of its pixels.
     votes
-        Share of the pixels called so on their own, of each name that got any, largest first.
+        Share of the pixels with each name, largest first.
     distance
         Distance to the material, in units of its threshold: above 1 is unknown.
     pixels
         Usable pixels.
     probabilities
-        Of each material that is not unlikely, and of "unknown", likeliest first; empty for models that give none.
+        Of each likely material and of "unknown", largest first; empty for models without probabilities.
     why
-        The reason of the name in one sentence (`explain.py`); empty where permittivities are not known.
+        Reason of the name in one sentence (:func:`add_explanation`); empty if permittivities are not known.
     nearest
-        The likeliest material, also of a patch that is unknown; None without usable pixels.
+        The likeliest material, also of an unknown patch; None without usable pixels.
     """
 
     name: str
@@ -152,24 +154,24 @@ class NamedPatch:
 
 
 class Classifier:
-    """Names pixels and patches by the library.
+    """Names the pixels and patches of scans by a library.
 
     Parameters
     ----------
     library
-        Reference patches; what was fitted on them says which model names.
+        Reference patches with the fitted model.
     weights
-        Of the paper's KNN, which they select; instead of the library's own.
+        Weights of the paper's KNN; they select that model, and replace the library's own weights.
     model
-        A key of `MODELS` or `SHORT`, instead of the model chosen for the library.
+        A key of `MODELS` or `SHORT`; default: the library's model.
     angles_deg
-        Incidence angle of the scan, or of several scans of the same patches in their order; needed where the library
-        holds more than one.
+        Incidence angle of the scan, or of several scans of the same patches in their order; required if the library
+        has more than one.
 
     Raises
     ------
     DataError
-        when the library is empty, holds no patch at an angle, or its fit cannot be read.
+        if the library is empty, has no patch at an angle, or its fit cannot be read.
     """
 
     def __init__(
@@ -180,19 +182,23 @@ class Classifier:
         angles_deg: Sequence[float] | None = None,
     ) -> None:
         if not library.entries:
-            raise DataError("the material library is empty", "nothing was trained", "polysight train")
+            raise DataError(
+                "the material library is empty", "nothing was trained", "polysight train", code=ErrorCode.NO_DATA
+            )
         if angles_deg is None and len(library.angles_deg) > 1:
             raise DataError(
-                f"the library holds incidence angles {', '.join(f'{a:g}' for a in library.angles_deg)} degrees",
-                "reflections under different angles are not compared",
-                "say which angle the scan has",
+                f"the library has several incidence angles: {', '.join(f'{a:g}' for a in library.angles_deg)} degrees",
+                "reflections under different angles cannot be compared",
+                "give the incidence angle of the scan",
+                code=ErrorCode.KEY_MISSING,
             )
         parts = [library.at(a) for a in angles_deg or library.angles_deg]
         if len({p.angles_deg[0] for p in parts}) < len(parts):
             raise DataError(
                 f"scans under {' and '.join(f'{a:.1f}' for a in angles_deg or ())} degrees",
-                "the library has learnt one set of features of that angle, whose errors would count twice",
+                "the library has only one set of features for that angle, whose errors would count twice",
                 "give scans of the same patches under different angles, or one at a time",
+                code=ErrorCode.VALUES_CONFLICT,
             )
         fit = parts[0].fit if len(parts) == 1 else library.fit_of([p.angles_deg[0] for p in parts])
         self.library, self.fit, self.angles_deg = library, fit, tuple(p.angles_deg[0] for p in parts)
@@ -212,7 +218,7 @@ class Classifier:
 
     @property
     def permittivities(self) -> dict[str, complex]:
-        """Name to what the library's patches look like, as half spaces; without metals."""
+        """Material to the permittivity of the library's patches as half spaces; without metals."""
         return self.distributions.permittivities
 
     def scan(self, patches: Sequence[Real], errors: SceneErrors | None = None) -> list[NamedPatch]:
@@ -224,7 +230,7 @@ class Classifier:
             Features of each patch's pixels, [n, 4 * angles] (:func:`polysight.host.materials.samples.feature_matrix`);
             pixels that are not finite are unknown.
         errors
-            What the scan's error budget leaves uncertain of the patches; None: nothing.
+            Errors of the patches by the scan's error budget; None: no errors.
         """
         good = [usable(x) for x in patches]
         some = [i for i, g in enumerate(good) if g.any()]
@@ -251,7 +257,7 @@ class Classifier:
             every = dict(zip([*map(str, found.materials), UNKNOWN], found.probabilities[row].tolist(), strict=True))
             order = sorted(every, key=lambda name: -every[name])
             probabilities = {name: round(every[name], 4) for name in order if every[name] >= LIKELY}
-            if far > 1:  # farther from all than one of them should be
+            if far > 1:  # too far from all materials
                 confidence = max(every[UNKNOWN], 1 - confidence)
         nearest = str(found.names[row])
         name = nearest if far <= 1 else UNKNOWN
@@ -260,21 +266,21 @@ class Classifier:
     def pixels(
         self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike
     ) -> tuple[npt.NDArray[np.str_], npt.NDArray[np.float64]]:
-        """Name pixels, each by nothing but itself; for libraries of one angle.
+        """Classify each pixel independently (libraries with one incidence angle).
 
         Parameters
         ----------
         h, v
-            |H|, |V| relative to metal, [n] (complex values are taken by modulus).
+            |H|, |V| relative to metal, [n]; of complex values the modulus.
         p
             complex [n], metal-referenced ratio.
 
         Returns
         -------
         names
-            str [n]; "unknown" beyond the threshold, or where the pixel is not finite.
+            str [n]; "unknown" beyond the threshold, or if the pixel is not finite.
         distance
-            float64 [n], distance over the threshold; infinite where not finite.
+            float64 [n], distance over the threshold; infinite if the pixel is not finite.
         """
         x = features_of(h, v, p)
         good = usable(x)
@@ -283,13 +289,13 @@ class Classifier:
         return found.names, found.distance
 
     def patch(self, h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> PatchName:
-        """Name one patch on its own; features as :meth:`pixels`."""
+        """Name one patch alone; parameters as :meth:`pixels`."""
         return self.scan([features_of(h, v, p)])[0].verdict
 
     def _named(
         self, good: npt.NDArray[np.bool_], pixels: tuple[npt.NDArray, Real] | None, name: PatchName
     ) -> NamedPatch:
-        """A patch with the names and distances of its usable pixels; None: none was named."""
+        """Return a patch with names and distances of all pixels; `pixels` are those of the usable ones, if any."""
         every = np.full(good.size, UNKNOWN, f"<U{self._width}")
         relative = np.full(good.size, np.inf)
         if pixels is not None:
@@ -302,7 +308,7 @@ class Classifier:
 
 
 def features_of(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
-    """Features [n, 4] of pixels, not finite where one of them cannot be used."""
+    """Return features [n, 4] of pixels; not finite for unusable pixels."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
 
@@ -312,6 +318,49 @@ def _model_name(given: str) -> str:
     if name not in MODELS:
         raise DataError(
             f"no classifier is called {given!r}", "the library was made by another version, or the name is wrong",
-            f"one of {', '.join(SHORT)}",
+            f"one of {', '.join(SHORT)}", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return name
+
+
+def add_explanation(
+    named: NamedPatch, permittivity: complex | None, covariance: npt.NDArray[np.float64] | None, classifier: Classifier
+) -> NamedPatch:
+    """Return the patch with the reason of its name, one sentence for a reader who knows materials.
+
+    Parameters
+    ----------
+    named
+        Result of the classifier.
+    permittivity, covariance
+        eps' - j eps'' of the patch, and [2, 2] of its real and imaginary part; None if it has none.
+    classifier
+        Gives the library's permittivities.
+    """
+    name = named.verdict
+    known, found = classifier.permittivities, _estimate(permittivity, covariance)
+    nearest = name.name if name.name != UNKNOWN else name.nearest
+    like = "" if nearest is None else _with_permittivity(nearest, known.get(nearest))
+    if name.name == UNKNOWN:
+        near = f"; nearest: {like}" if like else ""
+        why = f"not in the library: {found}{near}" if found else f"not in the library{near}"
+    else:
+        others = [f"{n} {100 * p:.0f} %" for n, p in name.probabilities.items() if n not in (name.name, UNKNOWN)][:2]
+        match = f"{found} matches the library's {like}" if found else f"it looks like the library's {like}"
+        alone = "; no other material is likely" if name.probabilities else ""  # the KNN has no probabilities
+        why = match + (f"; it could also be {' or '.join(others)}" if others else alone)
+    return replace(named, verdict=replace(name, why=why))
+
+
+def _estimate(permittivity: complex | None, covariance: npt.NDArray[np.float64] | None) -> str:
+    if permittivity is None:
+        return ""
+    text = f"permittivity {format_permittivity(permittivity)}"
+    if covariance is None or not np.isfinite(covariance).all():
+        return text
+    real, loss = np.sqrt(np.diag(covariance))
+    return f"{text} (+- {real:.2f}, {loss:.2f})"
+
+
+def _with_permittivity(name: str, permittivity: complex | None) -> str:
+    return name if permittivity is None else f"{name} ({format_permittivity(permittivity)})"

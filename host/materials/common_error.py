@@ -1,11 +1,11 @@
-"""The error that all patches of a scan share, found together with what the patches are.
+"""Estimate the error common to all patches of a scan, together with the materials of the patches.
 
-One leakage or one gain moves every patch alike, and a patch tells of it only as far as its material is known. So the
-error and the names are estimated in turns (expectation maximisation). A library whose materials lie in a row can be
-entered one place off: a common error then makes each plate look like its neighbour, and fits nearly as well. Turns
-that begin at no error find one of these explanations only. Here they begin at the error that would make any one patch
-any one material, and every explanation that is reached counts with its evidence (Laplace's approximation; MacKay,
-Information Theory, Inference, and Learning Algorithms, chapter 27).
+A leakage or gain error moves all patches alike, and a patch gives information on it only if its material is known. So
+the error and the materials are estimated in turns (expectation maximisation). If the library's materials lie in a row,
+a common error can shift every plate to its neighbour and fit nearly as well; iterations that start at zero error find
+only one of these explanations. Here they start at the error that would make any one patch any one material, and each
+explanation found is weighted with its evidence (Laplace's approximation; MacKay, Information Theory, Inference, and
+Learning Algorithms, chapter 27).
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ import numpy.typing as npt
 from polysight.host.materials.samples import Real
 
 _ROUNDS, _FIRST_ROUNDS = 30, 3
-_TURNS = 2  # of the error and of what it makes of patches that are none
-_STARTS, _TRIED = 100, 6  # the most plausible ones, and those of them that explain most of the other patches
-_UNLIKELY = 12.0  # an explanation whose log evidence lies so far below the best one's after the first rounds
-_SAME = 1.0  # explanations closer than this many standard deviations are one
+_TURNS = 2  # alternations of the error and the likelihood of none of the materials
+_STARTS, _TRIED = 100, 6  # the most plausible starts, and the best of them for all patches
+_UNLIKELY = 12.0  # log evidence below the best one's, after the first rounds, to drop an explanation
+_SAME = 1.0  # standard deviations within which two explanations are the same
 _LN_2PI = float(np.log(2 * np.pi))
 
 
 @dataclass(frozen=True)
 class CommonError:
-    """What a scan's patches have in common: an error, its covariance, and what it does to each patch.
+    """An error common to the patches of a scan, with its covariance and its effect on each patch.
 
-    `design` [patch, d, q] turns the error's q numbers into deviations; `value` [q]; `covariance` [q, q]; `precision`
-    [q, q] is what was known before any patch was seen.
+    `design` [patch, d, q] converts the error's q numbers to deviations; `value` [q]; `covariance` [q, q]; `precision`
+    [q, q] is that of the prior.
     """
 
     design: Real
@@ -41,7 +41,7 @@ class CommonError:
 
     @property
     def shift(self) -> Real:
-        """Deviations that the error makes, [patch, d]."""
+        """Deviations by the error, [patch, d]."""
         return np.asarray(self.design @ self.value, np.float64)
 
     @property
@@ -52,30 +52,30 @@ class CommonError:
 
 @dataclass(frozen=True)
 class Patches:
-    """Patches beside materials.
+    """Deviations of patches from materials.
 
-    `mean` [patch, materials, d] the deviations of their means, `own` [patch, materials, d, d] the covariances of each
-    patch alone, `tells` bool [patch] those that tell of the error.
+    `mean` [patch, materials, d] of their means, `own` [patch, materials, d, d] the covariances of the patches' own
+    errors, `informative` bool [patch]: usable to estimate the common error.
     """
 
     mean: Real
     own: Real
-    tells: npt.NDArray[np.bool_]
+    informative: npt.NDArray[np.bool_]
 
 
 def explanations(
     seen: Patches, before: CommonError, none: Callable[[CommonError], Real]
 ) -> list[tuple[float, CommonError]]:
-    """The errors that explain a scan, each with its probability, the likeliest first.
+    """Return the common errors that explain a scan, each with its probability, the likeliest first.
 
-    `before` is the error as it is known without the patches; `none` gives minus twice the log likelihood [patch] of
-    none of the materials under an error. Where fewer than two patches tell, the error stays as it was before.
+    `before` is the prior of the error; `none` returns minus twice the log likelihood [patch] of none of the materials
+    under an error. With fewer than two informative patches the result is the prior.
     """
-    at = np.flatnonzero(seen.tells)
+    at = np.flatnonzero(seen.informative)
     if at.size < 2:
         return [(1.0, before)]
     cost = none(before)
-    first = [_turns(seen, start, cost, _FIRST_ROUNDS) for start in (before, *_starts(seen, before, cost))]
+    first = [_alternate(seen, start, cost, _FIRST_ROUNDS) for start in (before, *_starts(seen, before, cost))]
     found: list[tuple[float, CommonError]] = []
     for evidence, start in _distinct([(_evidence(seen, e, cost), e) for e in first]):
         if found and evidence < found[0][0] - _UNLIKELY:
@@ -83,7 +83,7 @@ def explanations(
         error, cost_of_none = start, cost
         for _ in range(_TURNS):
             cost_of_none = none(error)
-            error = _turns(seen, error, cost_of_none, _ROUNDS)
+            error = _alternate(seen, error, cost_of_none, _ROUNDS)
         found.append((_evidence(seen, error, cost_of_none), error))
     found = _distinct(found)
     weight = np.exp(np.array([e for e, _ in found]) - found[0][0])
@@ -91,22 +91,22 @@ def explanations(
 
 
 def costs(d: Real, covariances: Real) -> tuple[Real, Real]:
-    """Squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials]."""
+    """Return squared distances and minus twice the log likelihoods of deviations [n, materials, d], [n, materials]."""
     inverse = np.linalg.inv(covariances)
     q = np.sum(d * (inverse @ d[..., None])[..., 0], axis=-1)
     return q, q - np.linalg.slogdet(inverse)[1] + d.shape[2] * _LN_2PI
 
 
 def probabilities(cost: Real, none: Real) -> Real:
-    """Of every material and, last, of none of them, [n, materials + 1]."""
+    """Return the probability of every material and, last, of none of them, [n, materials + 1]."""
     every = np.concatenate([cost, none[:, None]], axis=1)
     w = np.exp(-0.5 * (every - every.min(axis=1, keepdims=True)))
     return w / w.sum(axis=1, keepdims=True)
 
 
 def _starts(seen: Patches, before: CommonError, none: Real) -> list[CommonError]:
-    """The error as each patch alone would have it if it were each of the materials, those that explain most."""
-    at = np.flatnonzero(seen.tells)
+    """Return start values: the error that makes one patch one material, for the best of all such pairs."""
+    at = np.flatnonzero(seen.informative)
     mean, g = seen.mean[at], before.design[at][:, None]  # [patch, materials, d], [patch, 1, d, q]
     inverse = np.linalg.inv(seen.own[at])
     constant = -np.linalg.slogdet(inverse)[1] + mean.shape[2] * _LN_2PI
@@ -130,21 +130,20 @@ def _starts(seen: Patches, before: CommonError, none: Real) -> list[CommonError]
     return [error for _, error in _distinct(found, _TRIED)]
 
 
-def _turns(seen: Patches, error: CommonError, none: Real, rounds: int) -> CommonError:
-    """The error from the patches' deviations, names and error in turns.
+def _alternate(seen: Patches, error: CommonError, none: Real, rounds: int) -> CommonError:
+    """Estimate the error from the patches' deviations, alternating with the probabilities of their materials.
 
-    Which material a patch is, is as uncertain as the last round left it; a patch that is none of them counts for
-    nothing.
+    Patches that are probably none of the materials have little weight.
     """
-    at = np.flatnonzero(seen.tells)
+    at = np.flatnonzero(seen.informative)
     design, precision, g = error.design, error.precision, error.design[at]
     mean, own = seen.mean[at], seen.own[at]
     for _ in range(rounds):
         _, cost = costs(mean - error.shift[at][:, None], own + error.spread[at][:, None])
         middle, information = _moments(mean, own, probabilities(cost, none[at])[:, :-1])
         covariance = np.linalg.inv(precision + np.sum(g.mT @ information @ g, axis=0))
-        told = np.sum(g.mT @ (information @ middle[:, :, None]), axis=0)[:, 0]
-        before, value = error.value, covariance @ told
+        combined = np.sum(g.mT @ (information @ middle[:, :, None]), axis=0)[:, 0]
+        before, value = error.value, covariance @ combined
         error = CommonError(design, value, covariance, precision)
         if np.abs(design @ (value - before)).max() < 1e-7:
             break
@@ -152,8 +151,8 @@ def _turns(seen: Patches, error: CommonError, none: Real, rounds: int) -> Common
 
 
 def _evidence(seen: Patches, error: CommonError, none: Real) -> float:
-    """Log evidence of an explanation, by Laplace's approximation, but for a constant."""
-    at = np.flatnonzero(seen.tells)
+    """Return the log evidence of an explanation up to a constant, by Laplace's approximation."""
+    at = np.flatnonzero(seen.informative)
     _, cost = costs(seen.mean[at] - error.shift[at][:, None], seen.own[at])
     every = -0.5 * np.concatenate([cost, none[at, None]], axis=1)
     top = every.max(axis=1)
@@ -163,7 +162,7 @@ def _evidence(seen: Patches, error: CommonError, none: Real) -> float:
 
 
 def _distinct(found: list[tuple[float, CommonError]], most: int | None = None) -> list[tuple[float, CommonError]]:
-    """Without those that are one with a likelier one, the likeliest first, so many at most."""
+    """Drop explanations that equal a likelier one; return at most `most`, the likeliest first."""
     out: list[tuple[float, CommonError]] = []
     for evidence, error in sorted(found, key=lambda f: -f[0]):
         if len(out) == most:
@@ -175,9 +174,9 @@ def _distinct(found: list[tuple[float, CommonError]], most: int | None = None) -
 
 
 def _moments(d: Real, covariances: Real, weight: Real) -> tuple[Real, Real]:
-    """What a patch tells whose material is uncertain: mean deviation [patch, d] and information [patch, d, d].
+    """Return mean deviation [patch, d] and information [patch, d, d] of patches of uncertain material.
 
-    As of the normal distribution with the moments of the mixture; less for what is none of the materials.
+    They are those of the normal distribution with the moments of the mixture, less if it may be none of the materials.
     """
     known, weight = weight.sum(axis=1), weight + 1e-12
     share = weight / weight.sum(axis=1, keepdims=True)

@@ -1,22 +1,22 @@
-"""Materials as distributions, told apart by all that errors and specimens do: pixel, patch, specimen, scan.
+"""The discriminant of error sources: materials as distributions over pixels, patches, specimens and scans.
 
 On ln|H|, ln|V| and arg P errors of gain and of phase are additive. A pixel of material m in patch p of scan s is
 
     z = mean_m + F_m d + g_s + u_p + e,
 
-with e the pixel's own error (speckle), u_p that of the whole patch (its placement, uneven illumination), g_s that of
-the scan's metal reference, which all patches of the scan inherit, and d the deviation of the specimen from its
-material in ln eps' and ln eps'', which F_m turns into features (`specimens.py`): a linear model with random effects
-(Searle, Casella and McCulloch, Variance Components, chapter 5). Where V nearly vanishes its error is additive, and is
-taken so (`softened`). The covariances are estimated from the library: by residual mean squares of pixels, patches and
-scans, and patches' by expectation maximisation into placement and specimen. A decision weighs each as it should:
+with e the pixel's own error (speckle), u_p the error of the whole patch (placement, uneven illumination), g_s that of
+the scan's metal reference, common to all its patches, and d the deviation of the specimen from its material in ln eps'
+and ln eps'', which F_m converts to features (`specimens.py`): a linear model with random effects (Searle, Casella and
+McCulloch, Variance Components, chapter 5). If V nearly vanishes its error is additive (`softened`). The covariances are
+estimated from the library: by residual mean squares of pixels, patches and scans; that of patches is divided into
+placement and specimen by expectation maximisation. A decision uses them as follows:
 
-* a pixel on its own carries all of them;
-* a patch is named from the mean of its pixels, in which e has averaged out;
-* the patches of a scan are named together. g_s, and what the error budget leaves of leakage, angle and reference, is
-  the same for all of them, so that its estimate and the names are found in turns (expectation maximisation).
+* a single pixel has all errors;
+* a patch is named from the mean of its pixels, in which e averages out;
+* the patches of a scan are named together: g_s, and the remaining errors of leakage, angle and reference, are common
+  to them, so that these errors and the names are estimated in turns (expectation maximisation).
 
-The result is a probability of each material and of none of them (`none_of_these.py`).
+The result is a probability of each material and of none of them (`cost_of_none` in `specimens.py`).
 """
 
 from __future__ import annotations
@@ -28,23 +28,29 @@ import numpy.typing as npt
 import scipy
 
 from polysight.host.materials.common_error import CommonError, Patches, costs, explanations, probabilities
-from polysight.host.materials.none_of_these import cost_of_none
 from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle
-from polysight.host.materials.specimens import apparent_permittivity, effect, fit_spread, relative, without
+from polysight.host.materials.specimens import (
+    apparent_permittivity,
+    cost_of_none,
+    effect,
+    fit_spread,
+    relative,
+    without,
+)
 
 REJECTED = 0.02
-"""Share of the known materials' pixels, and of their patches, that may be called unknown."""
+"""Share of the known materials' pixels, and of their patches, that are called unknown."""
 NONE = 0.02
-"""Probability, before anything is measured, that a patch is none of the library's materials."""
+"""Prior probability that a patch is none of the library's materials."""
 METAL_LIKE = 0.25
-"""|1/P - 1| of a patch below this: the reference or another metal. It has no error of its own, so it tells of none."""
+"""|1/P - 1| below which a patch is metal, which has no error of its own and gives no information on errors."""
 _ROUNDS = 30
-_BEYOND = 1.001  # the least distance of what is unknown
+_BEYOND = 1.001  # least distance of unknown patches
 _LN_2PI = float(np.log(2 * np.pi))
 
 
 class ErrorDiscriminant(Model):
-    """The discriminant of the module's text.
+    """The discriminant of error sources, see the module's docstring.
 
     Parameters
     ----------
@@ -73,66 +79,72 @@ class ErrorDiscriminant(Model):
             samples.plates[first],
         )
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
-        tells = ~self._metal_like(samples.x, patch)
-        if not tells.any():
-            tells[:] = True
+        informative = ~self._metal_like(samples.x, patch)
+        if not informative.any():
+            informative[:] = True
 
-        offset, self.level = _two_way(mean, material, scan, tells)
+        offset, self.level = _two_way(mean, material, scan, informative)
         self.pixels = float(np.median(count))
         self.placements = np.bincount(material).astype(float)
         self.plates = np.array([np.unique(plate[material == k]).size for k in range(self.names.size)], np.float64)
         residual = mean - self.level[material] - offset[scan]
-        scans = np.unique(scan[tells]).size
-        dof = max(int(tells.sum()) - np.unique(material[tells]).size - scans + 1, 1)
-        pixel, told = d - mean[patch], tells[patch]
-        self.within = self._independent(_covariance(pixel[told], max(int(told.sum() - tells.sum()), 1)))
-        self._effects = self._effect_of_specimens()
-        self._fit_patches(residual[tells] * np.sqrt(tells.sum() / dof), material[tells], plate[tells], dof)
-        each = max(tells.sum() / scans, 1.0)
-        common = self._independent(_covariance(offset[np.unique(scan[tells])], max(scans - 1, 1)))
+        scans = np.unique(scan[informative]).size
+        dof = max(int(informative.sum()) - np.unique(material[informative]).size - scans + 1, 1)
+        pixel, used = d - mean[patch], informative[patch]
+        self.within = self._independent(_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1)))
+        self._effects = self._specimen_effects()
+        self._fit_patches(
+            residual[informative] * np.sqrt(informative.sum() / dof), material[informative], plate[informative], dof
+        )
+        each = max(informative.sum() / scans, 1.0)
+        common = self._independent(_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
         self.scan = _positive(common - self.between / each) + 1e-8 * np.eye(width)
         self._set_thresholds(
-            (mean - self.level[material])[tells], material[tells], (d - self.level[of])[told], of[told], float(dof)
+            (mean - self.level[material])[informative],
+            material[informative],
+            (d - self.level[of])[used],
+            of[used],
+            float(dof),
         )
         return self
 
     @property
     def distributions(self) -> ErrorDiscriminant:
-        """The materials' distributions: itself. Other models have one beside, for what is unknown."""
+        """The model itself; other models have a discriminant to recognise unknown patches."""
         return self
 
     @property
     def permittivities(self) -> dict[str, complex]:
-        """Name to the half space that looks like the material; without metals, and where angles are not known."""
+        """Material to permittivity of the half space with its ratio; without metals; empty if angles are not known."""
         if not len(self.angles_rad):
             return {}
         kinds = zip(self.names, self._anchor_t, strict=True)
         return {str(n): apparent_permittivity(t, self.angles_rad) for n, t in kinds if bool((abs(t - 1) > 0.1).all())}
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Name of each pixel on its own, and its distance over the threshold."""
+        """Classify each pixel independently: return its name, and its distance over the threshold."""
         q, cost = costs(self._deviations(x) - self.level, self._pixel_covariances())
         best = cost.argmin(axis=1)
         return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
 
     def distance(self, x: Real, names: npt.NDArray) -> Real:
-        """Distance of each pixel to the material it was named by whatever classifier, over the threshold."""
+        """Return the distance of each pixel to the material `names` [n] of any classifier, over the threshold."""
         q, _ = costs(self._deviations(x) - self.level, self._pixel_covariances())
         return np.sqrt(q[np.arange(len(x)), np.searchsorted(self.names, names)] / self.pixel_level)
 
     def by_scan(
         self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
     ) -> NamedScan:
-        """Names in one scan: what all patches' errors have in common is found, and taken off.
+        """Name the patches and pixels of one scan, with an estimate of the errors common to all patches.
 
-        `errors` come to the library's own; they are of one angle, and left out with several.
-        With `others`, pixels are named by their patch, up to so large a share.
+        `errors` are added to the library's own; they hold for one angle and are ignored with several. With `others`,
+        the prior of a pixel is its patch's name, except for this share; without, pixels are independent.
         """
         _, patch = np.unique(patches, return_inverse=True)
         ids = np.unique(patches)
         d = self._deviations(x) - self.level
         mean = np.stack([d[patch == i].mean(axis=0) for i in range(ids.size)])
-        tells = ~self._metal_like(x, patch)
+        informative = ~self._metal_like(x, patch)
         pixels = float(min([self.pixels, *np.bincount(patch).tolist()]))
         own = self._patch_covariances(pixels)
         mine = np.zeros((ids.size, *self.scan.shape))
@@ -142,16 +154,16 @@ class ErrorDiscriminant(Model):
             errors = None
         placed = self.within / pixels + self.between + mine
         found = explanations(
-            Patches(mean, own + mine[:, None], tells),
-            self._before(ids.size, errors),
+            Patches(mean, own + mine[:, None], informative),
+            self._prior(ids.size, errors),
             lambda error: self._none(x, patch, placed, error),
         )
         probability, share, distance2 = np.zeros((ids.size, self.names.size + 1)), 0.0, 0.0
         for weight, error in found:
             q, cost = costs(mean - error.shift[:, None], own + (mine + error.spread)[:, None])
             each = probabilities(cost, self._none(x, patch, placed, error))
-            probability += weight * _doubted(each, q - self.patch_level)
-            known = weight * np.maximum(probabilities(cost, np.full(ids.size, np.inf))[:, :-1], 1e-12)  # were it one
+            probability += weight * _reduce_distant(each, q - self.patch_level)
+            known = weight * np.maximum(probabilities(cost, np.full(ids.size, np.inf))[:, :-1], 1e-12)  # if known
             share, distance2 = share + known, distance2 + known * q
         far = np.sqrt(distance2 / share / self.patch_level)
         at, scene = (np.arange(ids.size), np.argmax(share, axis=1)), found[0][1]
@@ -176,7 +188,7 @@ class ErrorDiscriminant(Model):
         )
 
     def _fit_patches(self, residual: Real, material: npt.NDArray, plate: npt.NDArray, dof: int) -> None:
-        """Covariance of placements, and of each material's specimens, from patches' residuals."""
+        """Estimate the covariance of placements, and of each material's specimens, from patches' residuals."""
         width = residual.shape[1]
         total = self._independent(_covariance(residual, len(residual)))
         shrink = width / (width + dof)
@@ -187,14 +199,14 @@ class ErrorDiscriminant(Model):
         placement = (1 - shrink) * placement + shrink * np.diag(np.diag(placement))
         self.between = _positive(placement - self.within / self.pixels) + 1e-8 * np.eye(width)
 
-    def _effect_of_specimens(self) -> Real:
-        """What specimens' deviations do to the features of each material, [materials, features, 2]."""
+    def _specimen_effects(self) -> Real:
+        """Return the effect of specimens' deviations on the features of each material, [materials, features, 2]."""
         every = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
         apart = every.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
         return self._chosen(apart).swapaxes(1, 2)
 
-    def _before(self, count: int, errors: SceneErrors | None) -> CommonError:
-        """The error that so many patches have in common before any is seen: zero, as uncertain as scans differ."""
+    def _prior(self, count: int, errors: SceneErrors | None) -> CommonError:
+        """Return the prior of the error common to `count` patches: mean zero, covariance of scans and `errors`."""
         width = len(self.scan)
         design, prior = np.tile(np.eye(width), (count, 1, 1)), self.scan
         if errors is not None:
@@ -205,15 +217,15 @@ class ErrorDiscriminant(Model):
         return CommonError(design, np.zeros(len(prior)), prior, np.asarray(np.linalg.inv(prior), np.float64))
 
     def _none(self, x: Real, patch: npt.NDArray[np.intp], covariances: Real, scene: CommonError) -> Real:
-        """Minus twice the log likelihood of each patch as any other half space, [patch]; see `none_of_these.py`.
+        """Return minus twice the log likelihood of each patch as any other half space, [patch].
 
-        `covariances` [patch, d, d] of the patches' own errors; the scene's come to them, as for the materials.
+        `covariances` [patch, d, d] of the patches' own errors; the scene's are added, as for the materials.
         """
         h, _, t = by_angle(x)
         log_h = np.stack([np.log(np.maximum(h[patch == i], 1e-6)).mean(axis=0) for i in range(patch.max() + 1)])
         middle = np.stack([t[patch == i].mean(axis=0) for i in range(patch.max() + 1)])
         covariances = covariances + scene.spread
-        if self.channels != "H+V+P" or not len(self.angles_rad):  # no wave to compare with: as at the threshold
+        if self.channels != "H+V+P" or not len(self.angles_rad):  # no model of half spaces: likelihood at the threshold
             return np.asarray(
                 self.patch_level + np.linalg.slogdet(covariances)[1] + covariances.shape[1] * _LN_2PI, np.float64
             )
@@ -223,7 +235,7 @@ class ErrorDiscriminant(Model):
         )
 
     def _anchor(self, x: Real, of: npt.NDArray[np.intp]) -> None:
-        """Where each material's features are expanded: its pixels' means."""
+        """Set the expansion point of each material's features: the means of its pixels."""
         h, v, t = by_angle(x)
         logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
         each = [of == k for k in range(self.names.size)]
@@ -238,7 +250,7 @@ class ErrorDiscriminant(Model):
         self._gain_and_phase = (phase[:, None] == phase[None]).astype(float)
 
     def _deviations(self, x: Real) -> Real:
-        """From every material's anchor, [n, materials, features]."""
+        """Return the deviations from every material's anchor, [n, materials, features]."""
         h, v, t = by_angle(x)
         if self.channels == "V":  # alone, by its own logarithm
             return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
@@ -246,27 +258,27 @@ class ErrorDiscriminant(Model):
         return self._chosen(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
 
     def _chosen(self, every: Real) -> Real:
-        """The columns of the channels from ln|H|, ln|V|, arg P [..., angles, 3], as [..., features]."""
+        """Select the model's channels of ln|H|, ln|V|, arg P [..., angles, 3]; return [..., features]."""
         h, v, angle = (every[..., i] for i in range(3))
         columns = {"H": (h,), "V": (v,), "P": (v - h, angle), "H+V+P": (h, v, angle)}[self.channels]
         return np.stack(columns, axis=-1).reshape(*every.shape[:-2], -1)
 
     @staticmethod
     def _metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
-        """Patches 0, 1, ... whose median V / H, by real and imaginary part, is nearly 1 under every angle, bool."""
+        """Return true for patches 0, 1, ... whose median V / H is nearly 1 under all angles, bool [patch]."""
         q = by_angle(x)[2]
         parts = [q[patch == i] for i in range(patch.max() + 1)]
         middle = np.stack([np.median(p.real, axis=0) + 1j * np.median(p.imag, axis=0) for p in parts])
         return np.asarray((np.abs(middle - 1) < METAL_LIKE).all(axis=1), np.bool_)
 
     def _independent(self, covariance: Real) -> Real:
-        """Errors of scans under several angles are independent; what a specimen does under them is not."""
+        """Remove correlations between angles: errors of their scans are independent (effects of specimens are not)."""
         return np.where(self._same_angle, covariance, 0.0)
 
     def _patch_covariances(self, pixels: float) -> Real:
-        """Of the mean of so many pixels about each material's mean, [materials, d, d].
+        """Return the covariance of the mean of `pixels` pixels about each material's mean, [materials, d, d].
 
-        The mean is itself known from so many placements and specimens only.
+        It includes the error of the material's mean, known from a limited number of placements and specimens.
         """
         known = (1 + 1 / self.placements)[:, None, None]
         differ = self._effects * (self.spread * (1 + 1 / self.plates[:, None]))[:, None]
@@ -276,10 +288,10 @@ class ErrorDiscriminant(Model):
         return self._patch_covariances(1.0) + self.scan
 
     def _set_thresholds(self, patches: Real, material: npt.NDArray, pixels: Real, of: npt.NDArray, dof: float) -> None:
-        """Squared distances that known materials pass with probability REJECTED.
+        """Set the squared distances that known materials exceed with probability REJECTED.
 
-        Hotelling's distribution for a mean and a covariance that were estimated, or what the library's own patches
-        keep (each left out of its material's mean), whichever is larger. Too few patches for either: no threshold.
+        The larger of Hotelling's distribution, for an estimated mean and covariance, and the quantile of the library's
+        own patches (each left out of its material's mean). Without enough patches there is no threshold.
         """
         width = patches.shape[1]
         free = max(dof - width + 1, 1)
@@ -295,17 +307,17 @@ class ErrorDiscriminant(Model):
         self.pixel_level = max(law, farthest(pixels, of, self._pixel_covariances()))
 
 
-def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, tells: npt.NDArray) -> tuple[Real, Real]:
+def _two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:
     """Least squares of patch means = material + scan: offsets [scans, d], of mean zero, and levels [materials, d]."""
     offset, level = np.zeros((scan.max() + 1, mean.shape[1])), np.zeros((material.max() + 1, mean.shape[1]))
     for _ in range(_ROUNDS):
         for k in np.unique(material):
             at = material == k
-            level[k] = (mean[at] - offset[scan[at]] * tells[at, None]).mean(axis=0)
-        for s in np.unique(scan[tells]):
-            at = (scan == s) & tells
+            level[k] = (mean[at] - offset[scan[at]] * informative[at, None]).mean(axis=0)
+        for s in np.unique(scan[informative]):
+            at = (scan == s) & informative
             offset[s] = (mean[at] - level[material[at]]).mean(axis=0)
-        offset -= offset[np.unique(scan[tells])].mean(axis=0)
+        offset -= offset[np.unique(scan[informative])].mean(axis=0)
     return offset, level
 
 
@@ -314,17 +326,17 @@ def _covariance(residual: Real, dof: int) -> Real:
 
 
 def _positive(a: Real) -> Real:
-    """The nearest matrix without negative eigenvalues."""
+    """Return the nearest matrix without negative eigenvalues."""
     values, vectors = np.linalg.eigh((a + a.T) / 2)
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def _doubted(probability: Real, beyond: Real) -> Real:
-    """Probabilities [n, materials + 1] where a patch may be what no model here describes: gain, edges, damage.
+def _reduce_distant(probability: Real, beyond: Real) -> Real:
+    """Lower the probabilities [n, materials + 1] of distant materials: a patch may be something no model describes.
 
-    `beyond` [n, materials] is how much farther in chi-square a patch lies from a material than its patches do but for
-    2 in 100. There half of its probability goes to none of them, and farther out soon all: what is called unknown for
-    its distance has no likelier name.
+    `beyond` [n, materials] is the chi-square of a patch minus the threshold that 2 % of a material's patches exceed.
+    At the threshold half of the probability goes to none of the materials, far beyond it all, so that a patch called
+    unknown for its distance has no likelier name.
     """
     known = probability[:, :-1] * scipy.special.expit(-beyond)
     return np.concatenate([known, 1 - known.sum(axis=1, keepdims=True)], axis=1)

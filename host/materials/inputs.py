@@ -1,4 +1,7 @@
-"""What `analyse` is given: the image pair, the optics, which metal is the reference, and what is known of the scene."""
+"""Inputs of `analyse`: image pair, optics, choice of the metal reference, known facts of the scene; tilts of plates.
+
+`level` corrects the images for the tilts of the plates.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.imaging import ChannelImages, Illumination
-from polysight.host.materials.inversion import Uncertain
+from polysight.host.imaging import ChannelImages, Illumination, Rise, levelled
+from polysight.host.materials.inversion import RigPrior
 from polysight.host.materials.segment import Box, Segmentation, SegmentSettings
 from polysight.host.materials.truth import TruthPlate
 from polysight.host.polarimetry import IncidenceChoice, PlaneReference
@@ -17,12 +20,12 @@ from polysight.shared.config import Instrument
 
 Image = npt.NDArray[np.complexfloating]
 LEAST_LEAKAGE_STD = 5e-4
-"""No leakage is known better than this, whatever the rig file says."""
+"""Least standard deviation of the leakage, whatever the rig file says."""
 
 
 @dataclass(frozen=True)
 class ImagePair:
-    """The two channel images that are analysed.
+    """The two channel images.
 
     Attributes
     ----------
@@ -31,9 +34,9 @@ class ImagePair:
     x_m, y_m
         Pixel centres, metres, [nx] and [ny].
     valid
-        bool [ny, nx]; None: all of it.
+        bool [ny, nx]; None: all pixels.
     lit
-        How both channels light the plane; None: nothing is known of tilts.
+        Illumination of the plane in both channels; None: tilts are not estimated.
     """
 
     h: Image
@@ -45,7 +48,7 @@ class ImagePair:
 
     @classmethod
     def of(cls, images: ChannelImages) -> ImagePair:
-        """The pair of channel images as imaging makes them."""
+        """Return the pair of channel images from imaging."""
         return cls(images.h, images.v, images.x_m, images.y_m, images.valid, images.lit)
 
     @property
@@ -55,13 +58,13 @@ class ImagePair:
         return finite if self.valid is None else finite & self.valid
 
     def within(self, area: npt.NDArray[np.bool_]) -> ImagePair:
-        """The same, valid only inside `area`, bool [ny, nx]."""
+        """Return the pair, valid only inside `area`, bool [ny, nx]."""
         return replace(self, valid=area if self.valid is None else self.valid & area)
 
 
 @dataclass(frozen=True)
 class Optics:
-    """What turns images into permittivity, and how well it is known.
+    """Quantities that turn images into permittivity, with their standard deviations.
 
     Attributes
     ----------
@@ -73,13 +76,13 @@ class Optics:
         Width (standard deviation, pixels) of the filter against speckle before permittivity and classification,
         inside each patch.
     theta_std_rad
-        Standard deviation of the angle's error, the same everywhere.
+        Standard deviation of the angle's error, equal for all pixels.
     leakage_std
-        Standard deviation of each part of the leakage: as measured, or of the mount's prior.
+        Standard deviation of each part of the leakage: as measured, or that of the mount's prior.
     leakage_measured
-        Which of both.
+        True if it was measured.
     channel_ratio_known
-        Whether V beside H of the images is referenced to the direct path, which reaches both boards alike.
+        True if V / H of the images is referenced to the direct path, which reaches both boards with equal strength.
     """
 
     theta_rad: npt.ArrayLike
@@ -94,9 +97,9 @@ class Optics:
     def of(
         cls, rig: Instrument, angles: IncidenceChoice, theta_std_rad: float = 1e-3, channel_ratio_known: bool = False
     ) -> Optics:
-        """A rig's leakage and filter, under the angles that were chosen.
+        """Return the optics of a rig under the chosen incidence angles.
 
-        Leakage that the rig file does not call measured (`leakage_std`) is not subtracted: its mean is zero then.
+        Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero.
         """
         p = rig.polarimetry
         measured = p.leakage_std is not None
@@ -105,9 +108,9 @@ class Optics:
         least = max(float(std), LEAST_LEAKAGE_STD)
         return cls(angles.used_rad, leakage, p.smooth_px, theta_std_rad, least, measured, channel_ratio_known)
 
-    def prior(self, reference_std: float) -> Uncertain:
-        """What is known beforehand of the rig, for the joint inversion."""
-        return Uncertain(
+    def prior(self, reference_std: float) -> RigPrior:
+        """Return the prior of the joint inversion."""
+        return RigPrior(
             self.theta_std_rad,
             self.leakage,
             self.leakage_std,
@@ -119,7 +122,7 @@ class Optics:
 
 @dataclass(frozen=True)
 class MetalChoice:
-    """Which metal is the reference: a box, a known patch, a plate scanned on its own; none of them: the metal is found.
+    """The metal reference: a box, a known patch, or a plate scanned separately; none of them: it is searched for.
 
     Attributes
     ----------
@@ -128,7 +131,7 @@ class MetalChoice:
     label
         Number of one of the known patches.
     plane
-        A metal plate over the whole plane, instead of metal in this scene; where it is not valid nothing is looked at.
+        A metal plate over the whole plane, scanned separately; pixels where it is invalid are ignored.
     """
 
     box_mm: Box | None = None
@@ -138,16 +141,16 @@ class MetalChoice:
 
 @dataclass(frozen=True)
 class KnownScene:
-    """What is known of the scene.
+    """Known facts of the scene.
 
     Attributes
     ----------
     segmentation
-        Patches that are known (boxes drawn by hand); None: they are found.
+        Known patches (boxes drawn by hand); None: patches are searched for.
     plates
-        The truth, where known: only carried along to the results, never used for them.
+        The truth, if known: copied to the results, never used for them.
     settings
-        How to find patches.
+        Settings of the segmentation.
     """
 
     segmentation: Segmentation | None = None
@@ -156,5 +159,36 @@ class KnownScene:
 
 
 FOUND = MetalChoice()
-"""The metal reference is found in the scene."""
+"""Search for the metal reference in the scene."""
 UNKNOWN_SCENE = KnownScene()
+
+
+@dataclass(frozen=True)
+class Tilts:
+    """Tilts of the plates: patch number to rise along x and y, radians; patches without an estimate are missing.
+
+    `across` is the index of the axis across the plane of incidence.
+    """
+
+    rises: dict[int, Rise]
+    across: int
+
+    def across_rad(self, label: int) -> float:
+        """Return the rise of a patch across the plane of incidence, radians; 0 if it is not known."""
+        return self.rises[label][self.across] if label in self.rises else 0.0
+
+
+def level(images: ImagePair, found: Segmentation, tilts: Tilts | None = None) -> tuple[ImagePair, Tilts]:
+    """Correct each patch for its tilt; return the pair and the tilts, as given or estimated from the phase.
+
+    Without the illumination of the plane the pair is returned unchanged.
+    """
+    if images.lit is None:
+        return images, Tilts({}, 1)
+    if tilts is None:
+        rises = {p.label: images.lit.rise(images.h, images.v, p.interior) for p in found.patches}
+        tilts = Tilts(rises, images.lit.across)
+    there = [p for p in found.patches if p.label in tilts.rises]
+    masks, own = [p.mask for p in there], [tilts.rises[p.label] for p in there]
+    h, v = levelled(images.h, images.v, images.lit, masks, own)
+    return replace(images, h=h, v=v), tilts

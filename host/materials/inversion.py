@@ -47,7 +47,7 @@ _LEAST_STD = 1e-6  # of a ratio: below it the information matrix has no inverse 
 
 
 @dataclass(frozen=True)
-class Seen:
+class PatchMeasurement:
     """What was measured of one patch, relative to metal; leakage is still in it.
 
     Attributes
@@ -69,7 +69,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Uncertain:
+class RigPrior:
     """What is known beforehand of the rig, as means and standard deviations.
 
     Attributes
@@ -203,7 +203,7 @@ class _Model:
     Those of a patch are t as deviations from the measured ratio in units of its standard deviation.
     """
 
-    def __init__(self, seen: Sequence[Seen], prior: Uncertain, brightness_std: float) -> None:
+    def __init__(self, seen: Sequence[PatchMeasurement], prior: RigPrior, brightness_std: float) -> None:
         self.prior, self.n, self.brightness_std = prior, len(seen), brightness_std
         self.q = np.array([s.inverse_ratio for s in seen], np.complex128)
         self.std = np.maximum(np.array([s.std for s in seen], np.float64), _LEAST_STD)
@@ -256,7 +256,7 @@ class _Model:
         return rows | {"incidence": np.array([6]), "brightness": bright.astype(np.intp)}
 
 
-def invert(seen: Sequence[Seen], prior: Uncertain) -> Inversion:
+def invert(seen: Sequence[PatchMeasurement], prior: RigPrior) -> Inversion:
     """Solve for all patches of a scene together.
 
     The standard deviation of brightness is found in two turns: the patches' own scatter about the first solution
@@ -359,7 +359,7 @@ def _drawn(t: complex, theta: float, covariance: Real, unit: float, theta_std: f
     return (parts @ parts.T / parts.shape[1]).astype(np.float64)
 
 
-def ratio_slopes(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real:
+def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
     """Errors of 1 / P at any t [...] by leakage and metal reference as the inversion left them, float64 [..., 2, 6].
 
     Times its transpose it is their covariance; of several t side by side, that between them too.
@@ -373,6 +373,6 @@ def ratio_slopes(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Rea
     return np.stack([turned.real, turned.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def ratio_error(estimate: Inversion, prior: Uncertain, t: npt.ArrayLike) -> Real:
+def ratio_error(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
     """Standard deviation of 1 / P that leakage and reference leave at any t: root of both parts' mean variance."""
     return np.sqrt(np.sum(ratio_slopes(estimate, prior, t) ** 2, axis=(-2, -1)) / 2)

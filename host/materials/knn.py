@@ -1,18 +1,17 @@
 """The paper's weighted k-nearest-neighbour classifier on |H|, |V| and complex P (section 6.3).
 
 The distance of two pixels is lambda_H |d|H|| + lambda_V |d|V|| + lambda_P d_P, summed over the incidence angles. The
-paper uses |dP| for d_P. Two other measures of the same quantity are offered, because errors of a ratio are not
-additive:
+paper uses |dP| for d_P. There are two other measures, because errors of a ratio are not additive:
 
-* `inverse`: |d(1/P)|. 1/P = V/H stays below 1 for every dielectric, while P grows without bound near the Brewster angle
-  and there its noise swamps the distance.
-* `log`: |d ln P| = sqrt((d ln|P|)^2 + (d arg P)^2). A gain error of a few percent is the same distance for every
-  material; materials of nearly the same permittivity differ by 4 to 10 % in P.
+* `inverse`: |d(1/P)|. 1/P = V/H stays below 1 for every dielectric, while P and its noise grow without bound near the
+  Brewster angle.
+* `log`: |d ln P| = sqrt((d ln|P|)^2 + (d arg P)^2). A gain error is the same distance for every material; materials of
+  nearly the same permittivity differ by 4 to 10 % in P.
 
-The three weights and the measure are fitted by cross-validation on the training data, whole scans left out.
+The three weights and the measure are fitted by cross-validation on the training data, with whole scans left out.
 
-Neighbours cannot tell that a patch is none of the materials: the nearest is always somebody. What is unknown is decided
-by the materials' distributions (`discriminant.py`), as for every model.
+A nearest neighbour exists for every patch; unknown patches are recognised by the materials' distributions
+(`discriminant.py`), as for every model.
 """
 
 from __future__ import annotations
@@ -27,14 +26,15 @@ import numpy.typing as npt
 
 from polysight.host.materials.discriminant import ErrorDiscriminant
 from polysight.host.materials.samples import Model, NamedScan, Real, Samples, SceneErrors, by_angle, majority
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Measure = Literal["paper", "inverse", "log"]
 MEASURES: tuple[Measure, ...] = get_args(Measure)
 GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
-"""lambda_H and lambda_V tried, relative to lambda_P = 1 and with each channel scaled by its own spread."""
+"""Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread."""
 MARGIN = 2.0
-"""How much farther than the library's own patches from one another a pixel may lie before it is unknown."""
+"""Largest distance of a known pixel, relative to the distances between the library's own patches."""
 _CHUNK = 512
 _FAR = 1e9
 Distances = tuple[Real, Real, Real]
@@ -42,7 +42,7 @@ Distances = tuple[Real, Real, Real]
 
 @dataclass(frozen=True)
 class Weights:
-    """lambda_H, lambda_V, lambda_P, how P is compared, and the number of neighbours."""
+    """lambda_H, lambda_V, lambda_P, the measure of P, and the number of neighbours."""
 
     h: float = 1.0
     v: float = 1.0
@@ -51,7 +51,7 @@ class Weights:
     neighbours: int = 15
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the library file."""
+        """Return plain values for the library file."""
         return {"h": self.h, "v": self.v, "p": self.p, "measure": self.measure, "neighbours": self.neighbours}
 
     @staticmethod
@@ -60,14 +60,18 @@ class Weights:
         try:
             w = Weights(float(raw["h"]), float(raw["v"]), float(raw["p"]), raw["measure"], int(raw["neighbours"]))
         except (KeyError, TypeError, ValueError) as e:
-            raise DataError(f"the library's weights cannot be read: {e}", "made by another version") from None
+            raise DataError(
+                f"the library's weights cannot be read: {e}", "made by another version", code=ErrorCode.VALUE_INVALID
+            ) from None
         if w.measure not in MEASURES or min(w.h, w.v, w.p) < 0 or w.neighbours < 1:
-            raise DataError(f"the library's weights make no sense: {raw}", "made by another version")
+            raise DataError(
+                f"the library's weights are invalid: {raw}", "made by another version", code=ErrorCode.VALUE_INVALID
+            )
         return w
 
 
 def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128], measure: Measure) -> Real:
-    """Distance of ratios P, broadcast; see the module's text for the measures."""
+    """Return the distance of ratios P, broadcast; the measures are in the module's docstring."""
     if measure == "paper":
         return np.abs(a - b)
     if measure == "inverse":
@@ -77,7 +81,7 @@ def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128],
 
 
 def channel_distances(a: Real, b: Real, measure: Measure) -> Distances:
-    """The three distances of features `a` [n, 4 * angles] to `b` [m, 4 * angles], summed over angles, [n, m] each."""
+    """Return the distances of features a [n, 4 * angles] to b [m, 4 * angles], summed over angles, [n, m] each."""
     (ah, av, aq), (bh, bv, bq) = by_angle(a), by_angle(b)
     angles = range(ah.shape[1])
     return (
@@ -91,16 +95,16 @@ def channel_distances(a: Real, b: Real, measure: Measure) -> Distances:
 
 
 def combine(channels: Distances, w: Weights) -> Real:
-    """Weighted sum of the three distances."""
+    """Return the weighted sum of the three distances."""
     return w.h * channels[0] + w.v * channels[1] + w.p * channels[2]
 
 
 def voters(names: npt.NDArray, neighbours: int) -> Any:
-    """scikit-learn's KNN over named pixels, to be asked with a matrix of distances [queries, pixels]."""
-    from sklearn.neighbors import KNeighborsClassifier  # here: it loads for a second, which most commands need not wait
+    """Return scikit-learn's KNN of labelled pixels, to be called with distances [queries, pixels]."""
+    from sklearn.neighbors import KNeighborsClassifier  # slow import, which most commands do not need
 
     knn = KNeighborsClassifier(n_neighbors=min(neighbours, names.size), metric="precomputed")
-    return knn.fit(np.zeros((names.size, names.size)), names)  # of the distances among themselves it needs the shape
+    return knn.fit(np.zeros((names.size, names.size)), names)  # only the shape is used
 
 
 class PaperKnn(Model):
@@ -109,11 +113,11 @@ class PaperKnn(Model):
     Parameters
     ----------
     channels
-        One of `CHANNELS`; with one channel alone there is no weight to fit.
+        One of `CHANNELS`; a single channel has no weight to fit.
     weights
-        Given instead of fitted.
+        Fixed weights; None: they are fitted.
     thresholds
-        Distance beyond which a pixel named so is unknown, by material; none: never.
+        Largest distance of known pixels by material; without an entry there is no limit.
     """
 
     def __init__(
@@ -122,7 +126,7 @@ class PaperKnn(Model):
         self.channels, self.given, self.thresholds = channels, weights, dict(thresholds or {})
 
     def fit(self, samples: Samples) -> PaperKnn:
-        """Keep the pixels, and fit the weights unless they are given, or no two scans hold one material."""
+        """Store the pixels, and fit the weights unless they are given or no two scans share a material."""
         if self.given is not None:
             self.weights = self.given
         elif self.channels in ("H", "V"):
@@ -138,14 +142,14 @@ class PaperKnn(Model):
     def by_scan(
         self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
     ) -> NamedScan:
-        """Patches named by most of their pixels' neighbours, or unknown where that material's distribution is far."""
-        found, told = majority(*self.by_pixel(x), patches), self.distributions.by_scan(x, patches, errors, others)
+        """Name patches by the majority of their pixels; unknown if they are far from that material's distribution."""
+        found, known = majority(*self.by_pixel(x), patches), self.distributions.by_scan(x, patches, errors, others)
         row, kind = np.arange(len(found.patches)), np.searchsorted(self.distributions.names, found.names)
-        far = np.zeros(len(row)) if told.distances is None else told.distances[row, kind]
+        far = np.zeros(len(row)) if known.distances is None else known.distances[row, kind]
         return replace(found, distance=np.maximum(found.distance, far))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Name of each pixel, and its neighbours' mean distance over the threshold of the material it is named."""
+        """Name each pixel; return name, and mean distance of its neighbours over the material's threshold."""
         names, relative = [], []
         for start in range(0, len(x), _CHUNK):
             distance = combine(self._distances(x[start : start + _CHUNK]), self.weights)
@@ -173,11 +177,11 @@ class Fit:
     weights
         Best weights.
     pixel_accuracy
-        Of those weights on scans that were left out, mean over the materials that two scans or more hold.
+        Accuracy of these weights on scans left out, mean over the materials of two or more scans.
     by_channel
         Pixel accuracy with H, V, or P alone, same splits.
     thresholds
-        Per material: distance beyond which a pixel is unknown.
+        Material to the distance beyond which a pixel is unknown.
     """
 
     weights: Weights
@@ -191,9 +195,8 @@ def fit_weights(
 ) -> Fit:
     """Fit the paper's three weights and the measure of P.
 
-    Every combination of the grid is judged on pixels of scans it has not seen; among the combinations within half a
-    percent of the best the one with the most even weights is taken, because a weight that wins by chance throws
-    information away.
+    Every combination of the grid is judged on scans left out; among the combinations within half a percent of the best
+    the one with the most even weights is taken, because extreme weights discard information.
 
     Parameters
     ----------
@@ -202,22 +205,23 @@ def fit_weights(
     neighbours
         k of the KNN.
     pixels_per_patch
-        Pixels drawn of each patch: neighbours in a patch are alike, and the cost grows with the square.
+        Random pixels of each patch: pixels of a patch are similar, and the cost grows with the square.
     seed
-        Of that draw.
+        Seed of that choice.
     channels
-        "P": the measure alone is fitted.
+        "P": only the measure is fitted.
 
     Raises
     ------
     DataError
-        with fewer than two scans, or no material in two: a split by pixel would be flattering.
+        if no material is in two scans: a split by pixel would be too optimistic.
     """
     if not samples.shared.any():
         raise DataError(
             f"no material is in two of the {np.unique(samples.groups).size} scans; fitting weights needs one",
-            "whole scans are left out to judge weights; pixels of one patch are too much alike",
+            "weights are judged on scans left out; pixels of one patch are too similar",
             "process more scans with other placements",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     few = _few(samples, pixels_per_patch, np.random.default_rng(seed))
     same_scan = few.groups[:, None] == few.groups[None, :]
@@ -243,24 +247,23 @@ def fit_weights(
 
 
 def _few(samples: Samples, per_patch: int, rng: np.random.Generator) -> Samples:
-    """At most so many pixels of every patch."""
+    """Return at most so many random pixels of every patch."""
     at = [rng.permutation(np.flatnonzero(samples.patches == i))[:per_patch] for i in np.unique(samples.patches)]
     return samples.take(np.sort(np.concatenate(at)))
 
 
 def _left_out(distance: Real, knn: Any, few: Samples, same_scan: npt.NDArray[np.bool_]) -> float:
-    """Pixel accuracy, mean over the materials of two scans or more, when no pixel of the same scan may vote."""
+    """Return the pixel accuracy, mean over the materials of two or more scans, without votes of the same scan."""
     found = knn.predict(np.where(same_scan, _FAR, distance))
     return float(np.mean([(found[few.names == n] == n).mean() for n in np.unique(few.names[few.shared])]))
 
 
 def _thresholds(distance: Real, neighbours: int, few: Samples) -> dict[str, float]:
-    """Per material: how far its pixels lie from its own pixels in other scans, 99th percentile, times a margin.
+    """Return thresholds: 99th percentile of the distances of a material's pixels between scans, times a margin.
 
-    At least half of the materials' median: metal is the reference, so it lies on itself in every scan of the library
-    and would accept nothing else. At most three times the median: one strange specimen must not open a material to
-    everything. A material seen in one scan only has no spread between scans and gets none: it accepts whatever is
-    nearest to it.
+    At least half of the materials' median: metal is the reference, so its own distances are zero. At most three times
+    the median: one unusual specimen must not make a material accept everything. A material of a single scan has no
+    threshold.
     """
     out = {}
     for name in np.unique(few.names):

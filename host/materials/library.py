@@ -1,7 +1,7 @@
-"""The reference library: labelled patches with their pixels and where they come from, as one data file.
+"""The reference library: labelled patches with their pixels and their origin, in one data file.
 
-The file is an .npz with plain arrays and a JSON text inside; it is read with `allow_pickle=False`, so that a library
-from a stranger cannot run code.
+The file is an .npz with plain arrays and a JSON text; it is read with `allow_pickle=False`, so that a library of
+unknown origin cannot run code.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.store import open_npz
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 FORMAT = "polysight-library-1"
 SAME_ANGLE_DEG = 1.0
 SIMULATED_LIBRARY = Path(__file__).with_name("simulated-library.npz")
-"""The library that names materials unless another is given: simulated scans of examples/library."""
+"""The default library: simulated scans of examples/library."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Entry:
     name
         Material.
     scan
-        Scan it comes from: the unit by which training and test data are kept apart.
+        Scan of the patch: training and test data are split by scan.
     h, v
         float32 [n], |H| and |V| of its pixels relative to metal.
     p
@@ -43,15 +44,15 @@ class Entry:
     incidence_deg
         Angle of incidence.
     simulated
-        Whether the scan was simulated.
+        True if the scan was simulated.
     seed, thickness_mm, permittivity
-        Of the simulated placement, the sample, and the truth [eps', eps''], where known.
+        Seed of the simulated placement, thickness of the sample, true [eps', eps'']; None if not known.
     versions
-        Versions of what made it.
+        Versions of the programs that made it.
     reference
-        What it was divided by, where it was not the metal of its own scan.
+        Name of its reference, if that was not the metal of its own scan.
     specimen
-        Which physical piece of the material it shows; None where that is not known.
+        Name of the physical piece of the material; None if not known.
     """
 
     name: str
@@ -71,7 +72,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Library:
-    """Entries, and what was fitted on them (`polysight.host.materials.train`; empty when nothing was)."""
+    """Entries, and the model fitted to them (`polysight.host.materials.train`; may be empty)."""
 
     entries: tuple[Entry, ...]
     fit: dict[str, Any] = field(default_factory=dict)
@@ -99,23 +100,24 @@ class Library:
         return tuple(round(sum(a) / len(a), 1) for a in out)
 
     def at(self, angle_deg: float) -> Library:
-        """The entries seen under an angle, with what was fitted on them.
+        """Return the entries under an incidence angle, with their fit.
 
-        Raises DataError when there are none: |P| changes by a tenth in a degree, other angles do not help.
+        Raises DataError if there are none: |P| changes by 10 % in a degree, so other angles cannot be used.
         """
         near = [a for a in self.angles_deg if abs(a - angle_deg) <= SAME_ANGLE_DEG]
         if not near:
             raise DataError(
-                f"the library holds no patch at {angle_deg:.1f} degrees of incidence",
-                f"its patches were seen under {', '.join(f'{a:g}' for a in self.angles_deg)} degrees",
+                f"the library has no patch at {angle_deg:.1f} degrees of incidence",
+                f"its incidence angles are {', '.join(f'{a:g}' for a in self.angles_deg)} degrees",
                 "train a library at this angle, or process without naming: --model none",
+                code=ErrorCode.MISMATCH,
             )
         angle = min(near, key=lambda a: abs(a - angle_deg))
         mine = tuple(e for e in self.entries if abs(e.incidence_deg - angle) <= SAME_ANGLE_DEG)
         return Library(mine, self.fit_of([angle]), self.note)
 
     def fit_of(self, angles_deg: Sequence[float]) -> dict[str, Any]:
-        """What was fitted for an angle, or for several together; empty when nothing was."""
+        """Return the fit for an angle, or for several together; may be empty."""
         angles = self.fit.get("angles")
         if angles is None:
             return self.fit if len(angles_deg) == 1 else {}
@@ -123,16 +125,16 @@ class Library:
 
     @property
     def simulated(self) -> bool:
-        """Whether any entry was simulated."""
+        """True if any entry was simulated."""
         return any(e.simulated for e in self.entries)
 
     def select(self, scans: Iterable[str]) -> Library:
-        """The entries of these scans, without the fit."""
+        """Return the entries of these scans, without the fit."""
         wanted = set(scans)
         return Library(tuple(e for e in self.entries if e.scan in wanted), {}, self.note)
 
     def pixels(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.complex128]]:
-        """|H|, |V| and P of all pixels, [n] each, entry after entry."""
+        """Return |H|, |V| and P of all pixels, [n] each, entry after entry."""
         return (
             np.concatenate([e.h for e in self.entries]).astype(np.float64),
             np.concatenate([e.v for e in self.entries]).astype(np.float64),
@@ -140,13 +142,13 @@ class Library:
         )
 
     def of_pixels(self, key: str) -> npt.NDArray:
-        """An attribute of each pixel's entry (`name` or `scan`), [n]."""
+        """Return an attribute of each pixel's entry (`name` or `scan`), [n]."""
         return np.concatenate([np.full(e.h.size, getattr(e, key)) for e in self.entries])
 
     def save(self, path: Path) -> None:
-        """Write the library, replacing the file only when it is complete."""
+        """Write the library; an existing file is replaced once the new one is complete."""
         entries = [
-            {k: v for k, v in asdict_shallow(e).items() if k not in ("h", "v", "p")} | {"pixels": int(e.h.size)}
+            {k: v for k, v in vars(e).items() if k not in ("h", "v", "p")} | {"pixels": int(e.h.size)}
             for e in self.entries
         ]
         meta = {"format": FORMAT, "note": self.note, "fit": self.fit, "entries": entries}
@@ -172,7 +174,7 @@ class Library:
         Raises
         ------
         DataError
-            when the file is absent, no library, of another format version, damaged, or holds pickled objects.
+            if the file is missing, no library, of another format version, damaged, or has pickled objects.
         """
         bad = f"{path}: not a material library"
         try:
@@ -181,23 +183,28 @@ class Library:
                 h, v, p = z["h"], z["v"], z["p"]
         except FileNotFoundError:
             raise DataError(
-                f"{path}: no such library", "none was trained yet, or the path is wrong", "polysight train"
+                f"{path}: no such library",
+                "none was trained yet, or the path is wrong",
+                "polysight train",
+                code=ErrorCode.FILE_MISSING,
             ) from None
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
             why = str(e) if isinstance(e, ValueError) else f"{type(e).__name__}: {e}"
-            raise DataError(bad, why, "give a library that polysight train made, or a folder of products") from None
+            raise DataError(
+                bad, why, "give a library of polysight train, or a folder of products", code=ErrorCode.FILE_UNREADABLE
+            ) from None
         if not isinstance(meta, dict) or meta.get("format") != FORMAT:
             found = meta.get("format") if isinstance(meta, dict) else None
-            raise DataError(bad, f"its format is {found!r}, this program reads {FORMAT!r}", "train it again")
+            raise DataError(
+                bad, f"its format is {found!r}, this program reads {FORMAT!r}", "train it again",
+                code=ErrorCode.VERSION_UNSUPPORTED,
+            )  # fmt: skip
         try:
             return Library(_entries(meta["entries"], h, v, p), dict(meta["fit"]), str(meta["note"]))
         except (KeyError, TypeError, ValueError) as e:
-            raise DataError(bad, f"its description does not fit its arrays: {e}", "train it again") from None
-
-
-def asdict_shallow(entry: Entry) -> dict[str, Any]:
-    """The fields of an entry without copying its arrays."""
-    return {name: getattr(entry, name) for name in Entry.__dataclass_fields__}
+            raise DataError(
+                bad, f"its description does not fit its arrays: {e}", "train it again", code=ErrorCode.FILE_DAMAGED
+            ) from None
 
 
 def _entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p: npt.NDArray) -> tuple[Entry, ...]:

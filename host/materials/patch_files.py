@@ -1,7 +1,6 @@
-"""`patches.npz`: the features of every patch's pixels.
+"""`patches.npz`: the features of the pixels of all patches of a scan.
 
-It keeps what a scan saw, so that `match_patches` can find the same patches in several scans and have them named
-together.
+`match_patches` finds the same patches in several scans, to name them together.
 """
 
 from __future__ import annotations
@@ -23,20 +22,21 @@ from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.samples import Real, SceneErrors
 from polysight.host.materials.segment import axis_mm
 from polysight.host.store import open_npz
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 PATCHES = "patches.npz"
 FORMAT = "polysight-patches-1"
 APART_MM = 20.0
-"""Middles of one patch in two scans lie no farther apart."""
+"""Largest distance between the centres of one patch in two scans."""
 NEAR_MM = 4.0
-"""Two pixels of two scans that lie no farther apart show the same spot: about the resolution."""
-_BUDGET = ("own", "design", "covariance")  # of `SceneErrors`
+"""Largest distance between pixels of two scans that show the same spot: about the resolution."""
+_ERROR_ARRAYS = ("own", "design", "covariance")  # of `SceneErrors`
 
 
 @dataclass(frozen=True)
-class SeenPatch:
-    """A patch in one scan: its middle (mm from the image centre), the places of its pixels and their features.
+class ScanPatch:
+    """A patch in one scan: its centre (mm from the image centre), the positions and features of its pixels.
 
     `places_mm` float64 [n, 2], `features` float64 [n, 4] of its interior, after the Gaussian filter.
     """
@@ -49,17 +49,17 @@ class SeenPatch:
 
 
 @dataclass(frozen=True)
-class SeenPatches:
-    """The patches of one scan; `errors`: what its error budget leaves uncertain of those numbered `judged`."""
+class ScanPatches:
+    """The patches of one scan; `errors` of the patches numbered `judged`, by the scan's error budget."""
 
     angle_deg: float
     simulated: bool
-    patches: tuple[SeenPatch, ...]
+    patches: tuple[ScanPatch, ...]
     judged: tuple[int, ...] = ()
     errors: SceneErrors | None = None
 
     def errors_of(self, labels: Sequence[int]) -> SceneErrors | None:
-        """The same of these patches, in this order; None where it is not known of all."""
+        """Return the errors of these patches, in this order; None if one of them has none."""
         if self.errors is None or not set(labels) <= set(self.judged):
             return None
         return self.errors.of(np.array([self.judged.index(label) for label in labels], np.intp))
@@ -67,7 +67,7 @@ class SeenPatches:
 
 @dataclass(frozen=True)
 class MatchedPatch:
-    """A patch that several scans have in common; `features` [n, 4 * scans] of the spots that all of them show."""
+    """A patch that several scans show; `features` [n, 4 * scans] of the spots that all of them show."""
 
     label: int
     truth: str | None
@@ -75,7 +75,7 @@ class MatchedPatch:
 
 
 def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
-    """Content of `patches.npz`."""
+    """Return the content of `patches.npz`."""
     x, y = axis_mm(x_m), axis_mm(y_m)
     rows, places, features = [], [np.zeros((0, 2))], [np.zeros((0, 4))]
     for r in found.patches:
@@ -90,7 +90,7 @@ def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike,
     budget: dict[str, Any] = {}
     if found.errors is not None:
         meta["judged"], errors = found.errors
-        budget = {f"errors_{name}": getattr(errors, name) for name in _BUDGET}
+        budget = {f"errors_{name}": getattr(errors, name) for name in _ERROR_ARRAYS}
     out = io.BytesIO()
     np.savez_compressed(
         out,
@@ -102,43 +102,43 @@ def pack_patches(found: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike,
     return out.getvalue()
 
 
-def read_patches(path: Path) -> SeenPatches:
+def read_patches(path: Path) -> ScanPatches:
     """Read `patches.npz` (no pickle). Raises DataError."""
     try:
         with open_npz(path) as z:
             meta = json.loads(z["meta"].tobytes().decode("utf-8"))
             places, features = z["places_mm"].astype(np.float64), z["features"].astype(np.float64)
-            budget = [z[f"errors_{name}"].astype(np.float64) for name in _BUDGET] if "judged" in meta else []
+            budget = [z[f"errors_{name}"].astype(np.float64) for name in _ERROR_ARRAYS] if "judged" in meta else []
         if meta["format"] != FORMAT:
             raise ValueError(f"its format is {meta['format']!r}, this program reads {FORMAT!r}")
         ends = np.cumsum([0, *(int(r["pixels"]) for r in meta["patches"])])
         if features.shape != (ends[-1], 4) or places.shape != (ends[-1], 2):
             raise ValueError(f"arrays {places.shape}, {features.shape} for {ends[-1]} pixels")
         patches = tuple(
-            _seen(r, places[a:b], features[a:b]) for r, a, b in zip(meta["patches"], ends, ends[1:], strict=False)
+            _read_patch(r, places[a:b], features[a:b]) for r, a, b in zip(meta["patches"], ends, ends[1:], strict=False)
         )
         judged = tuple(int(label) for label in meta.get("judged", ()))
         errors = SceneErrors(*budget) if budget else None
         if errors is not None and (len(errors.own), len(errors.design)) != (len(judged), len(judged)):
             raise ValueError(f"an error budget of {len(errors.own)} patches for {len(judged)}")
-        return SeenPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, judged, errors)
+        return ScanPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, judged, errors)
     except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
         raise DataError(
             f"{path}: the patches cannot be read: {type(e).__name__}: {e}",
-            "written by polysight process", "process the scan again",
+            "it is damaged, or of another version", "process the scan again", code=ErrorCode.FILE_UNREADABLE,
         ) from None  # fmt: skip
 
 
-def _seen(row: Mapping[str, Any], places: Real, features: Real) -> SeenPatch:
+def _read_patch(row: Mapping[str, Any], places: Real, features: Real) -> ScanPatch:
     x, y = row["centre_mm"]
-    return SeenPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)
+    return ScanPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)
 
 
-def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
-    """Patches that every scan shows in the same place, pixel by pixel.
+def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
+    """Return the patches that all scans show at the same place, pixel by pixel.
 
-    A patch belongs to the one whose middle is nearest, when each is the other's nearest. Pixels are compared by their
-    place in the patch, so that the scans' image centres may differ by less than half a patch.
+    Two patches match if their centres are each other's nearest. Pixels match by their position in the patch, so that
+    the scans' image centres may differ by up to half a patch.
     """
     out = []
     for patch in scans[0].patches:
@@ -156,9 +156,9 @@ def match_patches(scans: Sequence[SeenPatches]) -> list[MatchedPatch]:
     return out
 
 
-def _partner(patch: SeenPatch, here: SeenPatches, there: SeenPatches) -> SeenPatch | None:
-    def nearest(to: SeenPatch, among: SeenPatches) -> SeenPatch | None:
-        def apart(p: SeenPatch) -> float:
+def _partner(patch: ScanPatch, here: ScanPatches, there: ScanPatches) -> ScanPatch | None:
+    def nearest(to: ScanPatch, among: ScanPatches) -> ScanPatch | None:
+        def apart(p: ScanPatch) -> float:
             return float(np.hypot(p.centre_mm[0] - to.centre_mm[0], p.centre_mm[1] - to.centre_mm[1]))
 
         best = min(among.patches, key=apart, default=None)

@@ -1,4 +1,4 @@
-"""Permittivity of a patch with its spread (Eq. 3 of the paper)."""
+"""Permittivity of a patch with its errors (Eq. 3 of the paper)."""
 
 from __future__ import annotations
 
@@ -8,41 +8,40 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from polysight.host.materials.inversion import PatchEstimate
+from polysight.host.materials.inversion import PatchEstimate, slope
 from polysight.host.polarimetry import permittivity_from_ratio
 
 METAL_LIKE = 0.25
 """|P - 1| below which no permittivity is given.
 
-A relative error d of P moves eps by about 4 d / |P - 1/P|, so at |P - 1| = 0.25 the usual 3 % of P are already a
-quarter of the permittivity, and it grows without bound towards P = 1.
+A relative error d of P changes eps by about 4 d / |P - 1/P|: at |P - 1| = 0.25 the usual 3 % of P are already a quarter
+of the permittivity, and the error grows without bound towards P = 1.
 """
 
 
 @dataclass(frozen=True)
 class Permittivity:
-    """Estimate for one patch.
+    """Permittivity of one patch.
 
     Attributes
     ----------
     value
-        eps' - j eps'' of the median ratio; None when the patch is metal-like.
+        eps' - j eps'' of the median ratio; None if the patch is metal-like.
     real_range, imag_range
-        30th to 70th percentile of the real part and of the imaginary part over the pixels (the range the paper's
-        authors use); None when metal-like.
+        30th to 70th percentile of the real part and of the imaginary part over the pixels (the paper's choice); None if
+        metal-like.
     real_std, loss_std
-        Standard error of eps' and of eps'': how far the value may lie from that of the same plate elsewhere on the
-        plane. None when metal-like.
+        Standard error of eps' and of eps'', including the effect of the plate's place on the plane. None if metal-like.
     ratio
         Median polarisation ratio P.
     inverse_std
-        Standard error of V / H, in its real part and in its imaginary part, from which those follow.
+        Standard error of V / H, of its real part and of its imaginary part.
     metal_distance
-        |P - 1| of it, or |1/P - 1| if less.
+        The smaller of |P - 1| and |1/P - 1|.
     pixels
         Pixels used.
     covariance
-        float64 [2, 2] of the real and the imaginary part by the scene's error budget; None where there is none.
+        float64 [2, 2] of the real and the imaginary part by the scene's error budget; None without one.
     shares
         Source of error to its share of that covariance's trace.
     """
@@ -66,17 +65,17 @@ class Permittivity:
 
     @property
     def metal_like(self) -> bool:
-        """Whether P is known and too close to 1 for a permittivity."""
+        """True if P is known and too close to 1 for a permittivity."""
         return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_LIKE
 
     @property
     def determinable(self) -> bool:
-        """Whether P is far enough from 1."""
+        """True if there is an estimate."""
         return self.value is not None
 
 
 def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
-    """Write `2.89 - j0.43` for a lossy medium and `2.89 + j27.30` for one with gain.
+    """Format a permittivity: `2.89 - j0.43` for a lossy medium, `2.89 + j27.30` for one with gain.
 
     Parameters
     ----------
@@ -85,22 +84,22 @@ def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
     digits
         Digits behind the point.
     width
-        Least width of the real part, so that columns line up.
+        Least width of the real part, for aligned columns.
     """
     real, imag = (round(float(part), digits) + 0.0 for part in (value.real, value.imag))  # + 0.0: no -0.00
     return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
 
 
 NOTHING = Permittivity(None, None, None, None, None, complex(np.nan, np.nan), float("nan"), float("nan"), 0)
-"""Of a patch of which nothing is said."""
+"""Permittivity of a patch without a result."""
 
 
 def median_ratio(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> complex:
-    """Robust mean of P = H / V over pixels, taken as the reciprocal of the median of V / H.
+    """Return a robust mean of P = H / V over pixels: the reciprocal of the median of V / H; NaN without usable pixels.
 
     Dielectrics reflect s more strongly than p. With the strong channel in the denominator the noise of the ratio is
-    additive and symmetric even where V nearly vanishes; H / V itself has no mean there. Eq. 3 does not mind. Real and
-    imaginary part each have their median. Not a number without usable pixels.
+    additive and symmetric even where V nearly vanishes; H / V itself has no mean there. Medians are taken of real and
+    imaginary part separately.
     """
     good = np.isfinite(h) & np.isfinite(v) & (h != 0)
     if not good.any():
@@ -111,7 +110,7 @@ def median_ratio(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfl
 
 
 def inverse_spread(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating]) -> float:
-    """Spread of V / H over pixels, one standard deviation of the real part and of the imaginary part (1.48 MAD)."""
+    """Return the standard deviation of V / H over pixels, of the real part and of the imaginary part (1.48 MAD)."""
     good = np.isfinite(h) & np.isfinite(v) & (h != 0)
     if not good.any():
         return float("nan")
@@ -120,25 +119,18 @@ def inverse_spread(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complex
     return float(1.4826 * np.median(np.abs(parts)))
 
 
-def _slope(inverse: complex, theta_rad: float) -> complex:
-    """Derivative of Eq. 3 by q = V / H: eps = sin^2 (1 + tan^2 u^2), u = (1 + q) / (1 - q)."""
-    u = (1 + inverse) / (1 - inverse)
-    return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * u / (1 - inverse) ** 2
-
-
 def estimate_permittivity(
     h: npt.NDArray[np.complexfloating],
     v: npt.NDArray[np.complexfloating],
     theta_rad: npt.ArrayLike,
-    calibration_std: float = 0.0,
 ) -> Permittivity:
-    """Permittivity of one patch from its metal-referenced pixels, with its error bar by the delta method.
+    """Estimate the permittivity of one patch from its metal-referenced pixels, with its error by the delta method.
 
-    The error of V / H is the spread of the pixels, **not** divided by the root of their number: what makes the ratio
-    wrong inside a patch, the diffraction of its own edges and the neighbours' sidelobes, is as wide as the patch and
-    does not average out. To it comes that of the metal reference. Illumination of H and V that differs more slowly
-    than a patch is wide is not seen here: a reference over the whole plane removes it. Eq. 3 is holomorphic, so both
-    parts of the permittivity have the standard error |d eps / d q| times that of q = V / H.
+    The error of V / H is the spread of the pixels, **not** divided by the root of their number: the main errors inside
+    a patch, diffraction at its edges and the neighbours' sidelobes, are as wide as the patch and do not average out.
+    Differences between the illumination of H and V that vary more slowly than a patch are not included; a reference
+    over the whole plane removes them. Eq. 3 is holomorphic, so both parts of the permittivity have the standard error
+    |d eps / d q| times that of q = V / H.
 
     On simulated scans (eight placements of eight materials, all disturbances) the error is half of what is claimed,
     rms, and 94 % of the values lie within one standard error.
@@ -149,15 +141,13 @@ def estimate_permittivity(
         complex [n], pixels of the interior, metal-referenced and leakage-corrected.
     theta_rad
         Incidence angle, one number or [n].
-    calibration_std
-        Relative standard error of the metal reference, the same for all patches.
     """
     ratio = median_ratio(h, v)
     good = np.isfinite(h) & np.isfinite(v) & (h != 0)
     distance = min(abs(ratio - 1), abs(1 / ratio - 1) if ratio != 0 else np.inf)
     n = int(good.sum())
     inverse = 1 / ratio if ratio != 0 else complex(np.inf, 0.0)
-    inverse_std = float(np.hypot(inverse_spread(h, v), calibration_std * abs(inverse)))
+    inverse_std = inverse_spread(h, v)
     if not distance >= METAL_LIKE:  # also when it is not a number
         return Permittivity(None, None, None, None, None, ratio, inverse_std, float(distance), n)
     theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[good]
@@ -165,7 +155,7 @@ def estimate_permittivity(
     pixels = permittivity_from_ratio(v[good].astype(np.complex128) / h[good], theta)
     pixels = pixels[np.isfinite(pixels)]
     re, im = (np.percentile(part, [30, 70]) for part in (pixels.real, pixels.imag))
-    std = float(abs(_slope(inverse, float(theta.mean()))) * inverse_std)
+    std = float(abs(slope(inverse, float(theta.mean()))) * inverse_std)
     return Permittivity(
         value,
         (float(re[0]), float(re[1])),
@@ -185,16 +175,16 @@ def permittivity_of_patch(
     theta_rad: float,
     estimate: PatchEstimate | None,
 ) -> Permittivity:
-    """Permittivity of one patch with the error budget of the joint inversion.
+    """Return the permittivity of one patch with the error budget of the joint inversion.
 
     Parameters
     ----------
     h, v
-        complex [n], pixels of the interior, metal-referenced and leakage-corrected: they give the percentiles.
+        complex [n], pixels of the interior, metal-referenced and leakage-corrected, for the percentiles.
     theta_rad
         Incidence angle.
     estimate
-        What the inversion found; None for a patch that it left out: no permittivity is given then.
+        Result of the inversion; None for a patch that it did not include, which gets no permittivity.
     """
     alone = estimate_permittivity(h, v, theta_rad)
     if estimate is None or estimate.permittivity is None or estimate.covariance is None:
@@ -215,29 +205,3 @@ def permittivity_of_patch(
         covariance=estimate.covariance,
         shares=estimate.shares,
     )
-
-
-def bootstrap_permittivity_std(
-    h: npt.NDArray[np.complexfloating],
-    v: npt.NDArray[np.complexfloating],
-    theta_rad: float,
-    calibration_std: float = 0.0,
-    draws: int = 4000,
-    seed: int = 0,
-) -> tuple[float, float]:
-    """Standard errors of eps' and eps'' as in :func:`estimate_permittivity`, by drawing instead of by the slope.
-
-    Each draw takes one pixel and one error of the metal reference through Eq. 3; half the 16th to 84th percentile is
-    the standard error. Where it differs much from the delta method, Eq. 3 bends within the error bar (near metal).
-
-    Returns
-    -------
-    std of eps', std of eps''
-    """
-    rng = np.random.default_rng(seed)
-    good = np.flatnonzero(np.isfinite(h) & np.isfinite(v) & (h != 0))
-    at = rng.choice(good, draws)
-    error = calibration_std * (rng.standard_normal(draws) + 1j * rng.standard_normal(draws))
-    eps = permittivity_from_ratio(v[at].astype(np.complex128) / h[at] * (1 + error), theta_rad)
-    real, loss = (np.percentile(part, [16, 84]) for part in (eps.real, -eps.imag))
-    return float(real[1] - real[0]) / 2, float(loss[1] - loss[0]) / 2

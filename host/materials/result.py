@@ -1,4 +1,4 @@
-"""What `analyse` returns: everything found about each patch, and its rows for materials.json."""
+"""Result of `analyse`: patches with permittivities and names, and their rows for materials.json."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.materials.classify import NamedPatch, PatchName
-from polysight.host.materials.inversion import Inversion, Uncertain, ratio_error
+from polysight.host.materials.inputs import Tilts
+from polysight.host.materials.inversion import Inversion, RigPrior, ratio_error
 from polysight.host.materials.measure import Refused, background, ratio_sigma
 from polysight.host.materials.metal import MetalReference
 from polysight.host.materials.permittivity import NOTHING, Permittivity
 from polysight.host.materials.samples import SceneErrors
 from polysight.host.materials.segment import Patch, Segmentation
-from polysight.host.materials.tilts import Tilts
 from polysight.host.materials.truth import TruthPlate
 from polysight.host.polarimetry import Calibrated
 
@@ -30,23 +30,23 @@ SHRINKS = {
     "incidence": "measure where the antennas are: `polysight calibrate direct-path`",
     "brightness": "measure leakage with metal strips: `polysight leakage`",
 }
-"""Source of error to the measurement that would shrink it."""
+"""Source of error to the measurement that reduces it."""
 
 
 @dataclass(frozen=True)
 class PatchResult:
-    """One patch with everything found about it.
+    """One patch with its permittivity and name.
 
     Attributes
     ----------
     patch, permittivity
-        Where it is, and what it is made of.
+        Its geometry and its permittivity.
     named
-        What it and its pixels were called; None when it was not named (no classifier, the metal reference).
+        Names of the patch and of its pixels; None if it was not named (no classifier, or the metal reference).
     truth
-        What it really is, where that is known.
+        The true plate, if known.
     refused
-        Why nothing is said of it; None when something is.
+        Reason for giving neither name nor permittivity; None if they are given.
     """
 
     patch: Patch
@@ -57,52 +57,50 @@ class PatchResult:
 
     @property
     def verdict(self) -> PatchName | None:
-        """Its name, how sure, and the pixels' votes; None when it was not named, or nothing is said of it."""
+        """Name with confidence and votes; None if it was not named or is refused."""
         return None if self.named is None or self.refused is not None else self.named.verdict
 
     @property
     def names(self) -> npt.NDArray[np.str_] | None:
-        """Names of the interior's pixels, in image order."""
+        """Names of the interior's pixels, in image order; None as for `verdict`."""
         return None if self.named is None or self.refused is not None else self.named.names
 
 
 @dataclass(frozen=True)
 class MaterialsResult:
-    """Everything found in one image pair.
+    """Results of one image pair.
 
     Attributes
     ----------
     calibrated
         Metal-referenced, leakage-corrected channels [ny, nx], not smoothed.
     h, v, p
-        The same after the Gaussian filter inside each patch: the features of classification and permittivity. Not a
-        number outside the patches' interiors, so that no edge and no neighbour gets into a material's pixels.
+        The same after the Gaussian filter inside each patch: the features of classification and permittivity. NaN
+        outside the patches' interiors, to exclude edges and neighbours.
     metal
         The reference and how it was chosen.
     segmentation
         Patches and label image.
     patches
-        What each patch is.
+        Permittivity and name of each patch.
     theta_rad
         Incidence angle, a number or [ny, nx].
     inversion, prior
-        The joint inversion of all patches, and what was known of the rig before.
+        The joint inversion of all patches, and its prior.
     bands
-        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.sub_bands`); empty when not
-        asked for.
+        Patch number to its ratios in sub-bands of the sweep (:mod:`polysight.host.materials.sub_bands`); may be empty.
     boxes
-        Patch number to the name of the box drawn by hand; empty when the patches were found.
+        Patch number to the name of the box drawn by hand; empty if the patches were found.
     library
-        Names of the materials that patches were compared with; empty when nothing was named.
+        Names of the library's materials; empty if nothing was named.
     withheld
-        Whether the verdict is `no result`: rows hold no name, no ratio and no permittivity then.
+        True if the verdict is `no result`: rows have no name, no ratio and no permittivity then.
     tilts
-        How the plates lie beside the image's plane; already taken out of `h` and `v`.
+        Tilts of the plates; `h` and `v` are already corrected for them.
     errors
-        What the error budget leaves uncertain of the judged patches, for naming them, and their numbers in its order;
-        None where nothing was judged.
+        Numbers of the judged patches, and their errors for naming by the error budget; None without judged patches.
     brightness_off
-        Patch number to ln of |H| beside that of a half space of its permittivity; absent where it does not tell.
+        Patch number to ln of |H| over that of a half space of its permittivity; not for metal-like patches.
     """
 
     calibrated: Calibrated
@@ -114,7 +112,7 @@ class MaterialsResult:
     patches: tuple[PatchResult, ...]
     theta_rad: npt.NDArray[np.float64]
     inversion: Inversion
-    prior: Uncertain
+    prior: RigPrior
     bands: dict[int, list[dict[str, Any]]] = field(default_factory=dict)
     boxes: dict[int, str] = field(default_factory=dict)
     library: tuple[str, ...] = ()
@@ -124,17 +122,17 @@ class MaterialsResult:
     errors: tuple[tuple[int, ...], SceneErrors] | None = None
 
     def rows(self) -> list[dict[str, Any]]:
-        """One plain dict a patch, ready for materials.json (no infinities, complex numbers as real and imaginary)."""
+        """Return one plain dict for each patch, for materials.json (no infinities, complex numbers as two parts)."""
         return [self._row(r) for r in self.patches]
 
     def without_result(self) -> MaterialsResult:
-        """The same patches with nothing said of them: no name, no ratio, no permittivity, no metal reference."""
+        """Return the same patches without names, ratios, permittivities and metal reference."""
         patches = tuple(replace(r, permittivity=NOTHING, named=None) for r in self.patches)
         metal = replace(self.metal, label=None, given=False, how=f"none ({self.metal.how})")
         return replace(self, patches=patches, metal=metal, bands={}, withheld=True)
 
     def p_sigma(self, usable: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-        """Standard deviation of each pixel's P, float32 [ny, nx]; not a number without a result, or not `usable`."""
+        """Return the standard deviation of each pixel's P, [ny, nx]; NaN without a result or if not `usable`."""
         h, v = self.calibrated.h, self.calibrated.v
         if self.withheld:
             return np.full(h.shape, np.nan, np.float32)
@@ -144,7 +142,7 @@ class MaterialsResult:
         return ratio_sigma(h, v, dark, ratio_error(self.inversion, self.prior, inverse))
 
     def incidence_deg(self, patch: Patch) -> float:
-        """Mean incidence angle over a patch's interior, degrees."""
+        """Return the mean incidence angle over a patch's interior, degrees."""
         inside = self.theta_rad[patch.interior] if self.theta_rad.ndim and patch.interior.any() else self.theta_rad
         return float(np.degrees(np.mean(inside)))
 

@@ -1,6 +1,6 @@
-"""Labelled pixels as classifiers see them, and what every classifier does with them.
+"""Labelled pixels for classifiers, and the interface of classifiers.
 
-`Samples` holds features, material, scan and patch of each pixel. A `Model` learns from samples and names pixels; the
+`Samples` holds features, material, scan and patch of each pixel. A `Model` is fitted to samples and names pixels; the
 result for one scan is a `NamedScan`, whose patches are named by `majority` or by the model itself.
 """
 
@@ -14,31 +14,32 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.materials.library import Library
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Real = npt.NDArray[np.float64]
 WIDTH = 4
 """Columns of one angle: |H|, |V|, real and imaginary part of 1/P = V/H."""
 CHANNELS = ("H", "V", "P", "H+V+P")
-"""What a classifier may look at (Fig. 20 of the paper)."""
+"""Channels that a classifier may use (Fig. 20 of the paper)."""
 
 
 def feature_matrix(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
-    """Features [n, 4] of metal-referenced pixels: |H|, |V|, real and imaginary part of V / H = 1 / P.
+    """Return features [n, 4] of metal-referenced pixels: |H|, |V|, real and imaginary part of V / H = 1 / P.
 
-    The ratio stands upside down because V / H stays bounded where V vanishes (Brewster angle).
+    V / H is used instead of P because it stays bounded where V vanishes (Brewster angle).
     """
     inverse = 1 / np.asarray(p, np.complex128)
     return np.stack([np.abs(h), np.abs(v), inverse.real, inverse.imag], axis=-1)
 
 
 def usable(x: Real) -> npt.NDArray[np.bool_]:
-    """Pixels whose features are all finite, bool [n]."""
+    """Return the pixels whose features are all finite, bool [n]."""
     return np.asarray(np.isfinite(x).all(axis=1), np.bool_)
 
 
 def by_angle(x: Real) -> tuple[Real, Real, npt.NDArray[np.complex128]]:
-    """|H|, |V| and V / H of features [n, 4 * angles], each [n, angles]."""
+    """Return |H|, |V| and V / H of features [n, 4 * angles], each [n, angles]."""
     h, v, real, imag = np.moveaxis(x.reshape(len(x), -1, WIDTH), -1, 0)
     return h, v, real + 1j * imag
 
@@ -52,12 +53,12 @@ class Samples:
     x
         float64 [n, 4 * angles].
     names, groups, patches
-        Material, group that is left out as a whole (a scan, or a sample), and patch number of each pixel, [n].
+        Material, group for cross-validation (a scan, or a physical sample) and patch number of each pixel, [n].
     specimens
-        Which plate of its material each pixel was seen on, str [n]; empty where it is not known: one plate of each
-        material then, seen in all scans. None: not known of any.
+        Specimen of the material that each pixel shows, str [n]; empty if not known: then one specimen of each material
+        is assumed in all scans. None: not known for all pixels.
     angles_deg
-        Incidence angles; empty: not known.
+        Incidence angles; empty if not known.
     """
 
     x: Real
@@ -69,16 +70,16 @@ class Samples:
 
     @property
     def plates(self) -> npt.NDArray[np.intp]:
-        """A number for each plate that was seen: material and specimen, [n]."""
+        """Number of each pixel's plate (material and specimen), [n]."""
         which = np.full(self.names.shape, "") if self.specimens is None else self.specimens
         pairs = np.stack([np.unique(a, return_inverse=True)[1] for a in (self.names, which)], axis=1)
         return np.asarray(np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), np.intp)
 
     @property
     def independent(self) -> npt.NDArray:
-        """Groups that share no specimen, [n]: scans, those that saw one labelled plate together taken as one.
+        """Groups without common specimens, [n]: scans of the same labelled plate are joined.
 
-        Where that leaves no two, the scans: then specimens that are judged were learnt, too.
+        If that leaves a single group, the scans themselves: then the same specimens are in training and test.
         """
         if self.specimens is None or not (self.specimens != "").any():
             return self.groups
@@ -92,21 +93,21 @@ class Samples:
 
     @property
     def groups_of_material(self) -> npt.NDArray[np.int64]:
-        """In how many groups each pixel's material is, [n]."""
+        """Number of groups that have each pixel's material, [n]."""
         names, of = np.unique(self.names, return_inverse=True)
         count = [np.unique(self.groups[of == k]).size for k in range(names.size)]
         return np.array(count, np.int64)[of]
 
     @property
     def shared(self) -> npt.NDArray[np.bool_]:
-        """Pixels whose material another group holds too, so that it can be judged with whole groups left out, [n]."""
+        """True for pixels whose material is in another group too, as cross-validation requires, [n]."""
         return self.groups_of_material > 1
 
     @classmethod
     def of(cls, library: Library, pixels_per_patch: int | None = None, seed: int = 0) -> Samples:
-        """Pixels of a library of one angle, grouped by scan; at most so many of each patch, drawn at random.
+        """Return the pixels of a library of one angle, grouped by scan; of each patch at most so many, at random.
 
-        Raises DataError when no pixel is usable.
+        Raises DataError if no pixel is usable.
         """
         rng = np.random.default_rng(seed)
         x, names, groups, patches, specimens = [], [], [], [], []
@@ -121,23 +122,25 @@ class Samples:
             patches += [i] * at.size
             specimens += [e.specimen or ""] * at.size
         if not names:
-            raise DataError("the library holds no usable pixel", "nothing was trained", "polysight train")
+            raise DataError(
+                "the library has no usable pixel", "nothing was trained", "polysight train", code=ErrorCode.NO_DATA
+            )
         labels = np.array(names), np.array(groups), np.array(patches), np.array(specimens)
         return cls(np.concatenate(x), *labels, library.angles_deg)
 
     def take(self, at: npt.NDArray) -> Samples:
-        """Some of the pixels, by index or by mask."""
+        """Return some of the pixels, by index or by mask."""
         which = None if self.specimens is None else self.specimens[at]
         return Samples(self.x[at], self.names[at], self.groups[at], self.patches[at], which, self.angles_deg)
 
     def joined(self, other: Samples, seed: int = 0) -> Samples:
-        """The same samples seen under a second angle, patch by patch.
+        """Join with samples of a second angle, patch by patch.
 
-        Scans of one name belong together; where no name is common, the first scan here and the first there do, and so
-        on in their order. In such a pair the patches of a material are paired in their order, and their pixels at
-        random, for the pixels of two scans are not the same spots.
+        Scans of the same name are paired; without common names, scans are paired in their order. In a pair of scans
+        the patches of a material are paired in their order, and their pixels at random, because the pixels of two
+        scans show different spots.
 
-        Raises DataError when no material was seen under both angles.
+        Raises DataError if no material was seen under both angles.
         """
         rng = np.random.default_rng(seed)
         ours, theirs = np.unique(self.groups), np.unique(other.groups)
@@ -157,7 +160,10 @@ class Samples:
                     groups += [a if a == b else f"{a} + {b}"] * n
                     patches += [p] * n
         if not groups:
-            raise DataError("no material was seen under both angles", "the scans' names differ", "train both angles")
+            raise DataError(
+                "no material was seen under both angles", "the materials' names differ", "train both angles",
+                code=ErrorCode.MISMATCH,
+            )  # fmt: skip
         i, j = np.concatenate(left), np.concatenate(right)
         which = None if self.specimens is None else self.specimens[i]
         x = np.hstack([self.x[i], other.x[j]])
@@ -166,23 +172,23 @@ class Samples:
 
 @dataclass(frozen=True)
 class NamedScan:
-    """What the pixels and patches of a scan were named.
+    """Names of the pixels and patches of a scan.
 
     Attributes
     ----------
     pixel_names, pixel_distance
         Likeliest material of each pixel, [n], and its distance over the threshold: above 1 is unknown.
     pixel_confidence
-        Probability of that material, [n]; None: the model gives none.
+        Probability of that material, [n]; None for models without probabilities.
     patches
         Patch numbers, sorted, [patches].
     names, confidence, distance
-        The same of each patch, [patches], and how sure: a probability, or the share of its pixels.
+        The same of each patch, [patches], and its confidence: a probability, or the share of its pixels.
     distances
         Distance of each patch to each material over the threshold, [patches, materials]; None: not known.
     probabilities, materials
-        Probability of each material and, last, of none of them, [patches, materials + 1]; the materials' names. None:
-        the model gives none.
+        Probability of each material and, last, of none of them, [patches, materials + 1]; the materials' names. None
+        for models without probabilities.
     """
 
     pixel_names: npt.NDArray
@@ -199,16 +205,16 @@ class NamedScan:
 
 @dataclass(frozen=True)
 class SceneErrors:
-    """What a scan's error budget leaves uncertain of its patches' ln|H|, ln|V| and arg P.
+    """Errors of a scan's patches in ln|H|, ln|V| and arg P, by its error budget.
 
     Attributes
     ----------
     own
-        float64 [patch, d, d]: covariance of each patch's own part.
+        float64 [patch, d, d]: covariance of each patch's own error.
     design
-        float64 [patch, d, q]: what the q errors that all patches have in common (leakage, reference, angle) do to each.
+        float64 [patch, d, q]: effect of the q errors common to all patches (leakage, reference, angle) on each.
     covariance
-        float64 [q, q] of those.
+        float64 [q, q] of the common errors.
     """
 
     own: Real
@@ -230,26 +236,27 @@ class Model(ABC):
 
     @abstractmethod
     def fit(self, samples: Samples) -> Model:
-        """Learn from labelled pixels."""
+        """Fit the model to labelled pixels."""
 
     @abstractmethod
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
-        """Name of each pixel by nothing but itself, [n], and its distance over the threshold."""
+        """Classify each pixel independently: return name [n] and distance over the threshold [n]."""
 
     def by_scan(
         self, x: Real, patches: npt.NDArray, errors: SceneErrors | None = None, others: float | None = None
     ) -> NamedScan:
-        """Names in one scan, whose pixels lie in `patches` [n]; a patch is what most of its pixels are called.
+        """Name the pixels and patches of one scan; `patches` [n] is the patch number of each pixel.
 
-        `errors` of the patches in the order of their numbers, for models that weigh them. `others`: the share of a
-        patch's pixels that may be of another material than the patch; None: each pixel is judged alone.
+        By default a patch gets the name of most of its pixels. `errors` of the patches, in the order of their numbers,
+        for models that use them. `others`: share of a patch's pixels that may be of another material than the patch;
+        None: pixels are classified independently.
         """
         del errors, others
         return majority(*self.by_pixel(x), patches)
 
 
 def majority(found: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
-    """Patches named as most of their pixels are, as sure as those are many, as far as the median of them."""
+    """Name each patch as most of its pixels; confidence is their share, distance the median over all pixels."""
     ids, rows = np.unique(patches), []
     for i in ids:
         at = patches == i

@@ -1,10 +1,10 @@
-"""Patches in the image, without being told their number.
+"""Segmentation: find the patches of an image; their number is unknown.
 
-Plates parallel to the stage are mirrors: bright where they are, dark where nothing is. Speckle is additive noise in dB,
-and plates are flat there with steps between: total variation takes the one and leaves the other. Their levels differ by
-more than 10 dB (wood against metal), so one threshold finds the bright ones and another, on what is left, the dim ones.
-No threshold finds the edges: each region is cut again at half of its own amplitude, where the edge of a band-limited
-step lies.
+Plates parallel to the stage are mirrors: the image is bright inside a plate and dark elsewhere. In dB, speckle is
+additive noise and plates are constant with steps between them: total variation removes the former and keeps the latter.
+Levels of plates differ by more than 10 dB (wood against metal), so one threshold finds the bright plates and another
+one, on the remaining pixels, the dim ones. A common threshold cannot give the edges: each region is cut again at half
+of its own amplitude, the position of the edge of a band-limited step.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import scipy
 import skimage
 
 from polysight.host.imaging import ChannelImages
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 Mask = npt.NDArray[np.bool_]
@@ -27,25 +28,25 @@ _TURNS = 3  # thresholds: metal, dielectrics, the dimmest
 
 @dataclass(frozen=True)
 class SegmentSettings:
-    """How patches are found.
+    """Settings of the segmentation.
 
     Attributes
     ----------
     smallest_mm
-        Narrowest patch that counts; narrower features (ringing at edges, speckle) are opened away.
+        Least width of a patch; narrower features (ringing at edges, speckle) are removed by opening.
     margin_mm
-        How far inside the outline the statistics start: about twice the resolution, beyond the edge's ringing.
+        Margin between outline and interior: about twice the resolution, beyond the ringing of the edge.
     smooth_px
-        Gaussian on the power, before it is taken in dB.
+        Gaussian filter of the power, before conversion to dB.
     speckle_db
-        Largest weight of the total variation (Chambolle). It is as large as the speckle on the plates themselves: more
+        Largest weight of the total variation (Chambolle). The weight equals the speckle on the plates: a larger one
         would fill the narrow gaps between plates.
     floor_db
         Levels below this, relative to the brightest, count as equally dark.
     dimmest_db
-        What is left beside the bright patches and lies below this, relative to the brightest, are their sidelobes.
+        Pixels beside bright patches below this level, relative to the brightest, count as sidelobes.
     least_contrast_db
-        Bright and dark must differ by this much, or there are no (more) patches.
+        Least difference of bright and dark; with less there are no (further) patches.
     """
 
     smallest_mm: float = 14.0
@@ -93,7 +94,7 @@ class Patch:
 
 @dataclass(frozen=True)
 class Segmentation:
-    """Label image int32 [ny, nx] (0 = nothing), its patches, and the level in dB that separated bright from dark."""
+    """Label image int32 [ny, nx] (0: no patch), its patches, and the threshold between bright and dark, dB."""
 
     labels: npt.NDArray[np.int32]
     patches: tuple[Patch, ...]
@@ -101,13 +102,13 @@ class Segmentation:
 
 
 def axis_mm(axis_m: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """An image axis in millimetres from the image centre."""
+    """Convert an image axis to millimetres from the image centre."""
     a = np.asarray(axis_m, np.float64)
     return (a - (a[0] + a[-1]) / 2) * 1e3
 
 
 def box_mask(box_mm: Box, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Mask:
-    """Pixels whose centres lie in a box (x0, y0, x1, y1), millimetres from the image centre; bool [ny, nx]."""
+    """Return the pixels whose centres lie in a box (x0, y0, x1, y1), mm from the image centre; bool [ny, nx]."""
     x, y = axis_mm(x_m), axis_mm(y_m)
     x0, x1 = sorted((box_mm[0], box_mm[2]))
     y0, y1 = sorted((box_mm[1], box_mm[3]))
@@ -117,7 +118,7 @@ def box_mask(box_mm: Box, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Mask:
 def make_patch(
     label: int, mask: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float, usable: Mask | None = None
 ) -> Patch:
-    """Box, outline and interior of a mask [ny, nx]; the margin shrinks when the patch is too small for it."""
+    """Make a patch of a mask [ny, nx]; the margin shrinks if the patch is too small for it."""
     x, y = axis_mm(x_m), axis_mm(y_m)
     pixel = abs(float(x[1] - x[0]))
     padded = np.pad(mask, 1)
@@ -139,10 +140,10 @@ def make_patch(
 
 
 def level_db(h: npt.NDArray[np.complexfloating], v: npt.NDArray[np.complexfloating], usable: Mask, smooth_px: float):
-    """Smoothed level of the channel that shows more, in dB below that channel's brightest, float64 [ny, nx].
+    """Return the smoothed level of the stronger channel, dB below that channel's brightest, float64 [ny, nx].
 
-    Each channel is scaled by its own brightest part, so that an unknown gain between H and V has no influence. The
-    larger of them, not their sum: where V nearly vanishes it brings nothing but its noise.
+    Each channel is scaled by its brightest part, so that an unknown gain between H and V has no effect. The larger of
+    both is used instead of the sum, because V is only noise where it nearly vanishes.
     """
     power = np.zeros(h.shape)
     for channel in (h, v):
@@ -163,10 +164,10 @@ def segment(
 ) -> Segmentation:
     """Find the patches of an image pair.
 
-    Total variation against speckle, Otsu's threshold on the level in dB, morphological opening, connected components
-    (scikit-image), each cut again at half of its own amplitude; what is left of a component after that is looked at
-    again, so that a dim plate that hangs on a bright one's skirt is found too. Then the same on what lies away from the
-    patches found, until bright and dark cannot be told apart.
+    The steps are total variation against speckle, Otsu's threshold on the level in dB, morphological opening, connected
+    components (scikit-image), each cut again at half of its own amplitude. The rest of a component is searched again,
+    so that a dim plate touching the skirt of a bright one is found. All is repeated on the pixels away from the found
+    patches until bright and dark cannot be separated.
 
     Parameters
     ----------
@@ -175,55 +176,58 @@ def segment(
     x_m, y_m
         Pixel centres in metres, evenly spaced.
     valid
-        bool [ny, nx], pixels to look at (None: all that are finite).
+        bool [ny, nx], pixels to use; None: all finite ones.
     settings
         None: the defaults.
 
     Returns
     -------
     Segmentation
-        without patches when bright and dark cannot be told apart.
+        without patches if bright and dark cannot be separated.
 
     Raises
     ------
     DataError
-        when shapes differ or nothing is valid.
+        if shapes differ or no pixel is valid.
     """
     cfg = settings or SegmentSettings()
     if h.shape != v.shape or h.shape != (np.size(y_m), np.size(x_m)):
-        raise DataError(f"images {h.shape}, {v.shape} do not fit axes of {np.size(y_m)} x {np.size(x_m)}")
+        raise DataError(
+            f"images {h.shape}, {v.shape} do not fit axes of {np.size(y_m)} x {np.size(x_m)}", code=ErrorCode.MISMATCH
+        )
     usable = np.isfinite(h) & np.isfinite(v)
     if valid is not None:
         usable &= valid
     if not usable.any():
-        raise DataError("the image has no valid pixel", "nothing was recorded there, or all of it was masked")
+        raise DataError(
+            "the image has no valid pixel", "nothing was recorded, or all of it was masked", code=ErrorCode.NO_DATA
+        )
     pixel_mm = abs(float(axis_mm(x_m)[1] - axis_mm(x_m)[0]))
     level = np.maximum(level_db(h, v, usable, cfg.smooth_px), cfg.floor_db)
     masks, threshold = _regions(_without_speckle(level, usable, cfg, pixel_mm), usable, cfg, pixel_mm)
     labels = np.zeros(h.shape, np.int32)
-    y = axis_mm(y_m)
-    row_pitch = max(2 * cfg.smallest_mm, 1.0)
-
-    def reading_order(mask: Mask) -> tuple[float, float]:
-        rows, cols = np.nonzero(mask)
-        return -round(float(y[rows].mean()) / row_pitch), float(cols.mean())
-
     patches = []
-    for mask in sorted(masks, key=reading_order):
+    for mask in sorted(masks, key=lambda mask: _reading_order(mask, axis_mm(y_m), max(2 * cfg.smallest_mm, 1.0))):
         labels[mask] = len(patches) + 1
         patches.append(make_patch(len(patches) + 1, mask, x_m, y_m, cfg.margin_mm, usable))
     return Segmentation(labels, tuple(patches), threshold)
 
 
+def _reading_order(mask: Mask, y_mm: npt.NDArray[np.float64], row_pitch_mm: float) -> tuple[float, float]:
+    """Sort key of a patch: top row first, then from left to right."""
+    rows, cols = np.nonzero(mask)
+    return -round(float(y_mm[rows].mean()) / row_pitch_mm), float(cols.mean())
+
+
 def insides(images: ChannelImages) -> list[Mask]:
-    """Insides of the patches of an image pair, bool [ny, nx] each; none when nothing is valid."""
+    """Return the interiors of the patches of an image pair, bool [ny, nx] each; none without valid pixels."""
     if not (images.valid & np.isfinite(images.h) & np.isfinite(images.v)).any():
         return []
     return [p.interior for p in segment(images.h, images.v, images.x_m, images.y_m, images.valid).patches]
 
 
 def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float) -> Segmentation:
-    """All usable pixels as one patch: a material that fills the image, so that nothing dark is left to tell it from."""
+    """Return all usable pixels as one patch, for a material that fills the image."""
     patch = make_patch(1, usable, x_m, y_m, margin_mm, usable)
     return Segmentation(usable.astype(np.int32), (patch,), float("-inf"))
 
@@ -231,9 +235,9 @@ def whole_plane(usable: Mask, x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm:
 def _without_speckle(
     level: npt.NDArray[np.float64], usable: Mask, cfg: SegmentSettings, pixel_mm: float
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """The level in dB after total variation: with the weight that the bright plates' speckle asks; with a middle one.
+    """Return the level after total variation, dB: with the weight for the bright plates' speckle, and a medium weight.
 
-    The second is for the dim plates that are left: they have more speckle than bright ones, and no bright neighbour.
+    The second is for the remaining dim plates: they have more speckle than bright ones, and no bright neighbour.
     """
 
     def even(weight: float) -> npt.NDArray[np.float64]:
@@ -255,7 +259,7 @@ def _without_speckle(
 def _regions(
     levels: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]], usable: Mask, cfg: SegmentSettings, pixel_mm: float
 ) -> tuple[list[Mask], float]:
-    """Masks of all patches, bright ones first, and the first threshold in dB."""
+    """Return the masks of all patches, bright ones first, and the first threshold, dB."""
     radius = max(1, round((cfg.smallest_mm / pixel_mm - 1) / 2))
     around = np.asarray(skimage.morphology.disk(max(1, round(cfg.margin_mm / pixel_mm))), bool)
     found: list[Mask] = []
@@ -279,10 +283,10 @@ def _regions(
 
 
 def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: float) -> bool:
-    """Whether two classes are there: their distance, and that it is not one class cut in two.
+    """Return true if bright and dark are two classes, far enough apart, and not one class cut in two.
 
     Otsu also splits a single normal distribution, with 2/pi = 0.64 of the variance between the halves. One small patch
-    has little of the variance, but stands far above the spread of the dark.
+    has little of the variance, but lies far above the spread of the dark class.
     """
     w = float(bright.mean())
     gap = float(level[bright].mean() - level[~bright].mean())
@@ -291,7 +295,7 @@ def _separate(level: npt.NDArray[np.float64], bright: Mask, least_contrast_db: f
 
 
 def _cut(amplitude: npt.NDArray[np.float64], mask: Mask, radius: int) -> list[Mask]:
-    """Connected regions of a mask, each bounded where the amplitude falls to half of its own level."""
+    """Return the connected regions of a mask, each cut at half of its own amplitude."""
     disk = np.asarray(skimage.morphology.disk(radius), bool)
     skirt = np.asarray(skimage.morphology.disk(radius + 1), bool)
     found: list[Mask] = []
@@ -306,14 +310,14 @@ def _cut(amplitude: npt.NDArray[np.float64], mask: Mask, radius: int) -> list[Ma
         near = np.asarray(scipy.ndimage.binary_dilation(core, skirt), bool)
         queue += _components(_opened(region & ~near, disk))
         if len(parts) == 1:
-            found.append(_even(parts[0]))
+            found.append(_smooth_outline(parts[0]))
         else:
             queue += parts
     return found
 
 
-def _even(mask: Mask) -> Mask:
-    """A region without holes, its outline evened: ringing along the edges makes it jagged."""
+def _smooth_outline(mask: Mask) -> Mask:
+    """Fill the holes of a region and smooth its outline, which ringing along the edges makes jagged."""
     filled = np.asarray(scipy.ndimage.binary_fill_holes(mask), float)
     return np.asarray(scipy.ndimage.gaussian_filter(filled, 1.0) > 0.5, bool)
 

@@ -1,8 +1,12 @@
-"""How specimens of one material differ: their spread in permittivity, and what that does to what a rig sees.
+"""Half spaces as seen by the rig: the effect of differences between specimens, and patches of unknown materials.
 
 Two plates of the same material differ by some per cent in the real part of the permittivity and by tens of per cent in
-the loss (Fig. 17 of the paper). In `(ln eps', ln eps'')` that is taken to be normal; Eq. 2 turns it into errors of
-ln|H|, ln|V| and arg P that belong together, under all angles at once, for it is one specimen that they see.
+the loss (Fig. 17 of the paper). `(ln eps', ln eps'')` is assumed to be normal; Eq. 2 converts its spread to correlated
+errors of ln|H|, ln|V| and arg P, for all angles together because they show the same specimen.
+
+`cost_of_none` is the likelihood of a patch that is none of the library's materials but any half space: ln eps' is
+uniform from nearly air's to beyond water's, and so is the loss on a scale that is logarithmic above `SOFT_LOSS` and
+linear below. The integral over all half spaces is by Laplace's method about the best fitting one.
 """
 
 from __future__ import annotations
@@ -18,35 +22,35 @@ Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 PUBLISHED_SPREAD = (0.027, 0.19)
-"""Standard deviations of ln eps' and ln eps'' where a library does not tell: root mean square of PET's and ceramic's in
+"""Standard deviations of ln eps' and ln eps'' if a library has no estimate: root mean square of PET's and ceramic's in
 Fig. 17 of the paper (variances 0.0021 and 0.0295 of 3.78 and 4.75; 0.0255 and 0.1081 of 0.70 and 2.43)."""
 PRIOR_FREEDOM = 4.0
-"""How many specimens' worth of evidence that is, beside the library's own specimens."""
+"""Weight of that prior, in number of specimens."""
 OWN_FREEDOM = 20.0
-"""How many specimens' worth of evidence the mean of all materials is, for one material's own spread."""
+"""Weight of the mean of all materials in one material's own spread, in number of specimens."""
 SOFT = 0.05
-"""|V / H| below which its errors are taken to be additive (leakage, noise) instead of relative (gain, phase)."""
+"""|V / H| below which its errors are additive (leakage, noise) instead of relative (gain, phase)."""
 _STEP = 1e-4
 _ROUNDS = 300
 _SETTLED = 1e-3
 _LEAST_LOSS = 1e-3
-_METAL = 0.1  # |t - 1| below which a material is metal, whose specimens do not differ
+_METAL = 0.1  # |t - 1| below which a material is metal; specimens of metal do not differ
 
 
 def softened(t: npt.ArrayLike) -> Real:
-    """The scale to which errors of t = V / H are relative, `sqrt(|t|^2 + SOFT^2)`: V may vanish (Brewster's angle)."""
+    """Return the scale of errors of t = V / H, `sqrt(|t|^2 + SOFT^2)`: V may vanish (Brewster's angle)."""
     return np.asarray(np.hypot(np.abs(t), SOFT), np.float64)
 
 
 def features(permittivity: npt.ArrayLike, angles_rad: Sequence[float]) -> tuple[Real, Complex]:
-    """ln|H| and V / H of half spaces relative to metal (Eq. 2), each [..., angles]."""
+    """Return ln|H| and V / H of half spaces relative to metal (Eq. 2), each [..., angles]."""
     both = [fresnel(permittivity, angle) for angle in angles_rad]
     log_h = np.stack([np.log(np.abs(s)) for s, _ in both], axis=-1)
     return log_h, np.stack([p / s for s, p in both], axis=-1)
 
 
 def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
-    """What a specimen's ln eps' and ln eps'' do to ln|H|, ln|V| and arg P of a material seen as t, [3 * angles, 2].
+    """Return the derivatives of ln|H|, ln|V| and arg P of a material by ln eps' and ln eps'', [3 * angles, 2].
 
     Parameters
     ----------
@@ -57,7 +61,7 @@ def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
 
     Returns
     -------
-    Zero for metal, and where the angles are not known.
+    Zero for metal, and if the angles are not known.
     """
     if len(angles_rad) != len(t) or not np.isfinite(t).all() or bool((np.abs(t - 1) < _METAL).any()):
         return np.zeros((3 * len(t), 2))
@@ -71,22 +75,22 @@ def effect(t: Complex, angles_rad: Sequence[float]) -> Real:
 
 
 def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
-    """Deviations of ln|H| and of t, [..., angles] each, as those of ln|H|, ln|V| and arg P, [..., angles, 3].
+    """Convert deviations of ln|H| and of t, [..., angles] each, to those of ln|H|, ln|V| and arg P, [..., angles, 3].
 
-    To first order; with :func:`softened` instead of |t|, so that they stay finite where V vanishes.
+    To first order; with :func:`softened` instead of |t|, so that they stay finite if V vanishes.
     """
     along = dt * np.exp(-1j * np.angle(t)) / softened(t)
     return np.stack([log_h, log_h + along.real, -along.imag], axis=-1)
 
 
 def without(log_h: Real, t: Complex, deviations: Real) -> tuple[Real, Complex]:
-    """ln|H| and t [..., angles] with deviations [..., angles, 3] taken off: :func:`relative` undone."""
+    """Subtract deviations [..., angles, 3] from ln|H| and t [..., angles]: inverse of :func:`relative`."""
     h, v, phase = (deviations[..., i] for i in range(3))
     return log_h - h, t - softened(t) * ((v - h) - 1j * phase) * np.exp(1j * np.angle(t))
 
 
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
-    """The half space that looks like t [angles], mean of what Eq. 3 gives for each angle; passive, at least air's."""
+    """Return the half space with ratios t [angles]: mean of Eq. 3 over the angles, limited to passive materials."""
     eps = complex(np.mean([complex(permittivity_from_ratio(q, angle)) for q, angle in zip(t, angles_rad, strict=True)]))
     return complex(max(eps.real, 1.01), min(eps.imag, -_LEAST_LOSS))
 
@@ -99,28 +103,28 @@ def fit_spread(
     noise: Real,
     gains_alike: bool = True,
 ) -> tuple[Real, Real]:
-    """The specimens' spread and the placements' covariance that patches' residuals tell: expectation maximisation.
+    """Estimate the spread of specimens and the covariance of placements from patches, by expectation maximisation.
 
-    A patch's residual is `F_m s + u`, s the specimen's deviation, the same in all its patches, u the placement's.
+    A patch's residual is `F_m s + u`: s is the specimen's deviation, equal in all its patches, u the placement's.
 
     Parameters
     ----------
     residuals
-        float64 [patches, d], of patch means about their material's.
+        float64 [patches, d]: patch means minus their material's mean.
     material, specimen
-        Of each patch; specimens are numbered over all materials.
+        Numbers for each patch; specimens are numbered over all materials.
     effects
         float64 [materials, d, 2], of :func:`effect`.
     noise
         float64 [d, d], covariance to start from.
     gains_alike
-        Whether the features are ln|H|, ln|V|, arg P of each angle, and gains of H and V err alike (:func:`alike`).
+        True if the features are ln|H|, ln|V|, arg P of each angle, with equal gain errors of H and V (:func:`alike`).
 
     Returns
     -------
     spread : float64 [materials, 2], variances of ln eps' and ln eps''
-        Of all materials together, with the published spread as prior, corrected by each material's own. A material of
-        which one specimen was seen tells nothing.
+        The spread of all materials together, with the published spread as prior, corrected by each material's own. A
+        material with a single specimen is ignored.
     placement : float64 [d, d]
     """
     one = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
@@ -151,7 +155,7 @@ def fit_spread(
 
 
 def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.NDArray[np.bool_]) -> Real:
-    """The spread of each material: that of all together, corrected by its own specimens' squares [specimen, 2]."""
+    """Return the spread of each material: the pooled one, corrected by its own specimens' squares [specimen, 2]."""
     own = np.tile(pooled, (telling.size, 1))
     for k in np.flatnonzero(telling):
         mine = second[kind == k]
@@ -160,9 +164,9 @@ def _each(pooled: Real, second: Real, kind: npt.NDArray[np.intp], telling: npt.N
 
 
 def alike(covariance: Real) -> Real:
-    """A covariance of ln|H|, ln|V|, arg P, [3 * angles, 3 * angles], with gains of H and V that err alike.
+    """Return a covariance of ln|H|, ln|V|, arg P, [3 * angles, 3 * angles], with equal gain errors of H and V.
 
-    A specimen's deviation changes mostly V, so that V's own gain error can hardly be told from it; H's can.
+    A specimen's deviation changes mostly V, so that the gain error of V cannot be separated from it; that of H can.
     """
     out = np.zeros_like(covariance)
     for i in range(0, len(covariance), 3):
@@ -175,3 +179,54 @@ def alike(covariance: Real) -> Real:
 
 def _floor(covariance: Real) -> Real:
     return (1e-9 * np.trace(covariance) + 1e-14) * np.eye(len(covariance))
+
+
+REAL_RANGE = (1.2, 30.0)
+LOSS_RANGE = (0.0, 30.0)
+SOFT_LOSS = 0.05
+_STEPS, _STEP = 8, 1e-4
+_PRIOR = 1 / (np.log(REAL_RANGE[1] / REAL_RANGE[0]) * np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS))
+
+
+def cost_of_none(log_h: Real, t: Complex, covariances: Real, angles_rad: Sequence[float]) -> Real:
+    """Return minus twice the log likelihood of each patch as any half space.
+
+    Parameters
+    ----------
+    log_h, t
+        ln|H| and V / H of the patches, [patch, angles].
+    covariances
+        float64 [patch, 3 * angles, 3 * angles] of their ln|H|, ln|V|, arg P, without the specimens' spread.
+    angles_rad
+        Incidence angles.
+    """
+    inverse = np.asarray(np.linalg.inv(covariances), np.float64)
+    constant = np.linalg.slogdet(covariances)[1] + covariances.shape[1] * np.log(2 * np.pi)
+    start = np.array([apparent_permittivity(q, angles_rad) for q in t], np.complex128)
+    low = np.array([np.log(REAL_RANGE[0]), 0.0])
+    high = np.array([np.log(REAL_RANGE[1]), np.arcsinh(LOSS_RANGE[1] / SOFT_LOSS)])
+    at: Real = np.stack([np.log(start.real), np.arcsinh(-start.imag / SOFT_LOSS)], axis=1)
+    at = np.asarray(np.clip(at, low, high), np.float64)
+    best, curvature = np.full(len(t), np.inf), np.tile(np.eye(2), (len(t), 1, 1))
+    for _ in range(_STEPS):
+        off, slope = _off(at, log_h, t, angles_rad)
+        weighed = slope.mT @ inverse
+        information = weighed @ slope + 1e-9 * np.eye(2)
+        cost = np.einsum("pd,pde,pe->p", off, inverse, off)
+        better = cost < best
+        best, curvature = np.where(better, cost, best), np.where(better[:, None, None], information, curvature)
+        step = np.linalg.solve(information, weighed @ off[..., None])[..., 0]
+        at = np.asarray(np.clip(at - step, low, high), np.float64)
+    return np.asarray(constant + best - 2 * np.log(_PRIOR * 2 * np.pi) + np.linalg.slogdet(curvature)[1], np.float64)
+
+
+def _off(at: Real, log_h: Real, t: Complex, angles_rad: Sequence[float]) -> tuple[Real, Real]:
+    """Return deviations of half spaces at [patch, 2] from the data, [patch, d], and derivatives, [patch, d, 2]."""
+
+    def deviations(where: Real) -> Real:
+        own_h, own_t = features(np.exp(where[:, 0]) - 1j * SOFT_LOSS * np.sinh(where[:, 1]), angles_rad)
+        return relative(own_h - log_h, own_t - t, t).reshape(len(t), -1)
+
+    here = deviations(at)
+    columns = [(deviations(at + step) - here) / _STEP for step in np.eye(2) * _STEP]
+    return here, np.stack(columns, axis=-1)

@@ -17,13 +17,12 @@ import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages, SubBand
 from polysight.host.materials.analyse import reference_spread, smooth_inside, to_metal, without_leakage
-from polysight.host.materials.inputs import ImagePair, Optics
+from polysight.host.materials.inputs import ImagePair, Optics, level
 from polysight.host.materials.inversion import ratio_slopes
 from polysight.host.materials.layers import Bands, Spectrum
-from polysight.host.materials.measure import seen
+from polysight.host.materials.measure import measure_patch
 from polysight.host.materials.permittivity import inverse_spread, median_ratio
 from polysight.host.materials.result import MaterialsResult
-from polysight.host.materials.tilts import level
 from polysight.host.polarimetry import PlaneReference
 from polysight.shared.config import Chirp
 from polysight.shared.errors import DataError
@@ -114,7 +113,7 @@ def band_rows(
             parts[r.patch.label].append(
                 {"first_hz": band.first_hz, "last_hz": band.last_hz, **_seen(h[at], v[at], whole, error)}
             )
-    common = {r.patch.label: seen(r.patch, found.h, found.v, 0.0).std for r in found.patches}
+    common = {r.patch.label: measure_patch(r.patch, found.h, found.v, 0.0).std for r in found.patches}
     return {label: _with_covariance(rows, found, common[label]) for label, rows in parts.items()}
 
 

@@ -1,14 +1,14 @@
-"""Reference libraries made from scans, their classifiers fitted, and models judged on data they have not seen.
+"""Train reference libraries from scans, and judge models by cross-validation.
 
 `make_library` collects the patches of known material from processed scans; `fit_library` judges the models on them, for
-each incidence angle and for all together. What names is always the discriminant, the one model that gives probabilities
-and knows what is none of the materials; the others are judged beside it. Nothing is chosen, so no figure flatters.
+each incidence angle and for all together. The default model is always the discriminant, the only one with probabilities
+and a test for unknown materials; other models are judged for comparison. No model is selected by its score, so that the
+scores are unbiased.
 
-To judge a model (`score`), whole groups are left out (scans, or physical samples): pixels of one patch share their
-speckle, their placement and their metal reference, so that a split by pixel measures how well a patch knows itself.
-That figure is given too, because the paper seems to use it; it is optimistic and called so. A material can be judged
-only where another scan taught it. One that a single scan holds is not judged: it stays among the materials that the
-others may be confused with, counts neither as right nor as wrong, and is named.
+To judge a model (`score`), whole groups are left out (scans, or physical samples): pixels of one patch share speckle,
+placement and metal reference, so that a split by pixel compares a patch with itself. That score is given too, because
+the paper seems to use it; it is labelled optimistic. A material of a single scan cannot be judged: it stays among the
+candidates, counts neither as right nor as wrong, and is listed.
 """
 
 from __future__ import annotations
@@ -26,41 +26,42 @@ from polysight.host.materials.knn import fit_weights
 from polysight.host.materials.library import Entry, Library
 from polysight.host.materials.result import MaterialsResult
 from polysight.host.materials.samples import Real, Samples, majority
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 
 FOLDS = 8
 OPTIMISTIC = "by pixel (optimistic)"
 PIXELS = 16
-"""Pixels of a patch that models are judged on."""
+"""Pixels per patch for judging models."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """How a model did.
+    """Scores of a model.
 
     Attributes
     ----------
     model, channels, split
-        Its name, what it saw, and how training and test were kept apart.
+        Name, channels, and split of training and test data.
     pixels
-        Share of pixels named right, each by nothing but itself: mean over materials.
+        Share of pixels named right, classified independently: mean over materials.
     in_scan
-        The same when the pixels of a scan are named together.
+        The same with the pixels of a scan named together.
     by_patch
-        Share of pixels whose patch was named right, the patches of a scan named together: mean over materials.
+        Share of pixels whose patch was named right, with the patches of a scan named together: mean over materials.
     patches
         Share of patches named right.
     unknown
-        Share of the patches, all of them of known materials, that were called unknown.
+        Share of the patches (all of known materials) that were called unknown.
     confusion
-        float64 [material, material] of pixels on their own, rows the truth, each adding to 1, in the order of `names`;
-        0 in the rows of materials that were not judged.
+        float64 [material, material] of independent pixels: rows are the truth in the order of `names` and add to 1; 0
+        in the rows of materials that were not judged.
     patch_confusion
-        The same of pixels by their patch.
+        The same with each pixel named as its patch.
     names
         Materials, sorted.
     not_judged
-        Those of them that no training pixels were left for; the shares above are of the others.
+        Materials without training pixels in other groups; the shares above are of the others.
     calibration
         Expected calibration error of the patches that were named (:func:`calibration_error`).
     """
@@ -81,9 +82,9 @@ class Score:
 
 
 def calibration_error(confidence: npt.NDArray, right: npt.NDArray, bins: int = 10) -> float:
-    """Expected calibration error: |mean confidence - share right| in bins of confidence, weighted by their size.
+    """Return the expected calibration error: |mean confidence - share right| in bins, weighted by their size.
 
-    Guo et al., On Calibration of Modern Neural Networks, ICML 2017. Not a number without any.
+    Guo et al., On Calibration of Modern Neural Networks, ICML 2017. NaN without data.
     """
     if not len(confidence):
         return float("nan")
@@ -94,14 +95,14 @@ def calibration_error(confidence: npt.NDArray, right: npt.NDArray, bins: int = 1
 
 
 def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
-    """Training and test pixels of each fold: whole groups apart, or single pixels.
+    """Yield training and test pixels of each fold: whole groups, or single pixels.
 
-    Every group is a fold of its own where `folds` could put all that hold a material into one.
+    Every group is a fold of its own if `folds` could put all groups of a material into one fold.
 
     Raises
     ------
     DataError
-        when there are fewer than two groups to keep apart, or no material is in two.
+        with fewer than two groups, or without a material in two groups.
     """
     from sklearn.model_selection import GroupKFold, StratifiedKFold
 
@@ -114,15 +115,17 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
     if groups.size < 2:
         raise DataError(
             f"{groups.size} scan to judge a classifier on",
-            "whole scans are left out, and none would remain to learn from",
+            "whole scans are left out, and none would remain for training",
             "process more scans",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     held = samples.groups_of_material[samples.shared]
     if not held.size:
         raise DataError(
             f"no material is in two of the {groups.size} scans",
-            "a scan that is left out shows only what was never learnt",
+            "a scan left out has no material of the training scans",
             "process a second scan with the same materials",
+            code=ErrorCode.NOT_ENOUGH_DATA,
         )
     if held.min() <= -(-groups.size // folds):
         folds = groups.size
@@ -139,14 +142,14 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     model, channels
         A key of `MODELS`, one of `CHANNELS`.
     by_pixel
-        Split by pixel instead of by group: optimistic, see the module's text.
+        Split by pixel instead of by group: optimistic, see the module's docstring.
     folds
-        At most so many folds.
+        Largest number of folds.
 
     Raises
     ------
     DataError
-        when there are fewer than two groups, or no material is in two of them.
+        with fewer than two groups, or without a material in two groups.
     """
     alone, in_scan, of_patch = (np.empty_like(samples.names) for _ in range(3))
     unknown, learnt = np.zeros((2, samples.names.size), bool)
@@ -195,18 +198,18 @@ def _confusion(true: npt.NDArray, found: npt.NDArray, names: npt.NDArray) -> Rea
 
 
 def best_model(samples: Samples) -> tuple[str, tuple[Score, ...]]:
-    """Name of the model that does best with whole groups left out, and the scores of all but the slowest.
+    """Return the name of the best model with whole groups left out, and the scores of all but the slowest.
 
-    Best is the mean of the pixels' and of the patches' share.
+    The criterion is the mean of the pixels' and of the patches' share.
     """
     scores = tuple(score(samples, model) for model in MODELS if model != SLOW)
     return max(scores, key=lambda s: s.pixels + s.patches).model, scores
 
 
-def strangers(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str, float]:
-    """Share of each material's patches that are called unknown when no patch of that material was ever learnt.
+def score_unseen_materials(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str, float]:
+    """Return the share of each material's patches that are called unknown if it is left out of the training data.
 
-    The other materials are learnt from other scans than the one that is judged, as always.
+    The other materials are learnt from other scans than the judged one, as always.
     """
     out = {}
     for name in np.unique(samples.names):
@@ -225,12 +228,12 @@ def strangers(samples: Samples, model: str, channels: str = "H+V+P") -> dict[str
 
 
 def fit_library(library: Library) -> Library:
-    """The library with its model chosen, ready to classify; each incidence angle for itself, and all of them together.
+    """Return the library with its fit, for each incidence angle and for all together.
 
     Raises
     ------
     DataError
-        with fewer than two scans of an angle: a split by pixel would be flattering.
+        with fewer than two scans of an angle: a split by pixel would be too optimistic.
     """
     samples = {f"{angle:g}": Samples.of(library.at(angle), PIXELS) for angle in library.angles_deg}
     fits = {angle: fit_samples(of) for angle, of in samples.items()}
@@ -240,12 +243,12 @@ def fit_library(library: Library) -> Library:
 
 
 def fit_samples(samples: Samples) -> dict[str, Any]:
-    """Model and scores on labelled pixels, as plain values for a library's file.
+    """Return model and scores on labelled pixels, as plain values for a library's file.
 
-    The scores are of materials that two scans or more hold; `not_judged` names the others.
+    The scores are of materials in two or more scans; `not_judged` lists the others.
     """
     scores = {model: score(samples, model) for model in MODELS if model != SLOW}
-    weighted, told = fit_weights(samples), scores[DISCRIMINANT]
+    weighted, own = fit_weights(samples), scores[DISCRIMINANT]
     judged = {s.model: {"pixels": s.pixels, "patches": s.patches} for s in scores.values()}
     for name in (DISCRIMINANT, PAPER):
         judged[name]["pixels_split_by_pixel"] = score(samples, name, by_pixel=True).pixels
@@ -254,38 +257,38 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
         "weights": weighted.weights.to_dict(),
         "thresholds": weighted.thresholds,
         "by_channel": weighted.by_channel,
-        "split": told.split,
-        "pixel_accuracy": told.pixels,
-        "patch_accuracy": told.patches,
-        "known_called_unknown": told.unknown,
-        "pixel_accuracy_in_scan": told.in_scan,
-        "calibration_error": told.calibration,
+        "split": own.split,
+        "pixel_accuracy": own.pixels,
+        "patch_accuracy": own.patches,
+        "known_called_unknown": own.unknown,
+        "pixel_accuracy_in_scan": own.in_scan,
+        "calibration_error": own.calibration,
         "judged": judged,
-        "materials": len(told.names),
-        "not_judged": list(told.not_judged),
+        "materials": len(own.names),
+        "not_judged": list(own.not_judged),
     }
 
 
 @dataclass(frozen=True)
 class TrainingScan:
-    """One processed scan for the library.
+    """One processed scan for training.
 
     Attributes
     ----------
     scan
-        Its name: pixels of one scan never test what they trained.
+        Its name; training and test data are split by it.
     result
-        Output of :func:`polysight.host.materials.analyse`, made with the truth's plates.
+        Result of :func:`polysight.host.materials.analyse`, made with the truth's plates.
     simulated
-        Whether it was simulated.
+        True if it was simulated.
     seed
-        Of the simulated placement, where it has one.
+        Seed of the simulated placement, if any.
     versions
-        Versions of what made it.
+        Versions of the programs that made it.
     names
-        Names of patches by label, when drawn by hand instead of matched to a truth.
+        Patch number to name, if drawn by hand instead of matched to a truth.
     specimens
-        Which physical piece each patch shows, by label, where that is known.
+        Patch number to physical piece, if known.
     """
 
     scan: str
@@ -298,9 +301,9 @@ class TrainingScan:
 
 
 def entries_of(scan: TrainingScan, pixels_per_patch: int = 16) -> list[Entry]:
-    """Library entries of one scan: each patch whose material is known, with up to so many pixels of its interior.
+    """Return the library entries of one scan: each patch of known material, with up to so many interior pixels.
 
-    Pixels are taken at even intervals over the interior, so that the same scan always gives the same entries.
+    Pixels are taken at even intervals, so that the same scan always gives the same entries.
     """
     out = []
     r = scan.result
@@ -333,18 +336,19 @@ def entries_of(scan: TrainingScan, pixels_per_patch: int = 16) -> list[Entry]:
 
 
 def make_library(scans: Iterable[TrainingScan], note: str = "", pixels_per_patch: int = 16) -> Library:
-    """A library of several scans, with the classifier's weights fitted on it (whole scans left out).
+    """Make a library of several scans, with its fit.
 
     Raises
     ------
     DataError
-        when no scan holds a patch of known material, or fewer than two scans do.
+        with no patch of known material, or fewer than two scans with one.
     """
     entries = [e for scan in scans for e in entries_of(scan, pixels_per_patch)]
     if not entries:
         raise DataError(
             "no patch of known material in these scans",
             "they have no truth.json or labels, or no patch matches them by position",
-            "say what lies where: polysight label SCAN",
+            "label the patches: polysight label SCAN",
+            code=ErrorCode.NO_DATA,
         )
     return fit_library(Library(tuple(entries), {}, note))

@@ -1,4 +1,4 @@
-"""What really lies on the plane, where that is known: plates of a simulated scene, matched to patches by position."""
+"""Truth of a scene: its plates as listed in truth.json, matched to patches by position."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from polysight.host.materials.segment import Box, Patch, box_mask
+from polysight.host.materials.segment import Box, Patch
+from polysight.shared.error_codes import ErrorCode
 from polysight.shared.errors import DataError
 from polysight.shared.files import read_json
 
@@ -19,7 +19,7 @@ TRUTH = "truth.json"
 
 @dataclass(frozen=True)
 class TruthPlate:
-    """A rectangular plate.
+    """A rectangular plate of the true scene.
 
     Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers.
     """
@@ -37,19 +37,20 @@ class TruthPlate:
 
 
 def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
-    """Plates of a truth file's content: `plates`, each with name, centre_mm, size_mm, permittivity or metal.
+    """Return the plates in the content of truth.json: name, centre_mm, size_mm, and permittivity or metal each.
 
     Raises
     ------
     DataError
-        when it has another form.
+        if the content is invalid.
     """
     try:
         return tuple(_plate(p) for p in truth["plates"])
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as e:
         raise DataError(
-            f"the truth has another form than expected: {type(e).__name__}: {e}",
+            f"the content of the truth file is invalid: {type(e).__name__}: {e}",
             "expected plates = [{name, centre_mm, size_mm, permittivity or metal}]",
+            code=ErrorCode.VALUE_INVALID,
         ) from None
 
 
@@ -57,18 +58,21 @@ Plates = tuple[TruthPlate, ...]
 
 
 def read_truth(path: Path) -> tuple[TruthPlate, ...]:
-    """Plates of a truth.json. Raises DataError."""
+    """Read the plates of a truth.json. Raises DataError."""
     remedy = f"give the one that polysight simulate wrote beside its data, or move {path.name} away"
     try:
         return truth_plates(read_json(path))
     except DataError as e:
-        raise DataError(f"{path}: {e.what}", e.why, remedy) from None
+        raise DataError(f"{path}: {e.what}", e.why, remedy, code=e.code) from None
     except (OSError, ValueError) as e:
-        raise DataError(f"{path}: cannot be read as truth: {e}", "another program's file, or damaged", remedy) from None
+        raise DataError(
+            f"{path}: cannot be read as truth: {e}", "another program's file, or damaged", remedy,
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None  # fmt: skip
 
 
-def drawn_specimens(path: Path) -> int | None:
-    """The seed by which a truth.json's scene drew its plates' permittivities (`specimen_spread`); None: it did not.
+def specimen_seed(path: Path) -> int | None:
+    """Return the seed of the plates' random permittivities (`specimen_spread`) in a truth.json; None if not random.
 
     Raises DataError.
     """
@@ -78,13 +82,13 @@ def drawn_specimens(path: Path) -> int | None:
     return scene.get("seed") if isinstance(scene, dict) and isinstance(spread, list) and any(spread) else None
 
 
-def truth_beside(folder: Path) -> tuple[Plates, str]:
-    """Plates of a scan folder's truth.json, for results that do without.
+def find_truth(folder: Path) -> tuple[Plates, str]:
+    """Read the plates of a scan folder's truth.json, if there is one.
 
     Returns
     -------
     plates, note
-        No plates when there is no such file; no plates and why, in one line, when it is not a truth file.
+        No plates without the file; no plates and the reason, in one line, if the file is invalid.
     """
     path = folder / TRUTH
     if not path.exists():
@@ -92,7 +96,7 @@ def truth_beside(folder: Path) -> tuple[Plates, str]:
     try:
         return read_truth(path), ""
     except DataError as e:
-        return (), f"{e.what}; {e.why}. The results do without the truth.".replace("\n", " ")
+        return (), f"{e.what}; {e.why}. The truth is not used.".replace("\n", " ")
 
 
 def _plate(raw: Mapping[str, Any]) -> TruthPlate:
@@ -111,7 +115,7 @@ def _plate(raw: Mapping[str, Any]) -> TruthPlate:
 
 
 def match_truth(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[int, TruthPlate]:
-    """Plate of each patch label: the patch's middle lies in the plate, each plate goes to the nearest such patch."""
+    """Return patch label to plate: the patch's centre lies in the plate; of several patches the nearest gets it."""
     pairs = []
     for plate in plates:
         x0, y0, x1, y1 = plate.box_mm
@@ -125,11 +129,3 @@ def match_truth(patches: Iterable[Patch], plates: Iterable[TruthPlate]) -> dict[
         if label not in out and all(p is not plate for p in out.values()):
             out[label] = plate
     return out
-
-
-def truth_labels(plates: Iterable[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.int32]:
-    """Label image int32 [ny, nx] of the plates: 0 where nothing is, then 1, 2 ... in their order."""
-    labels = np.zeros((np.size(y_m), np.size(x_m)), np.int32)
-    for i, plate in enumerate(plates, start=1):
-        labels[box_mask(plate.box_mm, x_m, y_m)] = i
-    return labels

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.host.imaging import ChannelImages
-from polysight.host.materials import PATCHES, SeenPatches, read_patches
+from polysight.host.materials import PATCHES, ScanPatches, read_patches
 from polysight.host.store import Scan, open_npz, versions
 from polysight.host.verdict import Verdict, read_verdict
 from polysight.shared.config import Chirp, Instrument
@@ -271,7 +271,7 @@ class SavedProducts:
         return _json(self.folder / SCAN)
 
     @cached_property
-    def patches(self) -> SeenPatches:
+    def patches(self) -> ScanPatches:
         """Pixels of the patches, from patches.npz."""
         return read_patches(self.folder / PATCHES)
 

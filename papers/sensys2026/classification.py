@@ -24,7 +24,7 @@ from polysight.host.materials import (
     Score,
     best_model,
     score,
-    strangers,
+    score_unseen_materials,
 )
 from polysight.host.polarimetry import fresnel
 from polysight.host.report import INK, PALETTE
@@ -138,7 +138,7 @@ def unknowns(quick: bool) -> Table:
     rows = []
     for task in TASKS[:1] if quick else TASKS:
         drawn = task_samples(task, RESULT, quick)
-        missed = strangers(drawn, DISCRIMINANT)
+        missed = score_unseen_materials(drawn, DISCRIMINANT)
         never = [n for n, share in missed.items() if share < 0.5]
         rows.append((
             f"{len(missed)} {task}", percent(judged(task, DISCRIMINANT, "H+V+P", False, quick).unknown),

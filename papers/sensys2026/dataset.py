@@ -22,13 +22,13 @@ from polysight.host.materials import (
     Entry,
     LabelledScan,
     Library,
+    angle_in_text,
     entries_of_boxes,
     fit_library,
+    image_orientation,
     label_folders,
     read_labelled_scan,
     read_material,
-    reading_of,
-    told_angle,
 )
 from polysight.host.polarimetry import correct_leakage
 from polysight.host.store import COLLECTION, open_npz, read_settings, rig_of
@@ -115,9 +115,9 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
         found[MATERIALS] = _readable(read_material, pickles, notices)
     scans = _readable(read_labelled_scan, label_folders(folder / "labels"), notices)
     if scans:
-        how = reading_of(scans)
+        how = image_orientation(scans)
         notices.append(f"boxes of labels/ are read with {how}: so they explain the images' brightness best")
-        turned = [s.turned(how) for s in scans]
+        turned = [s.oriented(how) for s in scans]
         angles = {s.scan: _angle(folder, s, base, notices) for s in scans}
         found[LABELS] = _entries(turned, angles, notices)
         if images is not None:
@@ -164,7 +164,7 @@ def _angle(folder: Path, scan: LabelledScan, base: Instrument, notices: list[str
             rig, told = rig_of(read_settings(path), base, path)
             notices += told
             return incidence_deg(rig, rig.receivers[0])
-    told_here = told_angle([scan.description, scan.scan])
+    told_here = angle_in_text([scan.description, scan.scan])
     if told_here is not None:
         return told_here
     angle = incidence_deg(base, base.receivers[0])

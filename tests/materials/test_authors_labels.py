@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from polysight.host.materials.published import (
+    ORIENTATIONS,
     PIXELS,
-    TURNS,
+    angle_in_text,
     entries_of_boxes,
+    image_orientation,
     label_folders,
     read_labelled_scan,
-    reading_of,
-    told_angle,
 )
 from polysight.host.polarimetry import ratio_from_permittivity
 from polysight.shared.errors import DataError
@@ -33,9 +33,9 @@ def labelled(folder, seed=1, name="scan_7", **more):
 @pytest.mark.parametrize("upside_down", [False, True])
 def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down):
     scan = read_labelled_scan(labelled(tmp_path, upside_down=upside_down))
-    how = reading_of([scan])
+    how = image_orientation([scan])
     assert ("last row" in how) == upside_down
-    entries = {e.name: e for e in entries_of_boxes(scan.turned(how), 60.0)}
+    entries = {e.name: e for e in entries_of_boxes(scan.oriented(how), 60.0)}
     assert set(entries) == set(BOXES)
     for name, e in entries.items():
         eps = MATERIALS[name].permittivity
@@ -45,7 +45,7 @@ def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down
         assert e.h.size == PIXELS
 
 
-@pytest.mark.parametrize("how", list(TURNS))
+@pytest.mark.parametrize("how", list(ORIENTATIONS))
 def test_the_right_reading_is_found_among_all(tmp_path, how):
     scan = read_labelled_scan(labelled(tmp_path))
     back = {
@@ -56,7 +56,7 @@ def test_the_right_reading_is_found_among_all(tmp_path, how):
     }[how]
     for name in ("sar_h", "sar_v"):
         np.save(tmp_path / scan.scan / f"{name}.npy", back(np.load(tmp_path / scan.scan / f"{name}.npy")))
-    assert reading_of([read_labelled_scan(tmp_path / scan.scan)]) == how
+    assert image_orientation([read_labelled_scan(tmp_path / scan.scan)]) == how
 
 
 def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
@@ -83,6 +83,6 @@ def test_folders_and_angles(tmp_path):
     (tmp_path / "empty").mkdir()
     assert [f.name for f in label_folders(tmp_path)] == ["another", "scan_7"]
     assert label_folders(tmp_path / "none") == []
-    assert told_angle(["a scan", "plates_at_55deg"]) == 55.0
-    assert told_angle(["60 degrees"]) == 60.0
-    assert told_angle(["scan 12"]) is None
+    assert angle_in_text(["a scan", "plates_at_55deg"]) == 55.0
+    assert angle_in_text(["60 degrees"]) == 60.0
+    assert angle_in_text(["scan 12"]) is None

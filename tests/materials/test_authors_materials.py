@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import Entry
-from polysight.host.materials.published import read_material, read_materials, read_pickle, write_materials
+from polysight.host.materials.published import read_material, read_materials, read_pickle
 from polysight.shared.errors import DataError
+from tests.support.published_files import write_materials
 
 RNG = np.random.default_rng(1)
 

@@ -9,7 +9,7 @@ from polysight.host.materials.classify import DISCRIMINANT, MODELS, PAPER
 from polysight.host.materials.discriminant import REJECTED, ErrorDiscriminant
 from polysight.host.materials.knn import fit_weights
 from polysight.host.materials.samples import Samples, feature_matrix
-from polysight.host.materials.train import fit_samples, score, strangers
+from polysight.host.materials.train import fit_samples, score, score_unseen_materials
 from polysight.host.report.context import classifier_sentence
 from polysight.shared.errors import DataError
 
@@ -111,7 +111,7 @@ def test_the_expected_share_of_right_pixels_is_the_share_over_many_scans(step, o
 
 
 def test_a_material_that_was_never_learnt_is_unknown():
-    missed = strangers(drawn(4), DISCRIMINANT)
+    missed = score_unseen_materials(drawn(4), DISCRIMINANT)
     assert set(missed) == {f"m{i}" for i in range(5)}
     assert min(missed.values()) > 0.9
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from polysight.host.materials.inversion import (
     SOURCES,
-    Seen,
-    Uncertain,
+    PatchMeasurement,
+    RigPrior,
     invert,
     measured_ratio,
     ratio_error,
@@ -31,7 +31,7 @@ def world(rng, leak, noise=0.003, dull=0.03, angle=0.0, reference=0.0, eps=EPS):
     z = rng.standard_normal((2, eps.size))
     ratio = v / h * (1 + reference) + noise * (z[0] + 1j * z[1])
     level = np.abs(h) * np.exp(dull * rng.standard_normal(eps.size))
-    return [Seen(complex(r), noise, THETA, float(s)) for r, s in zip(ratio, level, strict=True)]
+    return [PatchMeasurement(complex(r), noise, THETA, float(s)) for r, s in zip(ratio, level, strict=True)]
 
 
 def drawn_leakage(rng):
@@ -67,7 +67,7 @@ def test_slope_is_the_derivative(tr, ti):
 
 def test_without_errors_the_truth_comes_back():
     leak = (0.04 + 0.02j, -0.03j)
-    found = invert(world(np.random.default_rng(0), leak, 1e-9, 0.0), Uncertain(1e-6, leak, 1e-6, True))
+    found = invert(world(np.random.default_rng(0), leak, 1e-9, 0.0), RigPrior(1e-6, leak, 1e-6, True))
     for p, truth in zip(found.patches, EPS, strict=True):
         assert p.permittivity == pytest.approx(truth, rel=1e-5)
 
@@ -81,7 +81,7 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured):
         angle, reference = 2e-3 * rng.standard_normal(), 0.005 * complex(*rng.standard_normal(2))
         seen = world(rng, leak, angle=angle, reference=reference)
         known = tuple(x + 0.003 * complex(*rng.standard_normal(2)) for x in leak) if measured else (0j, 0j)
-        prior = Uncertain(2e-3, known, 0.003 if measured else 0.041, measured, reference_std=0.005)
+        prior = RigPrior(2e-3, known, 0.003 if measured else 0.041, measured, reference_std=0.005)
         d += distances(invert(seen, prior))
     d = np.array(d)
     # The patches of a scene share leakage, angle and reference: 60 scenes are not 480 independent draws.
@@ -93,7 +93,7 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured):
 def test_leakage_that_was_not_measured_is_within_the_error_bars_whatever_its_phase():
     for phase in np.linspace(0, 2 * np.pi, 8, endpoint=False):
         leak = 0.05 * np.exp(1j * phase)
-        found = invert(world(np.random.default_rng(1), (leak, leak)), Uncertain(2e-3))
+        found = invert(world(np.random.default_rng(1), (leak, leak)), RigPrior(2e-3))
         assert np.sqrt(np.mean(distances(found)) / 2) < 1.5
         assert all(p.dominated_by in ("leakage", "brightness") for p in found.patches)
 
@@ -101,7 +101,7 @@ def test_leakage_that_was_not_measured_is_within_the_error_bars_whatever_its_pha
 def test_where_even_plates_tell_the_leakage_it_is_found():
     leak = (0.05j, 0.05j)
     seen = world(np.random.default_rng(2), leak, noise=5e-4, dull=0.0)
-    found = invert(seen, Uncertain(1e-5, reference_std=5e-4, brightness_std=0.002))
+    found = invert(seen, RigPrior(1e-5, reference_std=5e-4, brightness_std=0.002))
     assert found.leakage_determined
     for p, truth in zip(found.patches, EPS, strict=True):
         assert abs(p.permittivity - truth) < 0.03 * abs(truth)
@@ -109,7 +109,7 @@ def test_where_even_plates_tell_the_leakage_it_is_found():
 
 def test_shares_add_up_and_a_better_measurement_shrinks_what_it_dominates():
     seen = world(np.random.default_rng(3), (0j, 0j))
-    wide, known = invert(seen, Uncertain(2e-3)), invert(seen, Uncertain(2e-3, (0j, 0j), 0.001, True))
+    wide, known = invert(seen, RigPrior(2e-3)), invert(seen, RigPrior(2e-3, (0j, 0j), 0.001, True))
     for a, b in zip(wide.patches, known.patches, strict=True):
         assert set(a.shares) == set(SOURCES)
         assert sum(a.shares.values()) == pytest.approx(1.0, abs=1e-6)
@@ -119,7 +119,7 @@ def test_shares_add_up_and_a_better_measurement_shrinks_what_it_dominates():
 
 def test_metal_like_patches_get_no_permittivity():
     for t in (1.0, 0.98 + 0.02j, 1.1 - 0.05j):
-        found = invert([Seen(complex(t), 0.01, THETA, 1.0)], Uncertain(2e-3))
+        found = invert([PatchMeasurement(complex(t), 0.01, THETA, 1.0)], RigPrior(2e-3))
         assert found.patches[0].permittivity is None
         assert found.patches[0].covariance is None
 
@@ -129,24 +129,25 @@ def test_drawn_covariance_agrees_with_the_slope_where_both_hold():
     noises, ratios = (0.01, 0.03), []
     for noise in noises:
         seen = [
-            Seen(s.inverse_ratio, noise, THETA, None) for s in world(np.random.default_rng(4), (0j, 0j), 1e-9, eps=eps)
+            PatchMeasurement(s.inverse_ratio, noise, THETA, None)
+            for s in world(np.random.default_rng(4), (0j, 0j), 1e-9, eps=eps)
         ]
-        found = invert(seen, Uncertain(1e-4, (0j, 0j), 1e-4, True, reference_std=1e-4))
+        found = invert(seen, RigPrior(1e-4, (0j, 0j), 1e-4, True, reference_std=1e-4))
         ratios.append(np.sqrt(np.trace(found.patches[0].covariance)) / noise)
     assert ratios[1] == pytest.approx(ratios[0], rel=0.3)
 
 
 def test_a_thin_sheet_does_not_pull_the_others():
     seen = world(np.random.default_rng(5), (0j, 0j), dull=0.01)
-    odd = [*seen[:-1], Seen(seen[-1].inverse_ratio, seen[-1].std, THETA, 0.3 * seen[-1].brightness)]
-    before, after = invert(seen, Uncertain(2e-3)), invert(odd, Uncertain(2e-3))
+    odd = [*seen[:-1], PatchMeasurement(seen[-1].inverse_ratio, seen[-1].std, THETA, 0.3 * seen[-1].brightness)]
+    before, after = invert(seen, RigPrior(2e-3)), invert(odd, RigPrior(2e-3))
     for a, b in zip(before.patches[:-1], after.patches[:-1], strict=True):
         assert abs(a.permittivity - b.permittivity) < np.sqrt(np.trace(a.covariance))
 
 
 def test_ratio_error_is_that_of_draws():
-    prior = Uncertain(2e-3)
-    found = invert([Seen(0.2 + 0.1j, 0.003, THETA, None)], prior)
+    prior = RigPrior(2e-3)
+    found = invert([PatchMeasurement(0.2 + 0.1j, 0.003, THETA, None)], prior)
     rng, t = np.random.default_rng(6), np.array([0.1 + 0.05j, -0.2j, 0.5])
     z = rng.multivariate_normal(np.zeros(8), found.nuisance_covariance, 20000)
     a, b = prior.leakage_std * (z[:, 0] + 1j * z[:, 1]), prior.leakage_std * (z[:, 2] + 1j * z[:, 3])

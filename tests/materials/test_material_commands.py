@@ -9,8 +9,8 @@ import pytest
 from polysight.host.cli.main import main
 from polysight.host.materials import Entry, Library, parse_layer
 from polysight.host.materials.layers import Layer, Spectrum, predict
-from polysight.host.materials.published import write_materials
 from tests.support.paths import RIG_FILE
+from tests.support.published_files import write_materials
 from tests.support.rigs import published_rig
 
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)

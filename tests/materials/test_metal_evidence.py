@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from polysight.host.materials.inversion import Seen, Uncertain
-from polysight.host.materials.metal_evidence import metal_evidence
+from polysight.host.materials.inversion import PatchMeasurement, RigPrior
+from polysight.host.materials.metal import metal_evidence
 
 THETA = np.radians(55.0)
 EPS = [
@@ -29,7 +29,10 @@ def scene(rng, plates, metal, patterns_db=1.0):
     v = v * 10 ** (patterns_db * rng.standard_normal() / 20) + 0.004 * h * rng.standard_normal(r_s.size)
     best = int(np.argmax(np.abs(h * v)))
     rest = [i for i in range(h.size) if i != best]
-    seen = [Seen(complex(v[i] / h[i] / (v[best] / h[best])), 0.005, THETA, float(abs(h[i] / h[best]))) for i in rest]
+    seen = [
+        PatchMeasurement(complex(v[i] / h[i] / (v[best] / h[best])), 0.005, THETA, float(abs(h[i] / h[best])))
+        for i in rest
+    ]
     return seen, metal and best == plates, complex(v[best] / h[best])
 
 
@@ -43,7 +46,7 @@ def scenes(request):
 def test_no_dielectric_is_taken_for_metal(plates, scenes):
     for seed in range(scenes):
         seen, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
-        assert not metal_evidence(seen, Uncertain(3e-3), channel).enough
+        assert not metal_evidence(seen, RigPrior(3e-3), channel).enough
 
 
 @pytest.mark.parametrize(("plates", "least"), [(2, 0.6), (4, 0.8), (8, 0.9)])
@@ -52,19 +55,19 @@ def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
     for seed in range(scenes):
         seen, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
         assert metal
-        found.append(metal_evidence(seen, Uncertain(3e-3), channel).enough)
+        found.append(metal_evidence(seen, RigPrior(3e-3), channel).enough)
     assert np.mean(found) >= least
 
 
 def test_alone_nothing_is_shown():
-    evidence = metal_evidence([], Uncertain(3e-3), 1.0 + 0j)
+    evidence = metal_evidence([], RigPrior(3e-3), 1.0 + 0j)
     assert not evidence.enough
     assert evidence.others == 0
 
 
 def test_a_patch_that_looks_the_same_is_no_witness():
     """Water beside water looks like metal beside metal."""
-    alike = [Seen(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
-    evidence = metal_evidence(alike, Uncertain(3e-3), 1.0 + 0j)
+    alike = [PatchMeasurement(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
+    evidence = metal_evidence(alike, RigPrior(3e-3), 1.0 + 0j)
     assert evidence.others == 0
     assert not evidence.enough

@@ -15,7 +15,6 @@ from polysight.host.materials import (
     patches_from_labels,
     read_labels,
     segment,
-    truth_labels,
 )
 from polysight.host.materials.segment import box_mask
 from polysight.host.materials.truth import match_truth
@@ -185,10 +184,3 @@ def test_bad_label_files_are_refused(tmp_path, text):
     path.write_text(text)
     with pytest.raises(DataError, match=r"bad\.json"):
         read_labels(path)
-
-
-def test_truth_labels_agree_with_boxes(synthetic):
-    scene = synthetic(7)
-    labels = truth_labels(scene.plates, scene.x_m, scene.y_m)
-    assert set(np.unique(labels)) == set(range(10))
-    assert (labels > 0).mean() == pytest.approx(9 * 45**2 / 300**2, rel=0.05)

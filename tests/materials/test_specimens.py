@@ -4,11 +4,17 @@ import numpy as np
 import pytest
 
 from polysight.host.materials import MODELS, UNKNOWN, Classifier, Entry, Library, specimens
-from polysight.host.materials.classify import DISCRIMINANT
-from polysight.host.materials.explain import explained
-from polysight.host.materials.none_of_these import cost_of_none
+from polysight.host.materials.classify import DISCRIMINANT, add_explanation
 from polysight.host.materials.samples import Samples, SceneErrors, feature_matrix
-from polysight.host.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative, without
+from polysight.host.materials.specimens import (
+    PUBLISHED_SPREAD,
+    cost_of_none,
+    effect,
+    features,
+    fit_spread,
+    relative,
+    without,
+)
 from polysight.host.polarimetry import fresnel
 from polysight.papers.sensys2026.patches import Errors, draw, groups
 
@@ -174,9 +180,9 @@ def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
     classifier = Classifier(entries(samples), model=model, angles_deg=[60.0])
     test = drawn((0.0, 0.0), 1, 4)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
-    told = [explained(n, eps, None, classifier).verdict.why for n, eps in zip(named, KINDS.values(), strict=True)]
-    assert all("looks like" in why for why in told)
-    assert any("no other material" in why for why in told) == (model == "discriminant")
+    whys = [add_explanation(n, eps, None, classifier).verdict.why for n, eps in zip(named, KINDS.values(), strict=True)]
+    assert all(n.verdict.name in why for n, why in zip(named, whys, strict=True))
+    assert any("no other material" in why for why in whys) == (model == "discriminant")
 
 
 def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
@@ -188,4 +194,4 @@ def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
     for n, eps in zip(named, (7.5 - 0.05j, 9.4 - 18j), strict=True):
         assert n.verdict.name == UNKNOWN
         assert n.verdict.nearest in known
-        assert f"nearest: {n.verdict.nearest}" in explained(n, eps, None, classifier).verdict.why
+        assert f"nearest: {n.verdict.nearest}" in add_explanation(n, eps, None, classifier).verdict.why

@@ -128,12 +128,6 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
 
 
 def _fact(row: CommittedRow, boards: list[str], products: str) -> Fact:
-    said = {n: {"file": b.file, "bytes": b.bytes, "crc32": b.crc32} for n, b in row.boards.items() if n in boards}
-    return {
-        "fact": "raw_dropped",
-        "row": row.row,
-        "take": row.take,
-        "boards": said,
-        "products": products,
-        "dropped_utc": utc_now(),
-    }
+    files = {n: {"file": b.file, "bytes": b.bytes, "crc32": b.crc32} for n, b in row.boards.items() if n in boards}
+    fact: Fact = {"fact": "raw_dropped", "row": row.row, "take": row.take, "boards": files}
+    return {**fact, "products": products, "dropped_utc": utc_now()}

@@ -49,13 +49,13 @@ def test_a_pi_that_does_not_report_its_stage_is_a_warning(rig, tmp_path):
     assert STAGE_NOT_REPORTED in result.warnings
 
 
-def test_what_does_not_place_rows_may_differ(rig):
+def test_settings_that_do_not_place_rows_may_differ(rig):
     stage = rig.instrument.stage
     same = msgspec.structs.replace(stage, port="elsewhere", speed_mm_s=stage.speed_mm_s / 2, heartbeat_ms=2000)
     assert same.placement_settings == stage.placement_settings
 
 
-def test_a_scan_begun_when_nobody_compared_goes_on_with_its_pi_and_says_so(rig, tmp_path):
+def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
     """Its rows lie where that Pi had them; refusing it would have them put elsewhere."""
     stop, right = StopRequest(), rig.pi.stage
     rig.pi.stage = {}

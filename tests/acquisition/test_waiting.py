@@ -31,7 +31,7 @@ def limited(instrument, **limits):
     return msgspec.structs.replace(instrument, limits=msgspec.structs.replace(instrument.limits, **limits))
 
 
-def test_next_row_waits_for_processing_and_says_so(rig, tmp_path):
+def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
     """Processing hangs on row 0: with one row allowed to wait, row 2 is committed last; released, all are."""
     release, started, at_wait = threading.Event(), [], []
 

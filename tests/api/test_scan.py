@@ -320,7 +320,7 @@ def test_the_figure_has_axes_in_mm_colour_bars_and_says_simulated(scan):
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_no_scan_is_refused(tmp_path):
+def test_other_folders_are_refused(tmp_path):
     for path in (tmp_path, tmp_path / "absent", str(tmp_path)):
         with pytest.raises(DataError):
             open_scan(path)

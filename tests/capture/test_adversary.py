@@ -133,7 +133,7 @@ class Rows(RuleBasedStateMachine):
         self.card.forget_late()
 
 
-def test_no_byte_is_wrong_and_none_is_masked_in_vain(request: pytest.FixtureRequest):
+def test_no_byte_is_wrong_and_none_is_masked_without_reason(request: pytest.FixtureRequest):
     records = 20_000 if request.config.getoption("--long") else 2_000
     run_state_machine_as_test(
         Rows,

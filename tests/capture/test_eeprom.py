@@ -25,7 +25,7 @@ def test_the_bytes_are_reversed():
     mac=st.binary(min_size=5, max_size=5).filter(any),
     ports=st.lists(st.integers(1025, 65535), min_size=2, max_size=2, unique=True),
 )
-def test_the_card_reads_what_was_meant(net, ends, mac, ports):
+def test_the_card_decodes_the_settings_sent(net, ends, mac, ports):
     host, card = (".".join(map(str, (*net, end))) for end in ends)
     settings = EepromSettings(host, card, (b"\2" + mac).hex(":"), *ports)
     read = Network.decode(settings.encode())

@@ -37,7 +37,7 @@ def failure(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
 
 @pytest.mark.parametrize("fault", ["full", "short"])
 @pytest.mark.parametrize("whose", ["scan", "journal"])
-def test_full_disk_is_told_and_loses_nothing(samples, undisturbed, tmp_path, sample, fault, whose):
+def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed, tmp_path, sample, fault, whose):
     seen = 0
     for at in sample(needs_space(samples, tmp_path / "count", whose), 10):
         folder = tmp_path / str(at)

@@ -16,7 +16,7 @@ from polysight.shared.error_codes import ErrorCode
 from tests.support.refusals import refused
 
 
-def test_lock_that_another_program_holds_is_told_from_a_disk_without_locks(tmp_path, monkeypatch):
+def test_a_locked_scan_and_a_disk_without_locks_are_different_errors(tmp_path, monkeypatch):
     path = tmp_path / "manifest.jsonl"
     with ManifestWriter(path, create=True), refused(ErrorCode.BUSY):
         ManifestWriter(path, create=False)

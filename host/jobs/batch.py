@@ -59,7 +59,7 @@ class Job(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a scan; seconds and the largest memory of its program (GB) where it ran."""
+    """Result of one scan, with the time and largest memory (GB) of its program."""
 
     name: str
     status: Status
@@ -105,7 +105,7 @@ NOT_DATA = ("samples", "products", ".products.new", ".products.old", "products-e
 
 
 def made_with(request: ProcessRequest) -> dict[str, Any]:
-    """What products depend on: releases, choices (files by their digest), and the data's files by size and time."""
+    """All that products depend on: releases, options (files by digest), and the data's files by size and time."""
     data = Path(request.data)
     choices = {**request.choices(), **{name: _digest(path) for name, path in request.paths().items()}}
     files = sorted(p for p in data.rglob("*") if p.is_file() and p.relative_to(data).parts[0] not in NOT_DATA)
@@ -124,7 +124,7 @@ def _digest(path: Path) -> Any:
 
 
 def finished(job: Job) -> bool:
-    """Whether the products are there and were made with just this."""
+    """True if the products exist and were made with exactly this."""
     try:
         mark = read_json(job.out / FINISHED)
     except (OSError, ValueError, PolysightError):
@@ -246,7 +246,7 @@ def memory_bytes(positions: int) -> int:
 
 
 def at_once(positions: int, cores: int, free_bytes: int) -> int:
-    """How many scans fit cores and free memory; at least one."""
+    """Number of scans that fit cores and free memory; at least one."""
     return max(1, min(cores, int(_FREE * free_bytes / memory_bytes(positions))))
 
 
@@ -323,7 +323,7 @@ def _positions(data: Path) -> int:
 
 
 def table(outcomes: Sequence[Outcome], out: Path) -> str:
-    """What became of every scan, and the counts."""
+    """Table of the results of all scans, and their counts."""
     rows = [("scan", "result", "seconds", "memory", "masked", "patches", "")]
     for o in outcomes:
         masked, patches = _found(out / o.name) if o.status in ("done", "skipped") else ("", "")
@@ -343,7 +343,7 @@ def table(outcomes: Sequence[Outcome], out: Path) -> str:
 
 
 def _verdict(products: Path) -> str:
-    """What the products say of themselves, where that is not `good`; with the first reason."""
+    """The verdict of products with its first reason; empty if `good`."""
     try:
         verdict = SavedProducts(products).verdict
     except (PolysightError, AttributeError, KeyError, TypeError):

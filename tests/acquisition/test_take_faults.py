@@ -10,7 +10,7 @@ from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.scan import run_scan
 from polysight.host.acquisition.take import ON_REQUEST, FaultKind, TakeFault
 from polysight.host.capture.dca1000 import Status
-from polysight.host.page.story import CAUSES, of_rejection
+from polysight.host.page.history import CAUSES, notice_of_rejection
 from polysight.shared.faults import PiFault, explain
 from tests.support.paths import REPO
 
@@ -112,7 +112,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
     assert set(re.findall(r"`([a-z_]+)`(?=[^|\n]*\|[^|\n]*\|$)", table, re.MULTILINE)) >= set(FaultKind)
     for kind in FaultKind:
         fault = TakeFault(kind, "text", "RV", 103 if kind is FaultKind.PI_FAULT else 0)
-        notice = of_rejection(0, 1, [str(fault)], [fault.fact()], "")
+        notice = notice_of_rejection(0, 1, [str(fault)], [fault.fact()], "")
         assert notice.why
         assert notice.do
     assert set(CAUSES) == set(FaultKind) - {FaultKind.PI_FAULT}
@@ -122,12 +122,12 @@ def test_words_follow_the_kind_alone():
     """Reasons are for people: whatever they say, the cause is that of the kind."""
     told = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (why, do) in CAUSES.items():
-        notice = of_rejection(0, 1, [told], [TakeFault(kind, told, "RV").fact()], "")
+        notice = notice_of_rejection(0, 1, [told], [TakeFault(kind, told, "RV").fact()], "")
         assert (notice.why, notice.do) == (why, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
-    notice = of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
+    notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.fact()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).why.lower()
     for unknown in ([], [{"kind": "of_a_newer_release", "board": "RV"}]):
-        notice = of_rejection(0, 1, [told], unknown, "")
+        notice = notice_of_rejection(0, 1, [told], unknown, "")
         assert (notice.why, notice.detail) == ("", told)
         assert notice.do

@@ -10,8 +10,8 @@ from polysight.host.acquisition import scan_loop as running
 from polysight.host.acquisition.control import StopRequest
 from polysight.host.acquisition.progress import time_left, typical_row_s
 from polysight.host.acquisition.scan import run_scan
+from polysight.host.page.history import ScanHistory, seconds
 from polysight.host.page.snapshot import remaining
-from polysight.host.page.story import Story, seconds
 
 ROW_S, PAUSE_S, HOMING_S = 12.0, 7200.0, 240.0
 
@@ -73,14 +73,14 @@ def test_the_page_has_the_same_time_left(rig, tmp_path):
     """The facts of a scan with times of our own: rows a minute apart, a pause of a day before the last."""
     run_scan(rig.instrument, tmp_path / "s")
     utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
-    story: Story | None = None
+    history: ScanHistory | None = None
     for fact in running.ScanFolder.load(tmp_path / "s").content.facts:
-        if story is None:
-            story = Story(fact | {"started_utc": utc.format(1, 0)})
+        if history is None:
+            history = ScanHistory(fact | {"started_utc": utc.format(1, 0)})
         elif fact["fact"] == "row_committed" and fact["row"] < 3:
-            story.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
-    assert story is not None
-    story.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
-    story.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
-    left, _ = remaining(story, seconds(utc.format(2, 3)) + 20)
+            history.add_fact(fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
+    assert history is not None
+    history.add_fact({"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
+    history.add_fact({"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
+    left, _ = remaining(history, seconds(utc.format(2, 3)) + 20)
     assert left == pytest.approx(time_left(1, 60.0, 20.0))

@@ -21,7 +21,7 @@ from polysight.pi_controller.server import Server
 from polysight.shared import messages as m
 from polysight.shared.config import load_instrument
 from polysight.shared.error_codes import ErrorCode
-from polysight.shared.errors import ConfigError, DeviceError
+from polysight.shared.errors import DeviceError
 from polysight.shared.faults import PiFault
 from polysight.shared.sockets import HOST_KEYS, HandshakeMonitor, requester
 from polysight.shared.tables import decode, to_builtins
@@ -209,16 +209,6 @@ def test_a_relative_key_dir_counts_from_the_rig_files_folder(tmp_path, monkeypat
         assert decode(to_builtins(rig), type(rig), "manifest").pi.key_dir == rig.pi.key_dir
     path.write_text(text)
     assert load_instrument(path).pi.key_dir == "/etc/polysight/keys", "an absolute one stays"
-
-
-def test_a_host_without_keys_is_told_to_copy_not_to_make_a_second_set(tmp_path):
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    with pytest.raises(ConfigError) as e:
-        requester(context, ELSEWHERE, tmp_path)
-    context.destroy(linger=0)
-    assert e.value.remedy.startswith("copy the Pi's pi.key and host.key_secret here")
-    assert str(tmp_path) in e.value.remedy
-    assert "polysight-pi keys" not in e.value.remedy
 
 
 def test_an_ordinary_user_is_told_whose_keys_they_are(config, monkeypatch, capsys):

@@ -112,7 +112,7 @@ def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
         assert np.mean(first == other) < 0.1
 
 
-def test_pulse_numbers_are_uniform_and_do_not_depend_on_company() -> None:
+def test_random_numbers_of_pulses_are_uniform_and_independent_of_batches() -> None:
     u = pulse_uniform(1234, np.arange(100_000))
     assert abs(u.mean() - 0.5) < 0.005
     assert abs(u.var() - 1 / 12) < 0.002

@@ -1,4 +1,4 @@
-"""A simulated scan on disk: both layouts hold the radars' bytes, and truth.json says what they show."""
+"""A simulated scan on disk: both layouts have the radars' bytes, and truth.json the truth of the scene."""
 
 import json
 from pathlib import Path

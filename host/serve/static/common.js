@@ -112,7 +112,7 @@ export const pageOf = (page, scan) => `/${page}?${new URLSearchParams({ scan })}
 export function permittivity(p) {
   if (!p || p.real === null || p.real === undefined) return "–";
   const error = (std) => (std ? ` ± ${std.toPrecision(2)}` : "");
-  return `${p.real.toFixed(2)}${error(p.real_std)} − j (${(-p.imag).toFixed(2)}${error(p.imag_std)})`;
+  return `${p.real.toFixed(2)}${error(p.real_std)} − j (${signed(-p.imag, 2)}${error(p.imag_std)})`;
 }
 
 /** A material's name as people read it. */

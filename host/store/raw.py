@@ -120,7 +120,7 @@ def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
                         f"{path}: cannot be removed: {e.strerror}",
                         "you may not write there, or the disk fails",
                         f"mend that, then `polysight drop-raw {scan.path}` deletes the rest",
-                        code=ErrorCode.FILE_UNREADABLE,
+                        code=ErrorCode.FILE_UNWRITABLE,
                     ) from None
         for folder in {path.parent for files in found.files.values() for path in files.values()}:
             sync_folder(folder)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 
 import pytest
 
@@ -75,8 +74,7 @@ def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, 
 
     def overflowing(row: int, take: int) -> None:
         if (row, take) == (0, 1):
-            status = struct.pack("<HHHH", 0xA55A, 0x0A, bit, 0xEEAA)
-            card.out.sendto(status, (card.board.host_address, card.board.command_port))
+            card.report_status(bit)
         send_row(row, take)
 
     card.send_row = overflowing

@@ -146,7 +146,7 @@ def test_errors_come_back_to_the_host(board, tmp_path):
         with refused(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}"):
             ReceiverProcess(board, 1 << 20)
         (tmp_path / "file").write_text("")
-        with refused(ErrorCode.DISK_FULL):
+        with refused(ErrorCode.FILE_UNWRITABLE):
             receiver.begin_row(0, 1, 4096, 4096, tmp_path / "file" / "a.part")
         with pytest.raises(DeviceError):
             receiver.end_row()

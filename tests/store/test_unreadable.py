@@ -25,7 +25,7 @@ def test_a_locked_scan_and_a_disk_without_locks_are_different_errors(tmp_path, m
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(appending.fcntl, "flock", no_locks)
-    with refused(ErrorCode.FILE_UNREADABLE, os.strerror(errno.ENOLCK)):
+    with refused(ErrorCode.FILE_UNWRITABLE, os.strerror(errno.ENOLCK)):
         ManifestWriter(path, create=False)
 
 

@@ -49,8 +49,8 @@ def _guess_lines(r: Report) -> list[str]:
     """The layouts that were tried, where there was a choice: the likeliest few."""
     if len(r.guesses) < 2:
         return []
-    told = (f"{g.shape} {100 * g.likelihood:.0f} %" for g in r.guesses[:GUESSES])
-    return [f"likely     {'; '.join(told)}"]
+    shapes = (f"{g.shape} {100 * g.likelihood:.0f} %" for g in r.guesses[:GUESSES])
+    return [f"likely     {'; '.join(shapes)}"]
 
 
 def _card_lines(card: CardReport) -> list[str]:

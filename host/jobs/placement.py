@@ -64,8 +64,8 @@ def _lines(file: Path, again: PlacedAgain, same: bool) -> list[str]:
     if again.moved:
         lines.append("committed  with its frames at their pulses")
     else:
-        told = "the same" if same else "differently: `polysight validate SCAN --replace` commits it as it is here"
-        lines.append(f"committed  {told}")
+        result = "the same" if same else "differently: `polysight validate SCAN --replace` commits it as it is here"
+        lines.append(f"committed  {result}")
     return lines
 
 
@@ -75,11 +75,11 @@ def replace_folder(folder: Path, as_json: bool) -> int:
     if as_json:
         sys.stdout.write(json.dumps([asdict(r) for r in rows], indent=1) + "\n")
     else:
-        sys.stdout.write("".join(f"{line}\n" for line in _told(folder, rows)))
+        sys.stdout.write("".join(f"{line}\n" for line in _replaced_lines(folder, rows)))
     return 1 if any(r.damaged for r in rows) else 0
 
 
-def _told(folder: Path, rows: list[Replaced]) -> list[str]:
+def _replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
     lines = [f"row {r.row} of {r.board}: {r.before} bytes missing before, {r.after} now" for r in rows if r.changed] + [
         f"row {r.row} of {r.board}: left as it is: {r.left}" for r in rows if r.left
     ]

@@ -19,7 +19,7 @@ from polysight.papers.sensys2026.dataset_run import authors_recipe, text_of, wit
 from polysight.papers.sensys2026.item import Table
 from polysight.papers.sensys2026.table2 import table2
 from polysight.shared.errors import DataError
-from polysight.simulators.scene import Errors, Material, write_labels, write_material
+from tests.support.drawn_files import Errors, Material, write_labels, write_material
 from tests.support.paths import RIG_FILE
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
